@@ -26,7 +26,7 @@ Faults of images
     FaultyImages(images, fault, noise, rng)                 images with a fault laid over them
     fault_bodies()                                          boxes that hide stickers
 
-Every error that a user can cause is a CmmError, except OpenGLMissingError. The packages
+Every exception that a user can cause is a CmmError, except OpenGLMissingError. The packages
 `cmmsim.calibration` and `cmmsim.acceptance` are public as well. Users can write their own detectors
 and renderers: `allow_plugin(module)` allows a module of the user to run. Everything else is
 private.

@@ -72,12 +72,12 @@ def allowed_plugins() -> tuple[str, ...]:
     return tuple(name.strip() for name in names if name.strip())
 
 
-def is_own(name: str) -> bool:
+def is_plugin_name(name: str) -> bool:
     """Tell whether a name has the form ``module:name`` of a user's own part."""
     return ":" in name
 
 
-def own_part(option: str, name: str) -> Any:
+def import_plugin(option: str, name: str) -> Any:
     """Import the user's own part that ``module:name`` names.
 
     ``option`` states the kind of part in messages, such as "detector". Raises CmmError if the
@@ -102,22 +102,22 @@ def own_part(option: str, name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Telling:
-    """User's own function whose errors are reported in one line with file and line number.
+class PluginFunction:
+    """Function of a plugin. An exception in it becomes one line with file and line number.
 
-    ``part`` is the function's name in messages. Errors of the classes ``known`` pass unchanged, and
-    any other error is raised anew as a ``refusal``. ``check`` is called with the part's name, the
-    result and the arguments; it raises a known error if the result is wrong.
+    ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged,
+    and any other exception becomes an ``error_class``. ``check`` is called with the part's name,
+    the result and the arguments. It raises an exception of a known class if the result is wrong.
     """
 
     part: str
     function: Callable[..., Any]
-    refusal: type[Exception]
+    error_class: type[Exception]
     known: tuple[type[Exception], ...] = ()
     check: Callable[..., None] | None = None
 
     def __call__(self, *given: Any) -> Any:
-        """Return what the function returns. Raises `refusal`, or a known error."""
+        """Return the function's result. Raises `error_class`, or an exception of a known class."""
         try:
             found = self.function(*given)
             if self.check is not None:
@@ -130,7 +130,7 @@ class Telling:
             at = traceback.extract_tb(error.__traceback__)[:2][-1]
             place = f"{Path(at.filename).name}, line {at.lineno}"
             said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
-            raise self.refusal(said) from error
+            raise self.error_class(said) from error
 
 
 def require_detector(name: str) -> str:
@@ -157,10 +157,10 @@ def find(
     """Return the Detector or Renderer that a built-in name or ``module:name`` names.
 
     ``kind`` is the class Detector or Renderer. A user's own part can be an instance of ``kind``, a
-    function, or a class whose instances are called like the function and need no arguments. A
-    function becomes an instance of ``kind``. Attributes of the function with the names of numeric
-    fields of ``kind`` become the values of these fields. ``check`` checks its results, see
-    `Telling`.
+    function, or a class whose instances are called like a function. Such a class is created without
+    arguments. A function becomes an instance of ``kind``. Attributes of the function with the names
+    of numeric fields of ``kind`` become the values of these fields. ``check`` checks each result,
+    see `PluginFunction`.
 
     Raises UnknownOptionError, which lists the valid names, for an unknown name. Raises CmmError for
     a part that cannot be called, and for a module that is not allowed to run.
@@ -169,9 +169,9 @@ def find(
     if name in built_in:
         module, _, attribute = built_in[name].partition(":")
         return getattr(importlib.import_module(module), attribute)
-    part = own_part(option, name)
+    part = import_plugin(option, name)
     said = f"{option} {name!r}"
-    found = Telling(said, part, CmmError)() if isinstance(part, type) else part
+    found = PluginFunction(said, part, CmmError)() if isinstance(part, type) else part
     # The fields of a kind are its name, its function, and numbers with defaults.
     _, does, *figures = fields(kind)
     function = getattr(found, does.name) if isinstance(found, kind) else found
@@ -179,7 +179,7 @@ def find(
         raise CmmError(f"{said} is of type {type(function).__name__}, which cannot be called")
     carried = [field for field in figures if hasattr(found, field.name)]
     values = {field.name: _figure(said, found, field) for field in carried}
-    return kind(name, Telling(said, function, CmmError, (CmmError,), check), **values)
+    return kind(name, PluginFunction(said, function, CmmError, (CmmError,), check), **values)
 
 
 def _figure(part: str, owner: Any, field: Any) -> Any:
@@ -192,7 +192,7 @@ def _figure(part: str, owner: Any, field: Any) -> Any:
 
 
 def _required(option: str, name: str, built_in: Mapping[str, str]) -> str:
-    if not isinstance(name, str) or not (name in built_in or is_own(name)):
+    if not isinstance(name, str) or not (name in built_in or is_plugin_name(name)):
         raise UnknownOptionError(option, name, built_in, own=True)
     return name
 

@@ -29,7 +29,7 @@ TOO_DEEP = f"keys, tables or lists more than {DEEPEST} deep"
 # scripts takes 4 bytes.
 NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
-# Largest number of errors of one file in a message.
+# Largest number of problems of one file in a message.
 MOST_COMPLAINTS = 8
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _TEXTS = re.compile(
@@ -48,7 +48,7 @@ _TEXTS = re.compile(
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
     """Return values as an array of the given shape.
 
-    Raises ShapeError for another shape, and for values that are not finite real numbers. Its
+    Raises ShapeError for another shape, and for values that are not finite real numbers. The
     message begins with ``wanted``, a sentence that states what is required.
     """
     try:
@@ -68,7 +68,7 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
 
 
 def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise CmmError unless a value is of type ``kind``. Its message begins with ``wanted``."""
+    """Raise CmmError unless a value is of type ``kind``. The message begins with ``wanted``."""
     if not isinstance(value, kind):
         raise CmmError(f"{wanted}, got {_shown(value)} of type {type(value).__name__}")
 
@@ -95,47 +95,47 @@ def check_name(name: str) -> str:
     )
 
 
-def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
+def read_text(path: str | Path, source: str, error_class: type[CmmError]) -> str:
     """Return the text of a file.
 
-    ``source`` names the file in messages, such as "board file x". Raises ``refusal`` if the file
-    cannot be read, or has more than `LARGEST` bytes.
+    ``source`` names the file in messages, such as "board file x". Raises ``error_class`` if the
+    file cannot be read, or has more than `LARGEST` bytes.
     """
     try:
         place = Path(path)
         if place.exists() and not (place.is_file() or place.is_dir()):
-            raise refusal(f"cannot read {source}: it is not a regular file")
+            raise error_class(f"cannot read {source}: it is not a regular file")
         with place.open("rb") as file:
             content = file.read(LARGEST + 1)
         if len(content) > LARGEST:
-            raise refusal(f"{source} has more than {LARGEST:,} bytes, which is the limit")
+            raise error_class(f"{source} has more than {LARGEST:,} bytes, which is the limit")
         return content.decode("utf-8")
     except OSError as error:
-        raise refusal(f"cannot read {source}: {error.strerror or error}") from error
+        raise error_class(f"cannot read {source}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise refusal(f"{source} is not text, so it cannot be TOML: {error}") from error
+        raise error_class(f"{source} is not text, so it cannot be TOML: {error}") from error
 
 
-def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
+def parsed(text: str, source: str, error_class: type[CmmError]) -> dict[str, Any]:
     """Return the content of a TOML text as a new dictionary, which the caller is free to change.
 
-    Raises ``refusal`` if the text is not TOML, nests tables deeper than `DEEPEST`, or contains
+    Raises ``error_class`` if the text is not TOML, nests tables deeper than `DEEPEST`, or contains
     integers beyond 64 bits or control characters.
     """
     try:
         return deepcopy(_parsed(text))
     except tomllib.TOMLDecodeError as error:
-        raise refusal(f"{source} is not TOML: {error}") from error
+        raise error_class(f"{source} is not TOML: {error}") from error
     except RecursionError:
-        raise refusal(f"{source} has {TOO_DEEP}") from None
+        raise error_class(f"{source} has {TOO_DEEP}") from None
     except ValueError as error:
-        raise refusal(f"{source} has {error}") from error
+        raise error_class(f"{source} has {error}") from error
 
 
-def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
+def checked(model: type[M], content: dict[str, Any], source: str, error_class: type[CmmError]) -> M:
     """Return the content of a file as an instance of ``model``.
 
-    Raises ``refusal``, which lists what is wrong and, for an unknown key, the valid keys.
+    Raises ``error_class``, which lists what is wrong and, for an unknown key, the valid keys.
     """
     try:
         return model.model_validate(content)
@@ -144,7 +144,7 @@ def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[
         said = [_explain(details, model) for details in found[:MOST_COMPLAINTS]]
         more = len(found) - len(said)
         said += [f"and {more} more"] if more else []
-        raise refusal(f"{source}: {'; '.join(said)}") from error
+        raise error_class(f"{source}: {'; '.join(said)}") from error
 
 
 @lru_cache(maxsize=8)
@@ -171,7 +171,7 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Describe the first value that is beyond the limits; empty if all values are within them."""
+    """Describe the first value that no file may contain. The text is empty if there is none."""
     left: list[tuple[Any, int]] = [(content, 0)]
     while left:
         value, depth = left.pop()

@@ -38,8 +38,8 @@ class CompilationWarning(UserWarning):
 def compiled(function: F) -> Dispatcher[F]:
     """Compile a kernel on its first call, or load it from the cache.
 
-    The cache is a folder beside the source if this is writable, and otherwise the user's cache
-    folder. Cached code is not loaded if an untrusted user could have written it.
+    The cache is a folder beside the source. If that folder is not writable, the cache is in the
+    user's cache folder. Cached code is not loaded if an untrusted user could have written it.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:

@@ -1,4 +1,4 @@
-"""Errors of the sensor package.
+"""Exceptions of the sensor package.
 
 Each message carries the evidence: the value, the limit, the valid names.
 """
@@ -10,7 +10,7 @@ LONGEST = 4000
 
 
 class CmmError(ValueError):
-    """Base class of errors for arguments and files that this package refuses.
+    """Base class of the exceptions for arguments and files that this package refuses.
 
     The message is one line.
 

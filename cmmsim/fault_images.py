@@ -285,8 +285,8 @@ class FaultyImages:
         return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
 
     def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Return parts (n, h, w) of one camera's image, first pixels (n, 2), with marks laid over
-        them.
+        """Lay the marks over parts ``images`` (n, h, w) of one image that begin at ``corners`` (n,
+        2).
         """
         marks = [m for m in self._fault.marks if m.side == side]
         if not marks:

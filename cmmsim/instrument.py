@@ -1,7 +1,7 @@
 """Instrument: the part of a sensor that is the same in all runs.
 
-It consists of the true cameras and scene, the parameters of the cameras as the estimator knows
-them, and the result of teaching.
+An instrument consists of the true cameras and scene, the camera parameters that the estimator
+knows, and the result of teaching.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from cmmsim.allowed_plugins import is_own, require_renderer
+from cmmsim.allowed_plugins import is_plugin_name, require_renderer
 from cmmsim.checks import checked_seed, require_kind
 from cmmsim.detection.detector import FitLimits, find_detector
 from cmmsim.errors import CmmError, UnknownOptionError
@@ -67,8 +67,9 @@ class Instrument:
             raise UnknownOptionError("method", method, METHODS)
         find_detector(file.detection.detector)
         self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
-        # A user's own renderer is imported now, so that its errors are reported before work begins.
-        if is_own(self._asked_renderer):
+        # A user's own renderer is imported now, so that an exception is reported before work
+        # begins.
+        if is_plugin_name(self._asked_renderer):
             choose_renderer(self._asked_renderer)
         if progress is not None and not callable(progress):
             raise CmmError(
@@ -150,7 +151,7 @@ class Instrument:
     def truth(self) -> Taught:
         """Result of a teaching without errors: the true places of rig and stickers.
 
-        Measurements do not use it. It is for studies of the observation noise alone.
+        Measurements do not use this result. It serves studies of the observation noise alone.
         """
         return exactly_taught(self._file)
 

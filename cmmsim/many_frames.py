@@ -35,10 +35,10 @@ BLOCK = 32
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a platform at poses (N, 6) that moves at rates (N, 6), each with its own noise.
+    """N frames of a platform at ``poses`` (N, 6), which change at ``rates`` (N, 6).
 
-    Stickers are searched near the poses ``near`` (N, 6). Obstacles stand still at base_from_body
-    (4, 4), by name.
+    Each frame has its own generator of noise in ``rngs``. Stickers are searched near the poses
+    ``near`` (N, 6). Obstacles stand still at base_from_body (4, 4), by name.
     """
 
     estimator: PoseEstimator
@@ -55,7 +55,7 @@ class Frames:
         return np.asarray(camera_from_base @ transforms_of(self.near))
 
 
-def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[ManySeen]:
+def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[MeasuredExposures]:
     """Measure frames block by block. The movement during each exposure is assumed to be known.
 
     The result does not depend on the number of threads.
@@ -72,7 +72,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Many
     last = back @ transforms_of(poses + half)
     parts = [slice(start, start + BLOCK) for start in range(0, len(poses), BLOCK)]
 
-    def block(part: slice) -> ManySeen:
+    def block(part: slice) -> MeasuredExposures:
         images = camera.look_many(poses[part], rngs[part], frames.obstacles, rates[part])
         return measure_exposures(estimator, images, expected[part], (first[part], last[part]))
 
@@ -93,12 +93,12 @@ def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> l
 
 
 @dataclass(frozen=True)
-class ManySeen:
+class MeasuredExposures:
     """Result of N exposures that were measured together.
 
-    ``found`` contains their poses, and ``solved`` their stickers. ``others`` are measurements by
-    number of the exposure. It contains the exposures that are lost, and all exposures if the method
-    is not registration.
+    ``found`` contains the poses, and ``solved`` the stickers. ``others`` maps the number of an
+    exposure to its measurement. It contains the lost exposures, and all exposures if the method is
+    not registration.
     """
 
     estimator: PoseEstimator
@@ -116,16 +116,19 @@ class ManySeen:
 
 
 def measure_exposures(
-    estimator: PoseEstimator, images: ManyExposures, expected: Array, swept: tuple[Array, Array]
-) -> ManySeen:
+    estimator: PoseEstimator,
+    images: ManyExposures,
+    expected: Array,
+    exposure_ends: tuple[Array, Array],
+) -> MeasuredExposures:
     """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
 
-    ``swept`` are the expected camera_from_platform (N,4,4) at the beginning and at the end of the
-    exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
+    ``exposure_ends`` are the expected camera_from_platform (N,4,4) at the beginning and at the end
+    of the exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places
     normals = estimator.platform.sticker_normals
-    seen = estimator.read(images, expected, places, normals).observed(swept)
+    seen = estimator.read(images, expected, places, normals).observed(exposure_ends)
     solved = solve_frames(seen, expected, estimator, estimator.platform, places)
     poses, covariances = estimator.in_base(solved.moves, solved.covariances)
     of = seen.index // len(places)
@@ -137,7 +140,7 @@ def measure_exposures(
         poses[k] = one.pose
         covariances[k] = one.covariance
         used[k] = len(one.target_ids)
-    return ManySeen(estimator, MeasuredPoses(poses, covariances, used), solved, others)
+    return MeasuredExposures(estimator, MeasuredPoses(poses, covariances, used), solved, others)
 
 
 def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:

@@ -121,8 +121,8 @@ class Sensor(Instrument):
         pose : array_like, shape (6,)
             Pose of the platform in the middle of the exposure, m and rad.
         obstacles : mapping of str to ndarray, shape (4, 4), optional
-            Transforms base_from_body of bodies that `add_bodies` registered, by name. They stand
-            still.
+            Transforms base_from_body of bodies that `add_bodies` registered, by name. The bodies
+            stand still.
         pose_rate : array_like, shape (6,), optional
             Time derivative of the pose, m/s and rad/s. It blurs the images if the exposure time of
             the sensor is above zero.
@@ -166,7 +166,7 @@ class Sensor(Instrument):
         Parameters
         ----------
         pose, obstacles, pose_rate
-            As in `look`, which also lists the errors.
+            As in `look`, which also lists the exceptions.
 
         Returns
         -------
@@ -200,7 +200,8 @@ class Sensor(Instrument):
         Parameters
         ----------
         pose, obstacles, pose_rate
-            As in `look`, which also lists the errors. The estimator does not use them.
+            As in `look`, which also lists the exceptions. The estimator does not use these
+            arguments.
 
         Returns
         -------
@@ -237,8 +238,8 @@ class Sensor(Instrument):
         Parameters
         ----------
         base : bool
-            True to observe the stickers of the base as well. This doubles the computing time. It
-            detects smaller movements, and movements of the whole rig.
+            True to observe the stickers of the base as well. This doubles the computing time.
+            Smaller movements, and movements of the whole rig, are then detected.
         chance : float
             Probability of a false alarm in a run.
 

@@ -294,8 +294,9 @@ def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
     """Return the weighted mean (..., n, 3) of v views of the same stickers, laid onto each other.
 
-    The mean has about the place and orientation of the first view. The second result contains its
-    covariances (..., n, 3, 3). Views are points (..., v, n, 3) with covariances (..., v, n, 3, 3).
+    The mean has about the place and orientation of the first view. The second result contains the
+    covariances (..., n, 3, 3) of the mean. Views are points (..., v, n, 3) with covariances (...,
+    v, n, 3, 3).
     """
     weights = np.linalg.inv(covariances)
     mean = points[..., 0, :, :]

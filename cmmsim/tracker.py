@@ -21,7 +21,7 @@ class Tracker:
 
     If the predicted windows show too few stickers, the whole images are searched as well, and the
     result with more stickers is used. Moving stickers are blurred during the exposure. The fit
-    takes the blur from the speed since the last frame. In the first frame of a run, and in the
+    computes the blur from the speed since the last frame. In the first frame of a run, and in the
     first frame after a loss, the speed is estimated from the blur.
 
     Parameters
@@ -53,7 +53,7 @@ class Tracker:
         self._seen = 0
 
     def measure(self, images: StereoImages | StereoFrame) -> Measurement:
-        """Measure one frame. No content of the images raises an error.
+        """Measure one frame. No content of the images raises an exception.
 
         Parameters
         ----------
@@ -110,10 +110,14 @@ class Tracker:
         try:
             if self._step_before is not None:
                 predicted = self._predicted()
-                return self._estimator.measure(images, predicted, self._swept(predicted))
+                return self._estimator.measure(images, predicted, self._exposure_ends(predicted))
             found = self._estimator.measure(images, self._last)
-            swept = self._swept(found[1])
-            return found if swept is None else self._estimator.measure(images, found[1], swept)
+            exposure_ends = self._exposure_ends(found[1])
+            return (
+                found
+                if exposure_ends is None
+                else self._estimator.measure(images, found[1], exposure_ends)
+            )
         except LostError:
             return None
 
@@ -122,13 +126,14 @@ class Tracker:
         found = self._estimator.locate(images)
         if self._last is None:
             return self._estimator.measure_anew(images, found)
-        return self._estimator.measure(images, found, self._swept(found))
+        return self._estimator.measure(images, found, self._exposure_ends(found))
 
-    def _swept(self, middle: Array) -> tuple[Array, Array] | None:
+    def _exposure_ends(self, middle: Array) -> tuple[Array, Array] | None:
         """Return camera_from_platform (4, 4) at the beginning and at the end of an exposure.
 
-        It is ``middle`` in the middle of the exposure, and the speed is the mean speed since the
-        last frame. The result is None without a last frame, or if the exposure takes no time.
+        In the middle of the exposure, camera_from_platform is ``middle``. The speed is the mean
+        speed since the last frame. The result is None without a last frame, or if the exposure
+        takes no time.
         """
         share = self._estimator.settings.exposed_share
         if self._last is None or share == 0.0:

@@ -1,6 +1,6 @@
-"""The true side of a sensor: its cameras, their scene, and the drift of the cameras in a run.
+"""True state of a sensor: the cameras, the scene, and the drift of the cameras in a run.
 
-The estimator does not know any of it.
+The estimator does not know this state.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Drift:
 class TrueCameras:
     """Both true cameras in front of platform and base, with all stickers at their true places.
 
-    `Sensor.add_bodies`, `Sensor.move_rig` and `Sensor.drift_rig` describe the arguments and errors
-    of `add_bodies`, `move` and `drift`.
+    `Sensor.add_bodies`, `Sensor.move_rig` and `Sensor.drift_rig` describe the arguments and
+    exceptions of `add_bodies`, `move` and `drift`.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class TrueCameras:
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
         """Return the transforms base_from_body (4, 4) of obstacles after checks.
 
-        Raises the same errors as `Sensor.look`.
+        Raises the same exceptions as `Sensor.look`.
         """
         # The legs of a robot are passed in every frame, so they are checked together, which is
         # fast.

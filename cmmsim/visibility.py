@@ -80,7 +80,7 @@ def expected_covariance(
     """Return the covariance (6, 6) that a sensor would state for a pose (6,), m and rad.
 
     One exposure is drawn without OpenGL. Teaching is assumed to be free of errors. Raises LostError
-    if the stickers do not determine the pose, and the same errors as `load_sensor`.
+    if the stickers do not determine the pose, and the same exceptions as `load_sensor`.
     """
     sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
     return stated_covariance(sensor, sight_lines(name, changes), pose)
@@ -90,7 +90,7 @@ def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Arr
     """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad.
 
     One exposure is drawn, and its stickers are read at the places that follow from the pose,
-    without teaching or search. Raises the same errors as `expected_covariance`.
+    without teaching or search. Raises the same exceptions as `expected_covariance`.
     """
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform

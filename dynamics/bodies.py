@@ -52,7 +52,7 @@ class Frames:
     spin: np.ndarray
 
 
-class Drawn(NamedTuple):
+class DrawnParts(NamedTuple):
     """Numbers from which the ends of the drawn parts are computed.
 
     `body` and `before` (parts,) are the rows of each part and of the part before it in the
@@ -67,7 +67,7 @@ class Drawn(NamedTuple):
     ends: np.ndarray
 
 
-class Room(NamedTuple):
+class FunctionBuffers(NamedTuple):
     """Memory for the inputs and outputs of a robot's functions.
 
     `at` (6 + g,) has a pose and the constants of the functions. `moving` (12 + g,) has a pose, a
@@ -113,7 +113,7 @@ class Parts:
         self._centre = np.array([part.segment.centre for part in self.all])
         before = np.append(rows, -1)[self._before]
         ends = np.array([part.segment.rod for part in self.all])
-        self._drawn = Drawn(self._rows, before, self._offset, self._centre, ends)
+        self._drawn = DrawnParts(self._rows, before, self._offset, self._centre, ends)
         chart = geometry.chart
         self._held = np.where(chart.basis.any(axis=1), np.nan, chart.home)
 
@@ -149,7 +149,7 @@ class Parts:
         placements = functions["placements"]
         fixed = placements.constants
         bodies = placements.outputs[0][0]
-        room = Room(
+        room = FunctionBuffers(
             at=np.concatenate((at, fixed)),
             moving=np.concatenate((at, np.zeros(6), fixed)),
             reach=np.empty((2, robot.layout.joints)),

@@ -87,59 +87,62 @@ def is_file(path: str | PathLike[str]) -> bool:
 
 
 def read_bytes(
-    path: str | PathLike[str], source: str, refusal: type[Exception], largest: int = LARGEST
+    path: str | PathLike[str], source: str, error_class: type[Exception], largest: int = LARGEST
 ) -> bytes:
     """Content of a file. `source` is its name in messages, such as "robot file mine.toml".
 
-    Raises `refusal`, with the reason, for a file that cannot be read or is too large.
+    Raises `error_class`, with the reason, for a file that cannot be read or is too large.
     """
     try:
         place = Path(path)
         if place.exists() and not (place.is_file() or place.is_dir()):
-            raise refusal(f"cannot read {source}: it is not a regular file")
+            raise error_class(f"cannot read {source}: it is not a regular file")
         with place.open("rb") as file:
             content = file.read(largest + 1)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or error
-        raise refusal(f"cannot read {source}: {reason}") from error
+        raise error_class(f"cannot read {source}: {reason}") from error
     if len(content) > largest:
-        raise refusal(f"{source} has more than {largest:,} bytes, the limit for such files")
+        raise error_class(f"{source} has more than {largest:,} bytes, the limit for such files")
     return content
 
 
-def read_text(path: str | PathLike[str], source: str, refusal: type[Exception]) -> str:
-    """Text of a file in UTF-8. Raises `refusal` as `read_bytes` does, and for other encodings."""
+def read_text(path: str | PathLike[str], source: str, error_class: type[Exception]) -> str:
+    """Text of a file in UTF-8. Raises `error_class` like `read_bytes`, and for other encodings."""
     try:
-        return read_bytes(path, source, refusal).decode("utf-8")
+        return read_bytes(path, source, error_class).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise refusal(f"cannot read {source}: {error}") from error
+        raise error_class(f"cannot read {source}: {error}") from error
 
 
-def parse_toml(text: str, source: str, refusal: type[Exception]) -> dict[str, Any]:
+def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str, Any]:
     """Content of TOML text. `source` is its name in messages.
 
-    Raises `refusal` for text that is not TOML or has more than `LARGEST` characters, for tables and
-    lists deeper than `DEEPEST`, for integers beyond 64 bits, for dates, and for control characters.
+    Raises `error_class` for text that is not TOML or has more than `LARGEST` characters, for tables
+    and lists deeper than `DEEPEST`, for integers beyond 64 bits, for dates, and for control
+    characters.
     """
     if len(text) > LARGEST:
-        raise refusal(f"{source} has more than {LARGEST:,} characters, the limit for such files")
+        raise error_class(
+            f"{source} has more than {LARGEST:,} characters, the limit for such files"
+        )
     deep = f"{source} has keys, tables or lists more than {DEEPEST} deep"
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
     # the time of tomllib grows with the square of the number of parts
     if any(key.count(".") >= DEEPEST for key in bare):
-        raise refusal(deep)
+        raise error_class(deep)
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise refusal(f"{source} is not valid TOML: {error}") from error
+        raise error_class(f"{source} is not valid TOML: {error}") from error
     except RecursionError:
-        raise refusal(deep) from None
+        raise error_class(deep) from None
     except ValueError:
         # int() refuses more than some thousand digits
-        raise refusal(f"{source} has an integer beyond 64 bits, or an invalid date") from None
+        raise error_class(f"{source} has an integer beyond 64 bits, or an invalid date") from None
     fault = _fault(content)
     if fault:
-        raise refusal(f"{source} has {fault}")
+        raise error_class(f"{source} has {fault}")
     return content
 
 
@@ -164,59 +167,60 @@ def _fault(content: dict[str, Any]) -> str:
     return ""
 
 
-def parse_json(text: str, source: str, refusal: type[Exception]) -> Any:
+def parse_json(text: str, source: str, error_class: type[Exception]) -> Any:
     """Content of JSON text.
 
-    Raises `refusal` for text that is not JSON, is too deep, or has integers with too many digits.
+    Raises `error_class` for text that is not JSON, is too deep, or has integers with too many
+    digits.
     """
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         reason = "it is too deep" if isinstance(error, RecursionError) else error
-        raise refusal(f"{source} is truncated or not JSON: {reason}") from error
+        raise error_class(f"{source} is truncated or not JSON: {reason}") from error
 
 
-def parse_yaml(content: bytes, source: str, refusal: type[Exception]) -> Any:
+def parse_yaml(content: bytes, source: str, error_class: type[Exception]) -> Any:
     """Content of YAML text with mappings, lists and names. Every scalar is returned as text.
 
-    Raises `refusal` for content that is not YAML, for aliases, for a duplicate key, and for more
-    than `DEEPEST` levels.
+    Raises `error_class` for content that is not YAML, for aliases, for a duplicate key, and for
+    more than `DEEPEST` levels.
     """
     try:
-        _check_events(yaml.parse(content, Loader=_YamlLoader), source, refusal)
+        _check_events(yaml.parse(content, Loader=_YamlLoader), source, error_class)
         node = yaml.compose(content, Loader=_YamlLoader)
         if isinstance(node, yaml.MappingNode):
             keys = Counter(str(key.value) for key, _ in node.value)
             twice = [key for key, count in keys.items() if count > 1]
             if twice:
-                raise refusal(f"{source} has the key {twice[0][:60]!r} twice")
+                raise error_class(f"{source} has the key {twice[0][:60]!r} twice")
         return yaml.load(content, Loader=_YamlLoader)
     except (yaml.YAMLError, ValueError) as error:
-        raise refusal(f"cannot read {source}: {' '.join(str(error).split())}") from None
+        raise error_class(f"cannot read {source}: {' '.join(str(error).split())}") from None
 
 
-def _check_events(events: Iterable[Any], source: str, refusal: type[Exception]) -> None:
-    """Raise `refusal` for aliases and for content that is too deep."""
+def _check_events(events: Iterable[Any], source: str, error_class: type[Exception]) -> None:
+    """Raise `error_class` for aliases and for content that is too deep."""
     depth = 0
     for event in events:
         if isinstance(event, yaml.AliasEvent):
-            raise refusal(f"{source} has an alias, *{event.anchor}; write its content instead")
+            raise error_class(f"{source} has an alias, *{event.anchor}; write its content instead")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
-            raise refusal(f"{source} has lists and mappings more than {DEEPEST} deep")
+            raise error_class(f"{source} has lists and mappings more than {DEEPEST} deep")
 
 
-def parse_xml(content: bytes, source: str, refusal: type[Exception]) -> Xml.Element:
+def parse_xml(content: bytes, source: str, error_class: type[Exception]) -> Xml.Element:
     """Root element of XML.
 
-    Raises `refusal` for content that is not XML, for elements more than `DEEPEST_ELEMENT` deep, and
-    for a document type, which could define entities.
+    Raises `error_class` for content that is not XML, for elements more than `DEEPEST_ELEMENT` deep,
+    and for a document type, which could define entities.
     """
     try:
         return Xml.fromstring(content, Xml.XMLParser(target=_Builder()))
     except (Xml.ParseError, ValueError) as error:
-        raise refusal(f"cannot read {source}: {error}") from None
+        raise error_class(f"cannot read {source}: {error}") from None
 
 
 class _Builder(Xml.TreeBuilder):

@@ -17,9 +17,9 @@ def place_rods(
     """Compute the ends (parts, 2, 3) of the drawn parts at a pose (6,), m, in the axes of the base.
 
     `kinematics` and `placements` are addresses of functions of the robot. `drawn` and `room` have
-    the fields of `Drawn` and `Room`. `held` (6,) has the value of each coordinate of the pose that
-    the chart fixes to within `slack`, and NaN for the others. Returns False if a leg does not reach
-    the pose, or if the pose differs from the fixed coordinates.
+    the fields of `DrawnParts` and `FunctionBuffers`. `held` (6,) has the value of each coordinate
+    of the pose that the chart fixes to within `slack`, and NaN for the others. Returns False if a
+    leg does not reach the pose, or if the pose differs from the fixed coordinates.
     """
     for i in range(6):
         # a comparison with NaN is never true

@@ -2,14 +2,14 @@
 
 import sys
 
-from identify.runtime import STOPPED, honoured, loading
+from identify.runtime import STOPPED, interruptible, interruptible_imports
 
 
 def main() -> None:
     """Run the command. After Ctrl-C, print one line and exit with the status STOPPED."""
     try:
-        with honoured():
-            with loading():
+        with interruptible():
+            with interruptible_imports():
                 from identify.commands import app as command_line
             command_line.main()
     except KeyboardInterrupt:

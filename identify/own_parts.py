@@ -9,9 +9,9 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from cmmsim.allowed_plugins import Telling as Telling
-from cmmsim.allowed_plugins import is_own as is_own
-from cmmsim.allowed_plugins import own_part
+from cmmsim.allowed_plugins import PluginFunction as PluginFunction
+from cmmsim.allowed_plugins import import_plugin
+from cmmsim.allowed_plugins import is_plugin_name as is_plugin_name
 from cmmsim.errors import CmmError
 from identify.errors import IdentifyError, ScenarioError
 
@@ -65,7 +65,7 @@ def check_choice(
     error : type, optional
         Exception to be raised. Its message has the valid names.
     """
-    if given not in built_in and not is_own(given):
+    if given not in built_in and not is_plugin_name(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
 
 
@@ -100,9 +100,9 @@ def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[.
         function does not exist, or the named object is not a function.
     """
     try:
-        function = own_part(what, name)
-    except CmmError as refusal:
-        raise error(str(refusal)) from refusal
+        function = import_plugin(what, name)
+    except CmmError as failure:
+        raise error(str(failure)) from failure
     if not callable(function):
         raise error(f"{what} {name!r} is not a function")
     return cast("Callable[..., Any]", function)

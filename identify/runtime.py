@@ -61,7 +61,7 @@ STOPPED = 130
 """Exit status of a command after Ctrl-C."""
 
 
-class Noting:
+class InterruptHandler:
     """Handler of Ctrl-C that raises KeyboardInterrupt and records that Ctrl-C came.
 
     The record is needed because an import, or CasADi during the conversion of a matrix to an array,
@@ -78,77 +78,78 @@ class Noting:
 
 
 @contextmanager
-def noted() -> Iterator[Noting]:
-    """Record Ctrl-C while the block runs, for `raise_noted`.
+def record_interrupts() -> Iterator[InterruptHandler]:
+    """Record Ctrl-C while the block runs, for `raise_interrupt`.
 
     A nested block uses the handler of the outer block, so Ctrl-C is recorded in both.
     """
     old = signal.getsignal(signal.SIGINT)
-    noting = old if isinstance(old, Noting) else Noting()
-    if not _is_ours():
-        yield noting
+    handler = old if isinstance(old, InterruptHandler) else InterruptHandler()
+    if not _can_handle_interrupts():
+        yield handler
         return
-    signal.signal(signal.SIGINT, noting)
+    signal.signal(signal.SIGINT, handler)
     try:
-        yield noting
+        yield handler
     finally:
         signal.signal(signal.SIGINT, old)
 
 
-def raise_noted() -> None:
-    """Raise KeyboardInterrupt again if Ctrl-C came since the `noted` block began.
+def raise_interrupt() -> None:
+    """Raise KeyboardInterrupt again if Ctrl-C came since the `record_interrupts` block began.
 
     It is called before long work begins.
     """
     handler = signal.getsignal(signal.SIGINT)
-    if isinstance(handler, Noting) and handler.came:
+    if isinstance(handler, InterruptHandler) and handler.came:
         raise KeyboardInterrupt
 
 
 @contextmanager
-def loading() -> Iterator[None]:
-    """After Ctrl-C in a `noted` block, raise KeyboardInterrupt at each import in this block.
+def interruptible_imports() -> Iterator[None]:
+    """After Ctrl-C in a `record_interrupts` block, raise KeyboardInterrupt at each import in this
+    block.
 
     Libraries that look for optional libraries can swallow the exception. All further libraries
     would then be loaded before the command ends, which takes a minute on a busy machine. Clean-up
     code with imports does not belong in the block.
     """
-    reminder = _Reminder()
-    sys.meta_path.insert(0, reminder)
+    finder = _InterruptingFinder()
+    sys.meta_path.insert(0, finder)
     try:
         yield
     finally:
-        sys.meta_path.remove(reminder)
+        sys.meta_path.remove(finder)
 
 
-class _Reminder:
+class _InterruptingFinder:
     """Module finder that finds no modules, and raises KeyboardInterrupt after Ctrl-C."""
 
     def find_spec(self, *_: object) -> None:
-        raise_noted()
+        raise_interrupt()
 
 
 @contextmanager
-def honoured() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """After Ctrl-C, leave the block with KeyboardInterrupt.
 
     This holds even if code of a library has swallowed the exception or turned it into another
     error.
     """
-    with noted() as noting:
+    with record_interrupts() as handler:
         try:
             yield
         except Exception:
-            if not noting.came:
+            if not handler.came:
                 raise
-        if noting.came:
+        if handler.came:
             raise KeyboardInterrupt
 
 
 @contextmanager
-def held() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Delay Ctrl-C until the block has ended."""
-    if not _is_ours():
+    if not _can_handle_interrupts():
         yield
         return
     came = False
@@ -167,7 +168,7 @@ def held() -> Iterator[None]:
 
 
 @contextmanager
-def deaf_offspring() -> Iterator[None]:
+def shield_children() -> Iterator[None]:
     """Block Ctrl-C in the threads and processes that start in the block, and in their children.
 
     Only the main process handles Ctrl-C, and ends the others. Windows has no such signal mask, and
@@ -197,7 +198,7 @@ def _end_after(parent: BaseProcess | None) -> None:
         os._exit(1)  # sys.exit would end only this thread
 
 
-def _is_ours() -> bool:
+def _can_handle_interrupts() -> bool:
     """Return whether this thread can handle Ctrl-C.
 
     Only the main thread can. The signal can also be turned off, for example by nohup, or by the
@@ -213,11 +214,11 @@ def stoppable(command: Callable[P, None]) -> Callable[P, None]:
     A command that reports Ctrl-C itself, by typer.Exit, is not changed.
     """
 
-    import typer  # late, so that Ctrl-C during this import is handled by `honoured`
+    import typer  # late, so that Ctrl-C during this import is handled by `interruptible`
 
     @wraps(command)
     def run(*arguments: P.args, **options: P.kwargs) -> None:
-        with noted() as interrupt:
+        with record_interrupts() as interrupt:
             try:
                 command(*arguments, **options)
             except typer.Exit:

@@ -25,7 +25,7 @@ from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.files.atomic import write_text
-from identify.files.seal import opened_json, sealed_json
+from identify.files.digest import json_with_digest, json_without_digest
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ def trajectories_json(trajectories: TrajectorySet) -> str:
         "excitation": _to_dict(trajectories.excitation),
         "validation": [_to_dict(t) for t in trajectories.validation],
     }
-    return json.dumps(sealed_json(data), indent=1) + "\n"
+    return json.dumps(json_with_digest(data), indent=1) + "\n"
 
 
 def load_trajectories(path: Path | str) -> TrajectorySet:
@@ -308,7 +308,7 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
         The file cannot be read, is of another format, or is incomplete.
     """
     try:
-        data = opened_json(path, dict(json.loads(Path(path).read_text(encoding="utf-8"))))
+        data = json_without_digest(path, dict(json.loads(Path(path).read_text(encoding="utf-8"))))
         if data["format"] != FORMAT:
             raise TrajectoryError(f"{path} has format {data['format']!r}, expected {FORMAT!r}")
         index = data["observability_index"]

@@ -63,11 +63,11 @@ for package in map(importlib.import_module, OURS):
 USE = """
 from pathlib import Path
 from identify.progress import SilentProgress
-from identify.runtime import cores, deaf_offspring, held, noted
+from identify.runtime import cores, shield_children, delay_interrupts, record_interrupts
 from identify.studies.runner import run_study
 from tests.identify.study_rows import small_study
 
-with noted(), held(), deaf_offspring():
+with record_interrupts(), delay_interrupts(), shield_children():
     assert cores() >= 1
 print(*(run_study(small_study(), Path("a"), SilentProgress()).found for _ in range(2)))
 """

@@ -2,9 +2,9 @@
 
 An artefact with a row of six stickers stands on each measuring line. The test lengths are the
 distances from the first sticker to the other five. A measured length is the mean over a few
-exposures of the artefact at rest. Its error is the measured length minus the certified length. The
-standard limits the magnitude of the error. The standard's tests of sphere form and sphere spacing
-are omitted, because the targets are flat stickers.
+exposures of the artefact at rest. The error of a length is the measured minus the certified length.
+The standard limits the magnitude of the error. The standard's tests of sphere form and sphere
+spacing are omitted, because the targets are flat stickers.
 """
 
 from collections.abc import Callable

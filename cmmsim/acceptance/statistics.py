@@ -1,7 +1,7 @@
 """Statistics of errors with 95 % intervals, and published values for comparison.
 
-Makers and laboratories published these values for real instruments. They come from different tests
-with different volumes and targets, and were not measured with this package.
+The published values are those of makers and laboratories for real instruments. They come from
+different tests with different volumes and targets, and not from this package.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _figures(values: Array) -> dict[str, Array]:
 
 
 def interval_of_mean(values: Array) -> Interval:
-    """Return the 95 % interval of the mean of independent normal values (n,), n >= 2.
+    """Return Student's 95 % interval of the mean of independent normal values (n,), n >= 2.
 
     It is computed from Student's t distribution.
     """

@@ -77,9 +77,9 @@ class MeasuringVolume:
     def pose(self, along: Array, position: Array, turn: Array | None = None) -> Array:
         """Return the pose (6,) of an artefact in the base frame.
 
-        The artefact's origin is at ``position`` (3,) m in volume axes. Its x axis has the direction
-        ``along`` (3,), which need not have length one, and its side A faces the rig. Finally the
-        artefact is rotated by ``turn`` (3, 3) in its own axes.
+        The artefact's origin is at ``position`` (3,) m in volume axes. The artefact's x axis has
+        the direction ``along`` (3,) of any length, and side A faces the rig. Finally the artefact
+        is rotated by ``turn`` (3, 3) in its own axes.
         """
         x = along / np.linalg.norm(along)
         towards = np.array([0.0, 0.0, -1.0])

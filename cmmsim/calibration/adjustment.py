@@ -156,8 +156,8 @@ class _Normal:
     def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
         """Return the blocks of the matrix with its diagonal enlarged by the damping.
 
-        They are those of the common unknowns (v, c, c), the mixed blocks (v, c, 6), and those of
-        the boards (v, 6, 6).
+        The blocks are those of the common unknowns (v, c, c), the mixed ones (v, c, 6), and those
+        of the boards (v, 6, 6).
         """
         damped = self.matrix + damping * self.matrix * np.eye(self.matrix.shape[1])
         return damped[:, COMMON, COMMON], damped[:, COMMON, BOARD], damped[:, BOARD, BOARD]

@@ -79,9 +79,9 @@ class Board(Section):
     def symmetries(self) -> list[NDArray[np.int_]]:
         """Orders (points,) in which the points of the board look the same in a picture.
 
-        They belong to the unturned board, to half a turn, and to quarter turns if the board has as
-        many rows as columns. An asymmetric grid with an odd number of rows has one order only. A
-        picture does not show which order is the true one.
+        The orders belong to the unturned board, to half a turn, and to quarter turns if the board
+        has as many rows as columns. An asymmetric grid with an odd number of rows has one order
+        only. A picture does not show which order is the true one.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":

@@ -37,7 +37,7 @@ ROUNDING_PX = 1e-3
 # Largest number of rounds of rejecting images, and of correcting dot centres.
 ROUNDS = 5
 # The correction of the dot centres ends when it changes by less than this.
-SETTLED_PX = 1e-4
+TOLERANCE_PX = 1e-4
 # Plausible range of a board's longer side, m. Other values suggest a wrong unit.
 BOARD_SIDES = (0.01, 5.0)
 # Largest share of unused pairs without a warning.
@@ -192,7 +192,7 @@ def _with_true_centres(
         solved = adjust(board.points, corrected, solved.state, free)
         change = max(np.abs(now - before).max() for now, before in zip(offsets, last, strict=True))
         last = offsets
-        if change < SETTLED_PX:
+        if change < TOLERANCE_PX:
             break
     return solved, corrected
 

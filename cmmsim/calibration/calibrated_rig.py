@@ -217,8 +217,8 @@ def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
     """Return the template of a sensor file, given by a built-in name or a path.
 
     The completed file is meant for ``folder``, so a path in ``based_on`` becomes relative to it.
-    Raises the errors of read_sensor_file, and CalibrationError if the cameras are given as inline
-    tables.
+    Raises the exceptions of read_sensor_file, and CalibrationError if the cameras are given as
+    inline tables.
     """
     section = read_sensor_file(name).rig
     text = (

@@ -1,6 +1,6 @@
 """Comparison of two calibrations, each from one half of the pictures.
 
-It is the only check of a stated covariance that works without the true cameras.
+No other check of a stated covariance works without the true cameras.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ class Halves:
     def chance(self) -> float:
         """Standard deviation of the mean square of one split if the covariance is right.
 
-        It is not divided by the number of splits, because splits of the same pictures are not
+        The number of splits does not reduce it, because splits of the same pictures are not
         independent.
         """
         return float(np.sqrt(2.0 / self.squares.shape[1]))
@@ -44,7 +44,7 @@ class Halves:
     def verdict(self) -> str:
         """Statement on the covariance.
 
-        It calls the covariance wrong if the mean square differs from 1 by more than two standard
+        The covariance is called wrong if the mean square differs from 1 by more than two standard
         deviations of a single split.
         """
         if abs(self.mean_square - 1.0) <= 2.0 * self.chance:

@@ -101,7 +101,7 @@ def _squares(board: Board, level: float) -> list[Mesh]:
 def default_board(rig: StereoRig) -> Board:
     """Return a board of 13 x 9 dots that fills a third of the width of the left image.
 
-    This holds at the depth at which the optical axes meet.
+    The board is then at the depth at which the optical axes meet.
     """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
     return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))

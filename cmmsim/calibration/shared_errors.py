@@ -16,11 +16,11 @@ is the mean generalised design effect of Rao and Scott (1981, J. Am. Stat. Assoc
 a mean that is corrected for leverage.
 
 The sandwich estimator of Liang and Zeger (1986, Biometrika 73, 13-22) shows which directions are
-affected most. Its whitened form is N^-1/2 (sum s_v s_v') N^-1/2. Its rank is the number of views
-minus one, so it is singular for 10 to 25 views and 24 unknowns. It is therefore shrunk towards the
-unit matrix as in Ledoit and Wolf (2004, J. Multivar. Anal. 88, 365-411), and scaled to the mean
-eigenvalue above. An error that is common to all views, such as a constant bend of the board, cannot
-be found by comparing views.
+affected most. The whitened estimate is N^-1/2 (sum s_v s_v') N^-1/2. The rank of this matrix is the
+number of views minus one, so the matrix is singular for 10 to 25 views and 24 unknowns. The matrix
+is therefore shrunk towards the unit matrix as in Ledoit and Wolf (2004, J. Multivar. Anal. 88,
+365-411), and scaled to the mean eigenvalue above. An error that is common to all views, such as a
+constant bend of the board, cannot be found by comparing views.
 """
 
 from dataclasses import dataclass

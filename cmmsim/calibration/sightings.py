@@ -45,9 +45,9 @@ def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
     """Return pairs of the images in two folders, in the order of the sorted file names.
 
     The names in both folders are either all different (left_01.png, right_01.png) or all equal.
-    Raises CalibrationError if a folder is missing or empty, or if both folders are the same. It is
-    also raised, with the names that exist in one folder only, if the numbers of images differ or
-    if only some names are equal.
+    Raises CalibrationError if a folder is missing or empty, if both folders are the same, if the
+    numbers of images differ, or if only some names are equal. In the last two cases, the message
+    has the names that exist in one folder only.
     """
     if Path(left).resolve() == Path(right).resolve():
         raise CalibrationError(

@@ -1,8 +1,8 @@
 """Start values of the adjustment: OpenCV's calibration of each camera and of the pair.
 
 The points of a symmetric board can be numbered in several orders (half a turn, quarter turns), and
-the order is found for each picture separately. Both pictures of a pair must have the same order.
-This is the case if, and only if, the right camera stands in the same place for all pairs.
+the order is found for each picture separately. Both pictures of a pair have the same order if, and
+only if, all pairs agree on the place of the right camera.
 """
 
 from collections.abc import Sequence
@@ -32,15 +32,19 @@ MISFIT = (
 
 
 def start_values(
-    board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool, fix_aspect: bool
+    board: Board,
+    pairs: Sequence[PairView],
+    size: tuple[int, int],
+    radial_terms: bool,
+    fix_aspect: bool,
 ) -> tuple[RigState, list[PairView]]:
     """Return the first state, and the pairs with the same order of points in both images.
 
-    Pairs that do not fit the others lose both views. ``bend`` frees two radial terms of distortion,
-    and ``size`` is (width, height) px. Raises CalibrationError.
+    Pairs that do not fit the others lose both views. ``radial_terms`` frees two radial terms of
+    distortion, and ``size`` is (width, height) px. Raises CalibrationError.
     """
-    left, from_left = _one_camera(board, pairs, 0, size, bend, fix_aspect)
-    right, from_right = _one_camera(board, pairs, 1, size, bend, fix_aspect)
+    left, from_left = _one_camera(board, pairs, 0, size, radial_terms, fix_aspect)
+    right, from_right = _one_camera(board, pairs, 1, size, radial_terms, fix_aspect)
     read, from_right, right_from_left = _read_alike(board, pairs, from_left, from_right)
     right_from_left = _stereo(board, read, (left, right), size, right_from_left)
     boards = [
@@ -55,7 +59,7 @@ def _one_camera(
     pairs: Sequence[PairView],
     side: int,
     size: tuple[int, int],
-    bend: bool,
+    radial_terms: bool,
     fix_aspect: bool,
 ) -> tuple[Array, dict[int, Array]]:
     """Return the intrinsics (9,) of one camera, and camera_from_board (4, 4) for each of its views.
@@ -71,7 +75,7 @@ def _one_camera(
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
     # Two radial terms are enough for start values. The adjustment frees the other terms.
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    flags |= 0 if radial_terms else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0
     points = [board.points[view.index].astype(np.float32) for view in views.values()]
     pixels = [view.pixels.astype(np.float32) for view in views.values()]
@@ -192,7 +196,7 @@ def _alike(places: Array) -> Array:
 
 
 def _angles(places: Array, rotations: Array) -> Array:
-    """Return the angles (n, m) between rotations of transforms (n, 4, 4) and rotations (m, 3, 3).
+    """Return the angles (n, m), rad, between transforms (n, 4, 4) and rotations (m, 3, 3).
 
     They are in rad.
     """

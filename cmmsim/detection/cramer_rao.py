@@ -27,10 +27,10 @@ TABLE_STEPS = 64
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Return the Fisher information that a rounded and clipped grey value has about its mean.
+    """Return the Fisher information, 1 / (grey value)², of a rounded and clipped grey value on its
+    mean.
 
-    Its unit is 1 / (grey value)². Raises CmmError for a camera without noise, for which there is no
-    bound.
+    Raises CmmError for a camera without noise, for which there is no bound.
     """
     mean_grey = np.asarray(mean_grey, dtype=float)
     variance, slope = _analog_variance(mean_grey, noise)

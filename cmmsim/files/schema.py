@@ -33,7 +33,7 @@ NARROWEST_PSF = 0.1
 
 
 @dataclass(frozen=True)
-class Within:
+class Bounds:
     """Range of a number from ``least`` to ``most``, in a unit.
 
     If ``zero`` is True, 0 is valid as well.
@@ -74,21 +74,21 @@ class Within:
         }
 
 
-Length = Annotated[float, Within(1e-6, 1e3, "m")]
-Distance = Annotated[float, Within(1e-9, 1e3, "m", zero=True)]
-Place = Annotated[float, Within(-1e3, 1e3, "m")]
+Length = Annotated[float, Bounds(1e-6, 1e3, "m")]
+Distance = Annotated[float, Bounds(1e-9, 1e3, "m", zero=True)]
+Place = Annotated[float, Bounds(-1e3, 1e3, "m")]
 """Coordinate of a point."""
-Angle = Annotated[float, Within(-1e2, 1e2, "rad")]
-Component = Annotated[float, Within(-1e6, 1e6)]
+Angle = Annotated[float, Bounds(-1e2, 1e2, "rad")]
+Component = Annotated[float, Bounds(-1e6, 1e6)]
 """Component of a direction. The length of the direction has no meaning."""
-Pixels = Annotated[float, Within(1.0, 1e7, "px")]
-ImagePlace = Annotated[float, Within(-1e6, 1e6, "px")]
-Distortion = Annotated[float, Within(-1e4, 1e4)]
-Electrons = Annotated[float, Within(1e-6, 1e9, "electrons", zero=True)]
-GreyPerElectron = Annotated[float, Within(1e-9, 1e6, "grey values per electron")]
-Grey = Annotated[float, Within(1e-6, 1e5, "grey values", zero=True)]
-Frequency = Annotated[float, Within(1e-3, 1e6, "Hz")]
-Duration = Annotated[float, Within(1e-9, 1e4, "s", zero=True)]
+Pixels = Annotated[float, Bounds(1.0, 1e7, "px")]
+ImagePlace = Annotated[float, Bounds(-1e6, 1e6, "px")]
+Distortion = Annotated[float, Bounds(-1e4, 1e4)]
+Electrons = Annotated[float, Bounds(1e-6, 1e9, "electrons", zero=True)]
+GreyPerElectron = Annotated[float, Bounds(1e-9, 1e6, "grey values per electron")]
+Grey = Annotated[float, Bounds(1e-6, 1e5, "grey values", zero=True)]
+Frequency = Annotated[float, Bounds(1e-3, 1e6, "Hz")]
+Duration = Annotated[float, Bounds(1e-9, 1e4, "s", zero=True)]
 
 
 Vector3 = tuple[Place, Place, Place]

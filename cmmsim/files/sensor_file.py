@@ -148,7 +148,7 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     """Read the sensor file with a built-in name or a path.
 
     Changes replace entries of the file. Raises UnknownSensorError for a name that is neither, and
-    SensorFileError for wrong content; its message lists the valid keys for an unknown key.
+    SensorFileError for wrong content. For an unknown key, the message lists the valid keys.
     """
     require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")

@@ -70,21 +70,21 @@ class Distortion:
 
     def distort(self, points: Array) -> Array:
         """Return the distorted points (..., 2) of undistorted points (..., 2)."""
-        return self._bent(points)[0]
+        return self._distorted(points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """Return the derivatives (..., 2, 2) of distorted points by undistorted points (..., 2)."""
-        return self._bent(points)[1]
+        return self._distorted(points)[1]
 
-    def _bent(self, points: Array) -> tuple[Array, Array]:
+    def _distorted(self, points: Array) -> tuple[Array, Array]:
         # Imported late, because importing numba takes time.
-        from cmmsim.geometry.camera_kernels import bend_all
+        from cmmsim.geometry.camera_kernels import distort_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
-        bent = np.empty_like(flat)
+        distorted = np.empty_like(flat)
         slopes = np.empty((len(flat), 2, 2))
-        bend_all(np.array(astuple(self)), flat, bent, slopes)
-        return bent.reshape(points.shape), slopes.reshape(*points.shape, 2)
+        distort_points(np.array(astuple(self)), flat, distorted, slopes)
+        return distorted.reshape(points.shape), slopes.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
         """Tell whether the model is valid at undistorted points (..., 2).
@@ -101,14 +101,14 @@ class Distortion:
         an undistorted point inside the fold. Its value is then finite but meaningless.
         """
         # Imported late, because importing numba takes time.
-        from cmmsim.geometry.camera_kernels import straighten_all
+        from cmmsim.geometry.camera_kernels import undistort_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
-        straight = np.empty_like(flat)
+        undistorted = np.empty_like(flat)
         found = np.empty(len(flat), dtype=bool)
         reach = 0.999999 * self.fold_radius
-        straighten_all(np.array(astuple(self)), flat, reach, straight, found)
-        return straight.reshape(points.shape), found.reshape(points.shape[:-1])
+        undistort_points(np.array(astuple(self)), flat, reach, undistorted, found)
+        return undistorted.reshape(points.shape), found.reshape(points.shape[:-1])
 
 
 @dataclass(frozen=True)

@@ -24,18 +24,20 @@ TRIANGULATION_STEPS = 6
 
 
 class Cameras(NamedTuple):
-    """Two cameras with intrinsics ``figures`` (2, 9) and image sizes ``size`` (2, 2), px.
+    """Two cameras with ``intrinsics`` (2, 9) and image sizes ``size`` (2, 2), px.
 
     ``moves`` (2, 4, 4) transform points from their given axes into the axes of each camera.
     """
 
-    figures: Array
+    intrinsics: Array
     size: Array
     moves: Array
 
 
 @compiled
-def bend(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float) -> tuple:
+def distort_point(
+    x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float
+) -> tuple:
     """Return a distorted point x, y and its derivatives xx, xy, yy by the undistorted point.
 
     The derivative of x by y equals that of y by x.
@@ -54,24 +56,26 @@ def bend(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: flo
 
 
 @compiled
-def bend_all(lens: Array, points: Array, bent: Array, slopes: Array) -> None:
+def distort_points(lens: Array, points: Array, distorted: Array, slopes: Array) -> None:
     """Fill distorted points (n, 2) and their derivatives (n, 2, 2) by the undistorted points.
 
     ``lens`` (5,) is k1, k2, p1, p2, k3, and ``points`` (n, 2) are undistorted.
     """
     for n in range(len(points)):
-        x, y, xx, xy, yy = bend(
+        x, y, xx, xy, yy = distort_point(
             points[n, 0], points[n, 1], lens[0], lens[1], lens[2], lens[3], lens[4]
         )
-        bent[n, 0] = x
-        bent[n, 1] = y
+        distorted[n, 0] = x
+        distorted[n, 1] = y
         slopes[n, 0, 0] = xx
         slopes[n, 0, 1] = slopes[n, 1, 0] = xy
         slopes[n, 1, 1] = yy
 
 
 @compiled
-def straighten_all(lens: Array, points: Array, reach: float, straight: Array, found: Array) -> None:
+def undistort_points(
+    lens: Array, points: Array, reach: float, undistorted: Array, found: Array
+) -> None:
     """Fill the undistorted points (n, 2) of distorted points (n, 2) by Newton's method.
 
     ``found`` (n,) is True if an undistorted point exists within the radius ``reach`` and the image
@@ -87,7 +91,7 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
             if radius > reach:
                 x *= reach / radius
                 y *= reach / radius
-            u, v, xx, xy, yy = bend(x, y, lens[0], lens[1], lens[2], lens[3], lens[4])
+            u, v, xx, xy, yy = distort_point(x, y, lens[0], lens[1], lens[2], lens[3], lens[4])
             gap_x = points[n, 0] - u
             gap_y = points[n, 1] - v
             gap = max(abs(gap_x), abs(gap_y))
@@ -98,8 +102,8 @@ def straighten_all(lens: Array, points: Array, reach: float, straight: Array, fo
             steady = determinant if abs(determinant) > 1e-6 else 1e-6
             x += min(max((yy * gap_x - xy * gap_y) / steady, -1.0), 1.0)
             y += min(max((xx * gap_y - xy * gap_x) / steady, -1.0), 1.0)
-        straight[n, 0] = x
-        straight[n, 1] = y
+        undistorted[n, 0] = x
+        undistorted[n, 1] = y
         found[n] = gap <= CONVERGED and determinant > 0.0
 
 
@@ -109,7 +113,7 @@ def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
 
     The derivatives xx, xy, yx, yy of the pixel are with respect to the ideal pixel.
     """
-    u, v, xx, xy, yy = bend(
+    u, v, xx, xy, yy = distort_point(
         x_m / depth, y_m / depth, camera[4], camera[5], camera[6], camera[7], camera[8]
     )
     skewed = camera[0] / camera[1]
@@ -151,7 +155,7 @@ def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) 
 
 
 @compiled
-def slope_by(
+def point_derivatives(
     move: Array, by_u: float, by_v: float, f_x: float, f_y: float, t_x: float, t_y: float
 ) -> tuple:
     """Return the derivatives of one pixel coordinate by the three coordinates of a point.
@@ -171,15 +175,15 @@ def slope_by(
 
 
 @compiled
-def pull(
-    camera: Array, move: Array, point: Array, pixel: Array, spread: Array, parted: float,
+def add_image(
+    camera: Array, move: Array, point: Array, pixel: Array, spread: Array, line_variance: float,
     normal: Array, right: Array,
 ) -> float:  # fmt: skip
     """Add one image's contribution to the normal equations of a point (3,); return r' W r.
 
     r is the measured ``pixel`` (2,) minus the predicted pixel, J the derivative of the latter by
-    the point, and W the inverse of ``spread`` (2, 2) + ``parted`` I. J' W J is added to the six
-    entries ``normal`` (6,), and J' W r to ``right`` (3,).
+    the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I. J' W J is added to the
+    six entries ``normal`` (6,), and J' W r to ``right`` (3,).
     """
     x = move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3]
     y = move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3]
@@ -187,9 +191,9 @@ def pull(
     u, v, a, b, c, d = project(camera, x, y, z)
     r = pixel[0] - u
     s = pixel[1] - v
-    xx = spread[0, 0] + parted
+    xx = spread[0, 0] + line_variance
     xy = spread[0, 1]
-    yy = spread[1, 1] + parted
+    yy = spread[1, 1] + line_variance
     share = 1.0 / (xx * yy - xy * xy)
     near = 1.0 / z
     w_xx = share * yy
@@ -201,8 +205,8 @@ def pull(
     t_y = near * y
     along = w_xx * r + w_xy * s
     down = w_xy * r + w_yy * s
-    first_0, first_1, first_2 = slope_by(move, a, b, f_x, f_y, t_x, t_y)
-    second_0, second_1, second_2 = slope_by(move, c, d, f_x, f_y, t_x, t_y)
+    first_0, first_1, first_2 = point_derivatives(move, a, b, f_x, f_y, t_x, t_y)
+    second_0, second_1, second_2 = point_derivatives(move, c, d, f_x, f_y, t_x, t_y)
     right[0] += first_0 * along + second_0 * down
     right[1] += first_1 * along + second_1 * down
     right[2] += first_2 * along + second_2 * down
@@ -223,16 +227,17 @@ def pull(
 
 @compiled
 def triangulate(
-    cameras: Cameras, pixels: Array, spreads: Array, parted: float, settled: float,
+    cameras: Cameras, pixels: Array, spreads: Array, line_variance: float, step_tolerance: float,
     point: Array, scratch: Array,
 ) -> float:  # fmt: skip
     """Triangulate a point (3,) from two pixels (2, 2); return the gap of their rays.
 
     ``point`` contains a start value and is replaced by the result. The gap is the squared distance
     of the rays in units of the noise. ``spreads`` (2, 2, 2) are the covariances of the pixels.
-    ``parted`` px² is added to them for the weights and the gap, but not for the covariance of the
-    point. Gauss-Newton ends with a step below ``settled`` m. The first two rows of ``scratch``
-    (3, 6) are filled with the entries of the point's information matrix and of its covariance.
+    ``line_variance`` px² is added to them for the weights and the gap, but not for the covariance
+    of the point. Gauss-Newton ends with a step below ``step_tolerance`` m. The first two rows of
+    ``scratch`` (3, 6) are filled with the entries of the point's information matrix and of its
+    covariance.
     """
     normal = scratch[0]
     inverse = scratch[1]
@@ -244,9 +249,9 @@ def triangulate(
             right[k] = 0.0
         gap = 0.0
         for side in range(2):
-            gap += pull(
-                cameras.figures[side], cameras.moves[side], point, pixels[side], spreads[side],
-                parted, normal, right,
+            gap += add_image(
+                cameras.intrinsics[side], cameras.moves[side], point, pixels[side], spreads[side],
+                line_variance, normal, right,
             )  # fmt: skip
         inverse_entries(normal, inverse)
         x = inverse[0] * right[0] + inverse[1] * right[1] + inverse[2] * right[2]
@@ -256,11 +261,11 @@ def triangulate(
         point[0] += x
         point[1] += y
         point[2] += z
-        if x * x + y * y + z * z < settled * settled:
+        if x * x + y * y + z * z < step_tolerance * step_tolerance:
             break
     # The weights include errors of the rig, but the stated covariance is that of the noise alone.
     trace = spreads[0, 0, 0] + spreads[0, 1, 1] + spreads[1, 0, 0] + spreads[1, 1, 1]
-    share = 0.25 * trace / (0.25 * trace + parted)
+    share = 0.25 * trace / (0.25 * trace + line_variance)
     for k in range(6):
         normal[k] /= share
         inverse[k] *= share
@@ -269,7 +274,7 @@ def triangulate(
 
 @compiled
 def triangulate_all(
-    cameras: Cameras, pixels: Array, spreads: Array, parted: float, settled: float,
+    cameras: Cameras, pixels: Array, spreads: Array, line_variance: float, step_tolerance: float,
     points: Array, covariances: Array, gaps: Array,
 ) -> None:  # fmt: skip
     """Triangulate n points from pixels (n, 2, 2) with covariances ``spreads`` (n, 2, 2, 2).
@@ -280,6 +285,6 @@ def triangulate_all(
     scratch = np.empty((3, 6))
     for n in range(len(points)):
         gaps[n] = triangulate(
-            cameras, pixels[n], spreads[n], parted, settled, points[n], scratch
+            cameras, pixels[n], spreads[n], line_variance, step_tolerance, points[n], scratch
         )  # fmt: skip
         from_entries(scratch[1], covariances[n])

@@ -91,23 +91,23 @@ def sticker_outlines(
         centre = np.einsum("...ij,...j->...i", move[..., :3, :3], places) + move[..., :3, 3]
         normal = np.einsum("...ij,...j->...i", move[..., :3, :3], normals)
         middles, shape = project_discs(camera.ideal, centre, normal, np.full(len(places), radius))
-        bend_outlines(camera, middles, shape)
+        distort_outlines(camera, middles, shape)
         centres.append(middles)
         shapes.append(shape)
     return np.stack(centres), np.stack(shapes)
 
 
-def bend_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
+def distort_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
     """Replace ellipses of a perfect lens by those in the camera's image.
 
     They have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), px. The distortion is linearised within
     each ellipse.
     """
     # Imported late, because importing numba takes time.
-    from cmmsim.geometry.disc_kernels import bend_ellipses
+    from cmmsim.geometry.disc_kernels import distort_ellipses
 
     if not camera.distortion.is_zero:
-        bend_ellipses(camera.intrinsics, middles, shapes)
+        distort_ellipses(camera.intrinsics, middles, shapes)
 
 
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
@@ -120,10 +120,10 @@ def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius:
     projected = camera.project(centres)[0]
     if camera.distortion.is_zero:
         return middles - projected
-    return camera.distort(middles)[0] + bending(camera, middles, shapes) - projected
+    return camera.distort(middles)[0] + curvature_shift(camera, middles, shapes) - projected
 
 
-def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
+def curvature_shift(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
     """Return the shifts (n, 2) px of the centres of n ellipses due to the curvature of distortion.
 
     They are the centre of the ellipse fitted to the distorted ellipse, minus the distorted centre

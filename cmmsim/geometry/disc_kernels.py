@@ -49,7 +49,9 @@ def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
 
 
 @compiled
-def bent_root(xx: float, xy: float, yy: float, a: float, b: float, c: float, d: float) -> tuple:
+def distorted_root(
+    xx: float, xy: float, yy: float, a: float, b: float, c: float, d: float
+) -> tuple:
     """Return ``symmetric_root`` of J M J' for the Jacobian J = [[a, b], [c, d]] of a lens."""
     return symmetric_root(
         a * a * xx + 2.0 * a * b * xy + b * b * yy,
@@ -79,7 +81,7 @@ def project_all(
 
 
 @compiled
-def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
+def distort_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
     """Replace ellipses of a perfect lens by those of a distorting camera with intrinsics (9,).
 
     The distortion is linearised within each ellipse.
@@ -94,7 +96,7 @@ def bend_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
         xx = shape[0, 0] ** 2 + shape[0, 1] ** 2
         xy = shape[0, 1] * (shape[0, 0] + shape[1, 1])
         yy = shape[0, 1] ** 2 + shape[1, 1] ** 2
-        xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+        xx, xy, yy = distorted_root(xx, xy, yy, a, b, c, d)
         shape[0, 0] = xx
         shape[0, 1] = shape[1, 0] = xy
         shape[1, 1] = yy
@@ -171,7 +173,7 @@ SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 
 @compiled
-def carried(
+def fill_blur_weights(
     start: float, first: int, last: int, psf_px: float, across: Array, passed: Array
 ) -> None:
     """Fill g and P of ``disc_image`` at the coordinate ``start`` for pixels ``first`` to ``last``.
@@ -232,8 +234,8 @@ def blur_window(
         right = min(width - 1, math.floor(x + reach))
         low = max(0, math.ceil(y - reach))
         high = min(height - 1, math.floor(y + reach))
-        carried(x, left, right, psf_px, across_x, passed_x)
-        carried(y, low, high, psf_px, across_y, passed_y)
+        fill_blur_weights(x, left, right, psf_px, across_x, passed_x)
+        fill_blur_weights(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
             through = across_y[row] * n_x
             # For pixels farther left P is 1. The last loop adds these contributions from the right.

@@ -19,7 +19,7 @@ from cmmsim.geometry.matrix_kernels import (
     solve_factored,
     square_by,
 )
-from cmmsim.geometry.transform_kernels import carry, move_by
+from cmmsim.geometry.transform_kernels import move_by, transform_point
 
 
 @compiled
@@ -91,7 +91,7 @@ def solve_step(normal: Array, change: Array, covariance: Array) -> float:
 @compiled
 def turn_arm(transform: Array, place: Array, point: Array, arm: Array, gap: Array) -> None:
     """Fill the arm (3,) and the gap (3,) of a measured point (3,) with known ``place`` (3,)."""
-    carry(transform, place, 0.0, arm)
+    transform_point(transform, place, 0.0, arm)
     for i in range(3):
         gap[i] = point[i] - transform[i, 3] - arm[i]
 
@@ -131,7 +131,9 @@ def rigid_fits(
 
 
 @compiled
-def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
+def residual_covariance(
+    arm: Array, noise: Array, covariance: Array, half: Array, entries: Array
+) -> None:
     """Fill the entries (6,) of the covariance of a fitted point's residual.
 
     ``noise`` (3, 3) is the covariance of the point, and ``covariance`` (6, 6) that of the pose.
@@ -154,31 +156,31 @@ def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries
 
 @compiled
 def residual_misfit(
-    gap: Array, noise: Array, left: Array, smallest: float, inverse: Array
+    gap: Array, noise: Array, residual_entries: Array, smallest: float, inverse: Array
 ) -> float:
     """Return the squared residual ``gap`` (3,) in units of its own covariance.
 
-    ``left`` (6,) has the entries of that covariance, see ``left_noise``. A direction does not count
-    if the variance of the residual is below the share ``smallest`` of the variance of the point's
-    ``noise`` (3, 3). In such a direction the point alone determines the pose. ``inverse`` (6,) is
-    overwritten.
+    ``residual_entries`` (6,) has the entries of that covariance, see ``residual_covariance``. A
+    direction does not count if the variance of the residual is below the share ``smallest`` of the
+    variance of the point's ``noise`` (3, 3). In such a direction the point alone determines the
+    pose. ``inverse`` (6,) is overwritten.
     """
-    xx = left[0] - smallest * noise[0, 0]
-    xy = left[1] - smallest * noise[0, 1]
-    xz = left[2] - smallest * noise[0, 2]
-    yy = left[3] - smallest * noise[1, 1]
-    yz = left[4] - smallest * noise[1, 2]
-    zz = left[5] - smallest * noise[2, 2]
+    xx = residual_entries[0] - smallest * noise[0, 0]
+    xy = residual_entries[1] - smallest * noise[0, 1]
+    xz = residual_entries[2] - smallest * noise[0, 2]
+    yy = residual_entries[3] - smallest * noise[1, 1]
+    yz = residual_entries[4] - smallest * noise[1, 2]
+    zz = residual_entries[5] - smallest * noise[2, 2]
     minor = xx * yy - xy * xy
     whole = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
     if xx > 0.0 and minor > 0.0 and whole > 0.0:
-        inverse_entries(left, inverse)
+        inverse_entries(residual_entries, inverse)
         return square_by(inverse, gap[0], gap[1], gap[2])
-    return checkable_misfit(gap, noise, left, smallest)
+    return checkable_misfit(gap, noise, residual_entries, smallest)
 
 
 @compiled
-def checkable_misfit(gap: Array, noise: Array, left: Array, smallest: float) -> float:
+def checkable_misfit(gap: Array, noise: Array, residual_entries: Array, smallest: float) -> float:
     """Return ``residual_misfit`` from only the directions with enough variance."""
     lower = noise.copy()
     factor(lower)
@@ -190,7 +192,7 @@ def checkable_misfit(gap: Array, noise: Array, left: Array, smallest: float) -> 
                 rest -= lower[i, j] * root[j, k]
             root[i, k] = rest / lower[i, i]
     matrix = np.empty((3, 3))
-    from_entries(left, matrix)
+    from_entries(residual_entries, matrix)
     shares, axes = np.linalg.eigh(root @ matrix @ root.T)
     whitened = axes.T @ (root @ gap)
     total = 0.0
@@ -213,9 +215,9 @@ def residual_misfits(
     arm = np.empty(3)
     gap = np.empty(3)
     half = np.empty((3, 6))
-    left = np.empty(6)
+    residual_entries = np.empty(6)
     inverse = np.empty(6)
     for n in range(len(points)):
         turn_arm(transforms[of[n]], places[n], points[n], arm, gap)
-        left_noise(arm, covariances[n], spreads[of[n]], half, left)
-        misfits[n] = residual_misfit(gap, covariances[n], left, smallest, inverse)
+        residual_covariance(arm, covariances[n], spreads[of[n]], half, residual_entries)
+        misfits[n] = residual_misfit(gap, covariances[n], residual_entries, smallest, inverse)

@@ -30,7 +30,7 @@ translation and the rotation vector of ``right_from_left``.
 """
 
 # A triangulation ends with a step shorter than this, m.
-SETTLED = 1e-8
+STEP_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class StereoRig:
         return self if perfect else replace(self, left=self.left.ideal, right=self.right.ideal)
 
     @cached_property
-    def figures(self) -> Cameras:
+    def kernel_cameras(self) -> Cameras:
         """Both cameras in the form of the compiled functions, for points in the camera frame C."""
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import Cameras
@@ -218,7 +218,7 @@ def _look_at(eye: Array, target: Array) -> Array:
 class StereoPoints:
     """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
 
-    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise. It has one
+    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, with one
     degree of freedom.
     """
 
@@ -234,12 +234,12 @@ def triangulate(
     left_covariances: Array,
     right_covariances: Array,
     near: Array | None = None,
-    parted: float = 0.0,
+    line_variance: float = 0.0,
 ) -> StereoPoints:
     """Return the points at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2) px².
 
-    The start values are ``near`` (n, 3), or the results of the linear method. ``parted`` px² is
-    added to the covariances for the weights and the ray gap, but not for the covariances of the
+    The start values are ``near`` (n, 3), or the results of the linear method. ``line_variance`` px²
+    is added to the covariances for the weights and the ray gap, but not for the covariances of the
     points.
     """
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
@@ -256,7 +256,16 @@ def triangulate(
     gaps = np.empty(len(points))
     pixels = np.stack([left, right], axis=1)
     spreads = np.stack([left_covariances, right_covariances], axis=1)
-    triangulate_all(rig.figures, pixels, spreads, parted, SETTLED, points, covariances, gaps)
+    triangulate_all(
+        rig.kernel_cameras,
+        pixels,
+        spreads,
+        line_variance,
+        STEP_TOLERANCE,
+        points,
+        covariances,
+        gaps,
+    )
     return StereoPoints(points, covariances, gaps)
 
 

@@ -73,8 +73,8 @@ def multiply(first: Array, second: Array, product: Array) -> None:
 
 
 @compiled
-def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
-    """Fill ``carried`` (3,) with a point (3,) transformed by a transform (4, 4).
+def transform_point(move: Array, point: Array, shift: float, transformed: Array) -> None:
+    """Fill ``transformed`` (3,) with a point (3,) transformed by a transform (4, 4).
 
     ``shift`` is 1 for a point, and 0 for a direction, which is only rotated.
     """
@@ -82,7 +82,7 @@ def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
     y = point[1]
     z = point[2]
     for i in range(3):
-        carried[i] = shift * move[i, 3] + move[i, 0] * x + move[i, 1] * y + move[i, 2] * z
+        transformed[i] = shift * move[i, 3] + move[i, 0] * x + move[i, 1] * y + move[i, 2] * z
 
 
 @compiled
@@ -108,8 +108,8 @@ def move_by(transform: Array, change: Array) -> None:
 def make_rigid(transform: Array) -> None:
     """Replace the rotation of a transform (4,4) by the nearest orthogonal matrix.
 
-    Newton's steps R (3 I - R'R) / 2 converge quadratically. This is needed if each transform is
-    computed as a product from the one before, because the rounding errors double with each product.
+    Newton's steps R (3 I - R'R) / 2 converge quadratically. The replacement is needed if each
+    transform is a product of the one before, because rounding errors double with each product.
     """
     square = np.empty((3, 3))
     row = np.empty(3)
@@ -132,8 +132,8 @@ def make_rigid(transform: Array) -> None:
 def farthest_from_rigid(transforms: Array) -> float:
     """Return the largest deviation of transforms (k, 4, 4) from rigid transforms.
 
-    It is the largest deviation of the entries of R'R from the unit matrix, and of the last rows
-    from [0 0 0 1]. It is infinite if an entry is not finite or a transform is mirrored.
+    The entries of R'R are compared with the unit matrix, and the last rows with [0 0 0 1]. The
+    result is infinite if an entry is not finite or a transform is mirrored.
     """
     farthest = 0.0
     for k in range(len(transforms)):

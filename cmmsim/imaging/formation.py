@@ -177,11 +177,13 @@ class ImageFormation:
         ]
         drawn = self._drawn(finer, drawn_size * sub_pixels, -(-supersampling // sub_pixels))
         response = pixel_response(self.optics.psf_px, size, margin, sub_pixels)
-        bent = [
-            _bent(side, windows, (places - at[:, None, None] + 0.5) * sub_pixels - 0.5, fine_size)
+        distorted = [
+            _distorted(
+                side, windows, (places - at[:, None, None] + 0.5) * sub_pixels - 0.5, fine_size
+            )
             for side, windows, places, at in zip(sides, drawn, nodes, first, strict=True)
         ]
-        return [np.asarray(response @ fine @ response.T) for fine in bent]
+        return [np.asarray(response @ fine @ response.T) for fine in distorted]
 
 
 def _shown_places(
@@ -211,7 +213,7 @@ def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
     return first, -(-(reach + REACH + 1) // SIDE_STEP) * SIDE_STEP
 
 
-def _bent(
+def _distorted(
     side: Side, drawn: NDArray[np.float32], nodes: Array, fine_size: int
 ) -> NDArray[np.float32]:
     """Return distorted fine windows (k, fine_size, fine_size).
@@ -247,9 +249,9 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
 def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
     """Return the weights of drawn sub-pixels in each pixel of a row.
 
-    They have the shape (size, (size + 2 margin) sub_pixels). They average a Gaussian of standard
-    deviation ``psf_px`` over each pixel. Each drawn sub-pixel is a mean over its own width, so the
-    sum over sub-pixels is the exact mean over a pixel.
+    The weights (size, (size + 2 margin) sub_pixels) average a Gaussian of standard deviation
+    ``psf_px`` over each pixel. Each drawn sub-pixel is a mean over its own width, so the sum over
+    sub-pixels is the exact mean over a pixel.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(

@@ -41,7 +41,7 @@ class Discs(NamedTuple):
 
 
 @compiled
-def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
+def polygon_contains(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
     """Tell whether a box with its first corner at (x, y) lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):
         a, b, c = half_planes[k]
@@ -82,7 +82,9 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
 
 
 @compiled
-def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array) -> None:
+def draw_solids(
+    image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array
+) -> None:
     """Draw solids over a window (h, w) and store the shares of pixels that they cover.
 
     The first pixel of the window begins at (x, y). The shares are stored in ``covers`` (slots, h,
@@ -95,7 +97,7 @@ def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, cov
         if high_x <= x or low_x >= x + width or high_y <= y or low_y >= y + height:
             continue
         half_planes = solids.half_planes[solids.starts[k] : solids.starts[k + 1]]
-        if polygon_holds(half_planes, x, y, width, height):
+        if polygon_contains(half_planes, x, y, width, height):
             share[:] = 1.0
         else:
             cover_by_polygon(half_planes, x, y, lines, share)
@@ -107,7 +109,7 @@ def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, cov
 
 
 @compiled
-def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
+def visible_share(behind: Array, covers: Array, row: int, column: int) -> float:
     """Return the share of a pixel that is not covered by any solid in front of a disc."""
     shown = 1.0
     for slot in range(len(behind)):
@@ -117,7 +119,7 @@ def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
 
 
 @compiled
-def lay_disc(
+def draw_disc(
     image: Array, centre_x: float, centre_y: float, k: int, discs: Discs, covers: Array
 ) -> None:
     """Draw disc ``k`` over a window (h, w). Its centre is in px of the window."""
@@ -138,13 +140,13 @@ def lay_disc(
         under = image[row, first:last]
         if discs.behind[k].any():
             for column in range(len(own)):
-                own[column] *= shown_share(discs.behind[k], covers, row, first + column)
+                own[column] *= visible_share(discs.behind[k], covers, row, first + column)
         for column in range(len(own)):
             under[column] += own[column] * (level - under[column])
 
 
 @compiled
-def lay_layers(
+def draw_layers(
     images: Array, group: Array, corners: Array, solids: Solids, lines: int, discs: Discs
 ) -> None:
     """Draw solids, then discs, over the windows ``images[group]`` (n, h, w).
@@ -158,7 +160,7 @@ def lay_layers(
         x = corners[n, 0]
         y = corners[n, 1]
         covers[:] = 0.0
-        lay_solids(image, x - 0.5, y - 0.5, solids, lines, covers)
+        draw_solids(image, x - 0.5, y - 0.5, solids, lines, covers)
         for k in range(len(discs.levels)):
             gap_x = discs.centres[k, 0] - x
             gap_y = discs.centres[k, 1] - y
@@ -168,18 +170,18 @@ def lay_layers(
                 and gap_y + discs.extents[k, 1] > -0.5
                 and gap_y - discs.extents[k, 1] < height - 0.5
             ):
-                lay_disc(image, gap_x, gap_y, k, discs, covers)
+                draw_disc(image, gap_x, gap_y, k, discs, covers)
 
 
 @compiled
-def enters(
+def occludes(
     eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float
 ) -> bool:
     """Tell whether a solid stands between ``eye`` (3,) and ``point`` (3,).
 
-    The solid is normal . x + offset <= ``wider``; all coordinates are in its axes. A point lies on
-    the solid, and not behind it, if the line of sight enters the solid within the last share
-    ``touching`` of its length.
+    The solid is normal . x + offset <= ``wider``; all coordinates are in the solid's axes. A point
+    lies on the solid, and not behind it, if the line of sight enters the solid within the last
+    share ``touching`` of the line's length.
     """
     enter = -np.inf
     leave = np.inf
@@ -203,7 +205,7 @@ def enters(
 
 
 @compiled
-def hidden_points(
+def occluded_points(
     body_from_camera: Array,
     points: Array,
     normals: Array,
@@ -222,4 +224,4 @@ def hidden_points(
             point[i] = eye[i] = body_from_camera[i, 3]
             for j in range(3):
                 point[i] += body_from_camera[i, j] * points[n, j]
-        hidden[n] = enters(eye, point, normals, offsets, 0.0, touching)
+        hidden[n] = occludes(eye, point, normals, offsets, 0.0, touching)

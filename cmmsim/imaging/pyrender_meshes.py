@@ -35,7 +35,7 @@ BAND_REACH = 5.0
 RIM_PX = 0.5
 # Smallest distance in m between a disc and the solid below it.
 CLEARANCE = 1e-6
-# Ratio of a solid's volume to that of a cube with its longest side. Solids with a smaller ratio
+# Smallest ratio of a solid's volume to that of a cube with the solid's longest side. Flatter solids
 # are drawn with depth tests.
 FLATTEST = 1e-6
 # Smallest slope between a ray and a disc's plane. Flatter rays count as parallel to the plane.
@@ -63,7 +63,8 @@ def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
     """Return the triangles of a stack of discs for a window that is cleared to the lowest disc's
     level.
 
-    They are as in ``disc_mesh``, but a band of ``level`` around the lowest disc replaces this disc.
+    The triangles are as in ``disc_mesh``, but a band of ``level`` around the lowest disc replaces
+    this disc.
     """
     lowest, *grounds = stack.discs[:-1]
     corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
@@ -154,7 +155,7 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 
 @dataclass(frozen=True)
-class Laid:
+class PaintedWindows:
     """Windows that need no depth test.
 
     ``solid`` (n,) is the patch of a window's only solid, or -1 if a depth test is needed.
@@ -167,7 +168,7 @@ class Laid:
     ringed: NDArray[np.int_]
 
 
-class LaidSolids:
+class PaintedSolids:
     """Convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
     ``levels`` (patches,) is the level of a solid or of the lowest disc of a stack, and NaN for
@@ -224,9 +225,9 @@ class LaidSolids:
             for k, solid in self._solids.items()
         }
 
-    def laid(self, views: Views, reaching: NDArray[np.bool_]) -> Laid:
+    def painted(self, views: Views, reaching: NDArray[np.bool_]) -> PaintedWindows:
         """Tell which windows need no depth test; ``reaching`` comes from `Drawable.reaching`."""
-        laid = Laid(
+        laid = PaintedWindows(
             np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
         )
         # At most two patches: a solid and a stack of discs.

@@ -1,16 +1,17 @@
-"""Rendering of many small windows in one pass. It is the only module that imports pyrender.
+"""Rendering of many small windows in one pass. No other module imports pyrender.
 
 pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers have
 one channel only, which draws faster than pyrender's four. One large frame buffer, the atlas, has a
-cell for each window. Each window is drawn into its cell with its own projection. It is enlarged by
-the supersampling factor and then averaged in linear light. Every drawn pixel has one sample:
-multisampling would take more time than its accuracy on the stickers' soft rims is worth.
+cell for each window. Each window is drawn into its cell with its own projection, enlarged by the
+supersampling factor. The drawn pixels are then averaged in linear light. Every drawn pixel has one
+sample: multisampling would take more time than its accuracy on the stickers' soft rims is worth.
 
 In a cell, only patches whose bounding box reaches into it are drawn. Projection and
 camera_from_body are multiplied in double precision, so that the shader gets one well-scaled matrix.
 Depth tests are used only where they are needed. If a solid or the dark ring of a sticker fills a
-cell, the cell is cleared to its level, see ``LaidSolids``. Each piece of the atlas is sent to
-OpenGL as soon as it is ready. OpenGL draws it while the next piece is prepared.
+cell, the cell is cleared to the level of the solid or ring, see ``PaintedSolids``. Each piece of
+the atlas is sent to OpenGL as soon as it is ready. OpenGL draws it while the next piece is
+prepared.
 """
 
 import ctypes
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
-from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh, ringed_mesh
+from cmmsim.imaging.pyrender_meshes import PaintedSolids, disc_mesh, ringed_mesh
 from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch
 
@@ -114,7 +115,7 @@ class _Uploaded:
 
     patches: dict[float, list[_Patch]]
     ringed: dict[float, list[_Patch]]
-    solids: LaidSolids
+    solids: PaintedSolids
 
 
 class _Atlas:
@@ -166,7 +167,7 @@ class _Atlas:
         frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
         reaching = drawable.reaching(views)
-        laid = known.solids.laid(views, reaching)
+        laid = known.solids.painted(views, reaching)
         reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
         places = [
             ((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))
@@ -191,7 +192,7 @@ class _Atlas:
                 p: address + k * strides[0] + int(drawable.body_index[p]) * strides[1]
                 for p in shown[k]
             }
-            draw = self._draw_by_depth if deep else self._lay
+            draw = self._draw_by_depth if deep else self._draw_in_order
             draw(matrices, (known.ringed if ringed else known.patches)[samples])
         self._bind_mesh(0)
         return frame_buffer.read()
@@ -207,7 +208,7 @@ class _Atlas:
             self._draw_elements(triangles, patches[p].indices, unsigned, 0)
         gl.glDisable(gl.GL_DEPTH_TEST)
 
-    def _lay(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
+    def _draw_in_order(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
         """Draw the patches of a cell over each other: the solid, then the stack that lies on it.
 
         ``matrices`` are addresses by patch. All patches belong to one body.
@@ -242,7 +243,7 @@ class _Atlas:
         """
         known = self._known.get(drawable)
         if known is None:
-            known = self._known[drawable] = _Uploaded({}, {}, LaidSolids(drawable))
+            known = self._known[drawable] = _Uploaded({}, {}, PaintedSolids(drawable))
         if samples not in known.patches:
             sample = drawable.distance / samples
             solids = known.solids

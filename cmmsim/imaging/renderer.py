@@ -1,7 +1,7 @@
 """Interface of all renderers, their input, and the choice of a renderer by name.
 
-A renderer draws windows of cameras with perfect lenses. In each window it draws the patches that
-reach into it.
+A renderer draws windows of cameras with perfect lenses. A patch is a piece of a body. In each
+window, the patches that reach into the window are drawn.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ RING_SUNK = 0.0001
 # m: the direction of a shorter rod would be dominated by rounding errors.
 SHORTEST_ROD = 1e-9
 # A point counts as lying on a solid, and not behind it, if the line of sight enters the solid
-# within this last share of its length.
+# within this last share of the line's length.
 TOUCHING = 1e-6
 
 
@@ -49,11 +49,11 @@ class ConvexSolid:
     def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
         """Tell whether the solid stands between the camera and points (..., 3) in camera axes."""
         # Imported late, because importing numba takes time.
-        from cmmsim.imaging.layer_kernels import hidden_points
+        from cmmsim.imaging.layer_kernels import occluded_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
         hidden = np.empty(len(flat), dtype=bool)
-        hidden_points(
+        occluded_points(
             invert(camera_from_body), flat, self._normals, self._offsets, TOUCHING, hidden
         )
         return hidden.reshape(points.shape[:-1])

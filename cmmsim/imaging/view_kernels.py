@@ -9,7 +9,7 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
-from cmmsim.imaging.layer_kernels import Discs, Solids, enters, lay_layers
+from cmmsim.imaging.layer_kernels import Discs, Solids, draw_layers, occludes
 
 # Number of points on a disc's rim that are tested, in addition to its centre, for solids in front.
 PROBES = 8
@@ -132,7 +132,7 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 
 @compiled
-def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
+def visible_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
     """Return the discs that face the camera, from far to near and larger before smaller.
 
     The results are their numbers (m,); the centres (m, 2), shapes (m, 2, 2) and extents (m, 2) of
@@ -182,7 +182,7 @@ def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near
 
 
 @compiled
-def stand_before(
+def occlusion_mask(
     scene: Scene,
     moves: Array,
     owners: Array,
@@ -218,7 +218,7 @@ def stand_before(
                     point[i] = eye[i]
                     for j in range(3):
                         point[i] += move[j, i] * probes[n, p, j]
-                if enters(
+                if occludes(
                     eye, point, scene.face_normals[own], scene.face_offsets[own], 0.0, touching
                 ):
                     slots[k] = hiding
@@ -229,7 +229,9 @@ def stand_before(
 
 
 @compiled
-def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array) -> Solids:
+def solid_outlines(
+    scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array
+) -> Solids:
     """Return the outlines of solids that lie wholly in front of the camera, from far to near.
 
     ``slots`` (s,) are the indices under which the shares that solids cover are stored, or -1.
@@ -292,13 +294,13 @@ def draw_view(
 ) -> None:
     """Draw the windows ``images[group]`` (n, h, w) of one exposure of a camera with a perfect lens.
 
-    They have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal`` (2,) and
-    the principal point ``principal`` (2,), px. Bodies stand at camera_from_body ``moves`` (b, 4,
-    4).
+    The windows have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal``
+    (2,) and the principal point ``principal`` (2,), px. Bodies stand at camera_from_body ``moves``
+    (b, 4, 4).
     """
-    kept, pixels, shapes, extents, probes = shown_discs(scene, moves, focal, principal, near)
+    kept, pixels, shapes, extents, probes = visible_discs(scene, moves, focal, principal, near)
     slots = np.empty(len(scene.bodies), np.int64)
-    behind = stand_before(scene, moves, scene.owners[kept], probes, near, touching, slots)
-    solids = outlined(scene, moves, focal, principal, slots)
+    behind = occlusion_mask(scene, moves, scene.owners[kept], probes, near, touching, slots)
+    solids = solid_outlines(scene, moves, focal, principal, slots)
     discs = Discs(pixels, shapes, extents, scene.disc_levels[kept], behind)
-    lay_layers(images, group, corners, solids, lines, discs)
+    draw_layers(images, group, corners, solids, lines, discs)

@@ -4,8 +4,9 @@ The taught places are fitted to the observed stickers. Stickers are rejected one
 one first, in two cases:
 
 - The place of a sticker differs from the place that the other stickers predict. This test is data
-  snooping. The residual r is compared with its own covariance S - J C J'. This covariance is
-  smaller than that of the sticker's noise, S, because each sticker pulls the pose towards itself.
+  snooping. The residual is compared with its own covariance S - J C J'. S is the covariance of the
+  sticker's noise, C the covariance of the pose, and J the derivative of the sticker's place by the
+  pose. S - J C J' is smaller than S, because each sticker pulls the pose towards itself.
 - The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
   sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
@@ -39,7 +40,7 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.measuring.observation import Observer, StickerObservation
 
 if TYPE_CHECKING:
-    from cmmsim.measuring.solver_kernels import Belief, Outlines
+    from cmmsim.measuring.solver_kernels import Outlines, SolverLimits
 
 # Probability that a good sticker is rejected, for its place and for each of its two ellipses.
 CHANCE = 1e-4
@@ -53,18 +54,18 @@ FEWEST = 4
 # Smallest share of a sticker's noise that must appear in its residual; below, it is not tested.
 SMALLEST_SHARE = 0.01
 # rad: a fit ends after a step with a smaller rotation.
-SETTLED = 1e-8
+STEP_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
 class SolvedFrames:
     """Poses of a body in f frames, and the stickers from which they were computed.
 
-    ``moves`` (f,4,4) are camera_from_body. ``covariances`` (f,6,6) are the covariances of their
-    small errors [dt, dphi]. ``stickers`` are the k stickers of all frames; their covariances are
-    enlarged if residuals are larger than noise. ``used`` (k,) is False for rejected stickers. The
-    stickers of frame f begin at ``starts[f]`` and end at ``starts[f + 1]``. ``verdicts`` (f,
-    COLUMNS) states why frames are lost. ``places`` (n, 3) are the taught places on ``body``.
+    ``moves`` (f,4,4) are camera_from_body, whose small errors [dt, dphi] have the ``covariances``
+    (f,6,6). ``stickers`` are the k stickers of all frames; their covariances are enlarged if
+    residuals are larger than noise. ``used`` (k,) is False for rejected stickers. The stickers of
+    frame j begin at ``starts[j]`` and end at ``starts[j + 1]``. ``verdicts`` (f, COLUMNS) states
+    why frames are lost. ``places`` (n, 3) are the taught places on ``body``.
     """
 
     moves: Array
@@ -84,7 +85,7 @@ class SolvedFrames:
     def of(self, frame: int) -> StickerObservation:
         """Return the stickers from which the pose of a frame was computed.
 
-        Their index refers to the body's stickers.
+        The ``index`` of the result refers to the body's stickers.
         """
         own = np.zeros(len(self.used), dtype=bool)
         own[self.starts[frame] : self.starts[frame + 1]] = True
@@ -109,7 +110,8 @@ def solve_frames(
 ) -> SolvedFrames:
     """Solve f frames near camera_from_body ``near`` (f,4,4), with stickers taught at ``places``.
 
-    The observation's index of sticker k in frame f is f n + k, as in ``Observer.read``.
+    In ``seen``, sticker k of frame j has the index j n + k, as in ``Observer.read``. There are n
+    places.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring import solver_kernels as kernels
@@ -119,7 +121,7 @@ def solve_frames(
     starts = np.searchsorted(of, np.arange(frames + 1)).astype(int)
     used = np.ones(len(of), dtype=bool)
     covariances = np.array(seen.covariances)
-    rows = kernels.Seen(
+    rows = kernels.ObservedStickers(
         used,
         np.ascontiguousarray(seen.points),
         np.linalg.inv(covariances),
@@ -131,9 +133,9 @@ def solve_frames(
     spreads = np.zeros((frames, 6, 6))
     verdicts = np.zeros((frames, kernels.COLUMNS))
     outlines = _outlines(seen, observer, body.sticker_normals[sticker])
-    belief = belief_for(len(places))
+    limits = solver_limits(len(places))
     taught = np.ascontiguousarray(places[sticker])
-    kernels.solve_frames(rows, taught, outlines, belief, starts, moves, spreads, verdicts)
+    kernels.solve_frames(rows, taught, outlines, limits, starts, moves, spreads, verdicts)
     return SolvedFrames(
         moves,
         spreads,
@@ -152,7 +154,7 @@ def consistent(
     """Return the stickers of one frame that agree with each other, and the pose from them.
 
     The pose is camera_from_body (4, 4) with its covariance (6, 6). ``near`` (4, 4) is a first guess
-    of it. Raises LostError if too few stickers agree.
+    of the pose. Raises LostError if too few stickers agree.
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
@@ -160,18 +162,18 @@ def consistent(
     return solved.of(0), solved.moves[0], solved.covariances[0]
 
 
-def belief_for(stickers: int, settled: float = SETTLED) -> Belief:
+def solver_limits(stickers: int, step_tolerance: float = STEP_TOLERANCE) -> SolverLimits:
     """Return the compiled solver's limits for frames with at most this number of stickers."""
     # Imported late, because importing numba takes time.
-    from cmmsim.measuring.solver_kernels import Belief
+    from cmmsim.measuring.solver_kernels import SolverLimits
 
-    return Belief(
+    return SolverLimits(
         LARGEST_MISFIT,
         LARGEST_EXCESS,
         FEWEST,
         SMALLEST_SHARE,
         SMALLEST_SPREAD,
-        settled,
+        step_tolerance,
         _largest_totals(3 * stickers),
     )
 
@@ -218,7 +220,7 @@ def no_outlines(rig: StereoRig) -> Outlines:
     from cmmsim.measuring.solver_kernels import Outlines
 
     shapes = np.zeros((0, 2, 3))
-    return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.figures)
+    return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.kernel_cameras)
 
 
 def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:

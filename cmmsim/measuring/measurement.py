@@ -80,8 +80,8 @@ class Measurement:
     def common_covariance(self) -> Array:
         """Covariance (6, 6) of the common part; NaN if it is not known.
 
-        It is not known for the method "planes" if the rig is not known exactly. It is computed on
-        first use, because this takes longer than a measurement.
+        With the method "planes", it is known only if the rig is known exactly. The covariance is
+        computed on first use, because its computation takes longer than a measurement.
         """
         return self.common_at(self.pose)
 

@@ -33,7 +33,8 @@ from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages, Windows
 
-# Longest smear that can be measured: about the size of a sticker.
+# A smear is the movement of a sticker's image during the exposure. The longest smear that can be
+# measured is about the size of a sticker.
 LONGEST_SMEAR_PX = 8.0
 # Shortest smear that changes the result of a fit, in standard deviations of the point spread.
 SHORTEST_SMEAR = 1.5
@@ -47,12 +48,12 @@ class DetectionSettings:
 
     ``window_size`` and ``fit_size`` are the sides of windows and of fitted parts, px. ``radius`` is
     the radius of a sticker, m. ``largest_ray_gap`` limits the squared distance between the two rays
-    of a sticker, in units of its variance; 25 means five sigma. ``centre_error_px`` is the rms of
-    systematic errors of a centre, such as errors of the image formation. The squares of this error
-    and of the detector's bias are added to the variances of a centre. ``line_error_px`` is the
-    standard deviation of an image's distance from its epipolar line due to errors of the rig; it
-    increases the allowed distance between two rays. ``exposed_share`` is the ratio of exposure time
-    to frame period.
+    of a sticker, in units of the distance's variance; 25 means five sigma. ``centre_error_px`` is
+    the rms of systematic errors of a centre, such as errors of the image formation. The squares of
+    this error and of the detector's bias are added to the variances of a centre. Errors of the rig
+    move images off their epipolar lines. ``line_error_px`` is the standard deviation of this
+    distance, and increases the allowed distance between two rays. ``exposed_share`` is the ratio of
+    exposure time to frame period.
     """
 
     window_size: int = 16
@@ -154,14 +155,14 @@ class Observer:
         camera_from_body: Array,
         places: Array,
         normals: Array,
-        swept: tuple[Array, Array] | None = None,
+        exposure_ends: tuple[Array, Array] | None = None,
     ) -> StickerObservation:
         """Observe stickers of a body near an expected pose camera_from_body (4, 4).
 
-        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``swept`` are the
-        expected camera_from_body at the beginning and at the end of the exposure, or None.
+        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``exposure_ends``
+        are the expected camera_from_body at the beginning and at the end of the exposure, or None.
         """
-        return self.read(images, camera_from_body, places, normals).observed(swept)
+        return self.read(images, camera_from_body, places, normals).observed(exposure_ends)
 
     def read(
         self,
@@ -205,7 +206,8 @@ class Observer:
         return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Return windows (2, n, size, size) with vignetting removed, relative to their middles.
+        """Return windows (2, n, size, size) in which vignetting has the same value as in the
+        middle.
 
         Vignetting would move the centre of a sticker because it varies across the sticker. The
         correction changes the noise by a few per mille only.
@@ -250,8 +252,8 @@ class StickerWindows:
     offsets: Array
     found: DetectedCentres | None = None
 
-    def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
-        """Return the stickers in these windows; see ``Observer.observe`` for ``swept``."""
+    def observed(self, exposure_ends: tuple[Array, Array] | None = None) -> StickerObservation:
+        """Return the stickers in these windows; see ``Observer.observe`` for ``exposure_ends``."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             return StickerObservation(
@@ -259,18 +261,20 @@ class StickerWindows:
             )
         settings = self.observer.settings
         fits = self.found or self._detected()
-        if swept is not None and self.found is None:
-            fits = self._likelier(fits, swept)
+        if exposure_ends is not None and self.found is None:
+            fits = self._more_likely(fits, exposure_ends)
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
         # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
         # would be too near to the ray of the sharper image.
-        parted = settings.line_error_px**2
+        line_variance = settings.line_error_px**2
         moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
         near = apply_each(moves, self.places[:, None])[:, 0]
         left, right = seen_at
-        seen = triangulate(self.observer.rig, left, right, spread[0], spread[1], near, parted)
+        seen = triangulate(
+            self.observer.rig, left, right, spread[0], spread[1], near, line_variance
+        )
         good = np.all(fits.good.reshape(2, -1), axis=0)
         # Mean variance over two coordinates in two images.
         noise = 0.25 * np.einsum("ckii->k", spread)
@@ -297,9 +301,9 @@ class StickerWindows:
 
     @cached_property
     def ellipses_at_rest(self) -> EllipseFits:
-        """Ellipses fitted for a body at rest.
+        """Ellipses fitted as for a body at rest.
 
-        They serve to detect streaks, and to measure a body at rest.
+        The search for streaks uses them, and so does the measurement of a body at rest.
         """
         return self.ellipses()
 
@@ -322,13 +326,16 @@ class StickerWindows:
         """Windows (2k, h, h) and corners (2k, 2) of both images together."""
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
-    def _likelier(self, still: DetectedCentres, swept: tuple[Array, Array]) -> DetectedCentres:
+    def _more_likely(
+        self, still: DetectedCentres, exposure_ends: tuple[Array, Array]
+    ) -> DetectedCentres:
         """Choose, for each exposure, between the result for a body at rest and for a moving body.
 
-        The result that agrees better with the images is chosen, because the movement ``swept`` is
-        only expected. The platform can have stopped. ``still`` is the result for a body at rest.
+        The movement between ``exposure_ends`` is only a prediction, and the platform can have
+        stopped. The result that agrees better with the images is therefore chosen. ``still`` is the
+        result for a body at rest.
         """
-        smears, shown = self._smears(swept)
+        smears, shown = self._smears(exposure_ends)
         if still.misfits is None or not shown.any():
             return still
         moving = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2))
@@ -341,13 +348,13 @@ class StickerWindows:
         taken = np.tile(np.repeat(better, counts), 2)
         return still.with_others(np.flatnonzero(again)[taken], moving, taken)
 
-    def _smears(self, swept: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
+    def _smears(self, exposure_ends: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
         """Return the stickers' movements (2, k, 2) px during the exposure, and a mask (k,).
 
         The mask is False for exposures in which the longest movement is too short compared with the
         point spread, or too long to be measured.
         """
-        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in swept)
+        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in exposure_ends)
         first, last = (
             self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0]
             for move in moves

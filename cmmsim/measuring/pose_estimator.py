@@ -25,7 +25,7 @@ from cmmsim.measuring.layout_search import (
 )
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.observation import Observer, StickerObservation
-from cmmsim.measuring.streaks import drawn_out, find_streaks
+from cmmsim.measuring.streaks import find_streaks, streak_message
 from cmmsim.measuring.taught import Taught
 from cmmsim.radiometry.stereo_images import FrameImages, StereoFrame, StereoImages
 
@@ -159,16 +159,21 @@ class PoseEstimator(Observer):
         return longer if more > count else found
 
     def measure(
-        self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
+        self,
+        images: StereoImages,
+        expected: Array,
+        exposure_ends: tuple[Array, Array] | None = None,
     ) -> tuple[Measurement, Array]:
         """Return the measurement, and the measured camera_from_platform (4, 4).
 
-        ``expected`` is a first guess of camera_from_platform. ``swept`` are the expected transforms
-        at the beginning and at the end of the exposure. Without ``swept`` and without point spread,
-        the error of the pose exceeds its covariance if stickers move by more than half a pixel; use
-        ``measure_anew`` in this case. Raises LostError.
+        ``expected`` is a first guess of camera_from_platform. ``exposure_ends`` are the expected
+        transforms at the beginning and at the end of the exposure. Without ``exposure_ends`` and
+        without point spread, the error of the pose exceeds its covariance if stickers move by more
+        than half a pixel; use ``measure_anew`` in this case. Raises LostError.
         """
-        return self.measured(self.observe(images, expected, *self._stickers, swept), expected)
+        return self.measured(
+            self.observe(images, expected, *self._stickers, exposure_ends), expected
+        )
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """Measure as ``measure`` does, and estimate the movement during the exposure from streaks.
@@ -180,12 +185,12 @@ class PoseEstimator(Observer):
         read = self.read(images, expected, *self._stickers)
         streaks = None if read.found is not None else find_streaks(read)
         try:
-            seen = read.observed(None if streaks is None else streaks.swept)
+            seen = read.observed(None if streaks is None else streaks.exposure_ends)
             return self.measured(seen, expected)
         except LostError as error:
             if streaks is None:
                 raise
-            raise LostError(f"{error}; {drawn_out(streaks.longest_px)}") from error
+            raise LostError(f"{error}; {streak_message(streaks.longest_px)}") from error
 
     @property
     def _stickers(self) -> tuple[Array, Array]:

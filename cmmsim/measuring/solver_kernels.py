@@ -14,16 +14,16 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.camera_kernels import Cameras, project
-from cmmsim.geometry.disc_kernels import bent_root, disc_ellipse
+from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
 from cmmsim.geometry.matrix_kernels import from_entries, square_by
 from cmmsim.geometry.rigid_kernels import (
     add_point,
-    left_noise,
+    residual_covariance,
     residual_misfit,
     solve_step,
     turn_arm,
 )
-from cmmsim.geometry.transform_kernels import carry, make_rigid, move_by
+from cmmsim.geometry.transform_kernels import make_rigid, move_by, transform_point
 
 MOST_STEPS = 8
 
@@ -44,7 +44,7 @@ STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS = range(7)
 COLUMNS = 7
 
 
-class Seen(NamedTuple):
+class ObservedStickers(NamedTuple):
     """Stickers of one frame or of several frames.
 
     ``used`` (n,) is False for rejected stickers. ``points`` (n,3) are in the camera frame, m, and
@@ -75,15 +75,15 @@ class Outlines(NamedTuple):
     cameras: Cameras
 
 
-class Belief(NamedTuple):
+class SolverLimits(NamedTuple):
     """Limits for the stickers of a frame.
 
     ``largest_misfit`` limits the squared misfit of one sticker, and ``largest_excess`` the mean
     square of all residuals. ``fewest`` is the smallest number of stickers. ``smallest_share`` is
     the smallest share of a sticker's noise that must appear in its residual. ``smallest_width`` is
     the smallest extent of the stickers across a line through them, m. A fit ends after a step with
-    a rotation below ``settled``, rad. ``totals`` (f,) are the largest sums of squared residuals
-    that noise explains, by the number of degrees of freedom.
+    a rotation below ``step_tolerance``, rad. ``totals`` (f,) are the largest sums of squared
+    residuals that noise explains, by the number of degrees of freedom.
     """
 
     largest_misfit: float
@@ -91,7 +91,7 @@ class Belief(NamedTuple):
     fewest: int
     smallest_share: float
     smallest_width: float
-    settled: float
+    step_tolerance: float
     totals: Array
 
 
@@ -138,7 +138,12 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
 
 @compiled
 def fit(
-    seen: Seen, places: Array, settled: float, place: Array, covariance: Array, normal: Array
+    seen: ObservedStickers,
+    places: Array,
+    step_tolerance: float,
+    place: Array,
+    covariance: Array,
+    normal: Array,
 ) -> float:
     """Fit ``place`` (4,4) to the used stickers and return the sum of their squared residuals.
 
@@ -157,7 +162,7 @@ def fit(
                 total += add_point(seen.arms[n], seen.informations[n], seen.gaps[n], normal, change)
         total -= solve_step(normal, change, covariance)
         move_by(place, change)
-        if max(abs(change[3]), abs(change[4]), abs(change[5])) < settled:
+        if max(abs(change[3]), abs(change[4]), abs(change[5])) < step_tolerance:
             for n in range(len(seen.used)):
                 arm = seen.arms[n]
                 gap = seen.gaps[n]
@@ -183,35 +188,35 @@ def excess_of(total: float, freedom: int, totals: Array) -> float:
 def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: Array) -> float:
     """Return the squared misfit of the ellipse of sticker ``n`` in image ``side``.
 
-    It is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
+    The misfit is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
     """
-    camera = outlines.cameras.figures[side]
+    camera = outlines.cameras.intrinsics[side]
     move = outlines.cameras.moves[side]
     point = np.empty(3)
     centre = np.empty(3)
     turned = np.empty(3)
     normal = np.empty(3)
-    carry(place, taught, 1.0, point)
-    carry(move, point, 1.0, centre)
-    carry(place, outlines.normals[n], 0.0, turned)
-    carry(move, turned, 0.0, normal)
+    transform_point(place, taught, 1.0, point)
+    transform_point(move, point, 1.0, centre)
+    transform_point(place, outlines.normals[n], 0.0, turned)
+    transform_point(move, turned, 0.0, normal)
     x, y, xx, xy, yy = disc_ellipse(centre, normal, outlines.radius, camera)
     _, _, a, b, c, d = project(camera, x, y, 1.0)
-    xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+    xx, xy, yy = distorted_root(xx, xy, yy, a, b, c, d)
     shape = outlines.shapes[n, side]
     return square_by(outlines.informations[n, side], shape[0] - xx, shape[1] - xy, shape[2] - yy)
 
 
 @compiled
 def worst_sticker(
-    seen: Seen, places: Array, outlines: Outlines, belief: Belief, place: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
     covariance: Array, total: float, freedom: int, misfits: Array,
 ) -> int:  # fmt: skip
     """Return the used sticker with the largest misfit, and fill ``misfits`` (2,).
 
-    ``misfits`` are the squared misfits of its place and of its worse ellipse. The misfit of its
-    place is in units of noise, or in units of the other stickers' residuals if these are larger
-    than noise.
+    ``misfits`` are the squared misfits of this sticker's place and of its worse ellipse. The misfit
+    of the place is in units of noise, or of the other stickers' residuals if those are larger than
+    noise.
     """
     worst = -1
     largest = -1.0
@@ -221,13 +226,13 @@ def worst_sticker(
     for n in range(len(seen.used)):
         if not seen.used[n]:
             continue
-        left_noise(seen.arms[n], seen.covariances[n], covariance, half, left)
+        residual_covariance(seen.arms[n], seen.covariances[n], covariance, half, left)
         misfit = residual_misfit(
-            seen.gaps[n], seen.covariances[n], left, belief.smallest_share, inverse
+            seen.gaps[n], seen.covariances[n], left, limits.smallest_share, inverse
         )
         # The squared residuals of the other stickers are the total minus this sticker's part, with
         # three degrees of freedom less.
-        misfit /= excess_of(total - misfit, freedom - 3, belief.totals)
+        misfit /= excess_of(total - misfit, freedom - 3, limits.totals)
         outline = 0.0
         if len(outlines.shapes):
             for side in range(2):
@@ -242,7 +247,7 @@ def worst_sticker(
 
 @compiled
 def solve(
-    seen: Seen, places: Array, outlines: Outlines, belief: Belief, place: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
     covariance: Array, verdict: Array,
 ) -> None:  # fmt: skip
     """Solve one frame.
@@ -264,23 +269,23 @@ def solve(
     while True:
         count = np.sum(seen.used)
         verdict[LEFT] = count
-        if count < belief.fewest or count <= left_out:
+        if count < limits.fewest or count <= left_out:
             verdict[STATE] = TOO_FEW
             return
-        if lie_on_a_line(seen.used, places, belief.smallest_width):
+        if lie_on_a_line(seen.used, places, limits.smallest_width):
             verdict[STATE] = ON_A_LINE
             return
         freedom = 3 * count - 6
-        total = fit(seen, places, belief.settled, place, covariance, normal)
-        excess = excess_of(total, freedom, belief.totals)
+        total = fit(seen, places, limits.step_tolerance, place, covariance, normal)
+        excess = excess_of(total, freedom, limits.totals)
         worst = worst_sticker(
-            seen, places, outlines, belief, place, covariance, total, freedom, misfits
+            seen, places, outlines, limits, place, covariance, total, freedom, misfits
         )
         # Without a worst sticker, all misfits are NaN.
         if worst < 0:
             verdict[STATE] = TOO_FEW
             return
-        if max(misfits[0], misfits[1]) <= belief.largest_misfit and excess <= belief.largest_excess:
+        if max(misfits[0], misfits[1]) <= limits.largest_misfit and excess <= limits.largest_excess:
             break
         if left_out == 0:
             verdict[FIRST] = worst
@@ -301,10 +306,10 @@ def solve(
 
 @compiled
 def solve_frames(
-    seen: Seen, places: Array, outlines: Outlines, belief: Belief, starts: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, starts: Array,
     moves: Array, covariances: Array, verdicts: Array,
 ) -> None:  # fmt: skip
-    """Call ``solve`` for several frames. Frame f has the stickers ``starts[f]`` to ``starts[f +
+    """Call ``solve`` for several frames. Frame j has the stickers ``starts[j]`` to ``starts[j +
     1]``.
 
     ``moves`` (f,4,4) are first guesses of camera_from_body on entry, and the results at the end.
@@ -313,7 +318,7 @@ def solve_frames(
     for f in range(len(moves)):
         first = starts[f]
         last = starts[f + 1]
-        own = Seen(
+        own = ObservedStickers(
             seen.used[first:last],
             seen.points[first:last],
             seen.informations[first:last],
@@ -333,4 +338,4 @@ def solve_frames(
         make_rigid(moves[f])
         for n in range(last - first):
             turn_arm(moves[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
-        solve(own, taught, shown, belief, moves[f], covariances[f], verdicts[f])
+        solve(own, taught, shown, limits, moves[f], covariances[f], verdicts[f])

@@ -6,12 +6,12 @@ sticker at rest shows an ellipse A_0, an ellipse A fitted to the streak therefor
 
     A A = A_0 A_0 + d d' / 3.
 
-The stickers of a rigid body share one small movement w (6,), with d = P w. It is found by least
-squares over both images. An ellipse fits a streak only roughly. The fit is therefore repeated with
-an ellipse that moves by the current d. Then A A - A_0 A_0 is the remaining part of the streak, and
-d d' / 3 is added to it to find a new d. This is repeated until d no longer changes. Streaks do not
-show the sign of the movement. The pose refers to the middle of the exposure, which is the same for
-both signs.
+The stickers of a rigid body share one small movement w (6,). With the derivative P of a sticker's
+pixels by the movement, d = P w. Least squares over both images give w. An ellipse fits a streak
+only roughly. The fit is therefore repeated with an ellipse that moves by the current d. Then A A -
+A_0 A_0 is the remaining part of the streak, and d d' / 3 is added to it to find a new d. This is
+repeated until d no longer changes. Streaks do not show the sign of the movement. The pose refers to
+the middle of the exposure, which is the same for both signs.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,7 @@ LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Largest number of repetitions of the fit.
 ROUNDS = 8
 # Repetition ends at a smaller change of d, which has no visible effect on centres and ellipses.
-SETTLED_PX = 0.05
+TOLERANCE_PX = 0.05
 # Number of times that the weights of the start are updated.
 REWEIGHTED = 5
 TINY_PX2 = 1e-6
@@ -52,11 +52,11 @@ UNIT = 1e-4
 class Streaks:
     """Movement estimated from streaks.
 
-    ``swept`` are camera_from_body (4, 4) at both ends of the exposure, in unknown order.
+    ``exposure_ends`` are camera_from_body (4, 4) at both ends of the exposure, in unknown order.
     ``longest_px`` is the longest movement of a sticker in the images.
     """
 
-    swept: tuple[Array, Array]
+    exposure_ends: tuple[Array, Array]
     longest_px: float
 
 
@@ -145,12 +145,12 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
         return None
     movement, ellipses = found
     if ellipses.longest_px > LONGEST_SMEAR_PX:
-        raise LostError(drawn_out(ellipses.longest_px))
+        raise LostError(streak_message(ellipses.longest_px))
     ends = [read.camera_from_body @ _moved(share * movement, middle) for share in (-0.5, 0.5)]
     return Streaks((ends[0], ends[1]), ellipses.longest_px)
 
 
-def drawn_out(length_px: float) -> str:
+def streak_message(length_px: float) -> str:
     """Return a text with the length of the streaks and the limit on it."""
     return (
         f"stickers move by {length_px:.1f} px during the exposure, at most {LONGEST_SMEAR_PX:.1f} "
@@ -165,7 +165,7 @@ def _require_short(still: _Ellipses) -> None:
     squares = 3.0 * still.excess[still.bright][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     length = float(np.sqrt(max(np.median(np.linalg.eigvalsh(squares)[:, -1]), 0.0)))
     if length > LONGEST_SMEAR_PX:
-        raise LostError(drawn_out(length))
+        raise LostError(streak_message(length))
 
 
 def _movement_and_ellipses(
@@ -178,7 +178,7 @@ def _movement_and_ellipses(
     """
     best: tuple[Array, _Ellipses] | None = None
     for movement in _fitted_movements(still, by_movement, _starts(still, by_movement)):
-        found = _settled(movement, fit, by_movement)
+        found = _converged_movement(movement, fit, by_movement)
         if found is not None and (best is None or found[1].misfit < best[1].misfit):
             best = found
         if best is not None and best[1].explained:
@@ -186,7 +186,7 @@ def _movement_and_ellipses(
     return best
 
 
-def _settled(
+def _converged_movement(
     movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
     """Repeat the fit from a movement (6,) until it no longer changes.
@@ -206,7 +206,7 @@ def _settled(
         movement = _fitted_movements(ellipses, by_movement, [movement])[0]
         before = ellipses
         ellipses = fit(by_movement @ movement)
-        if np.abs(ellipses.smears - before.smears).max() < SETTLED_PX:
+        if np.abs(ellipses.smears - before.smears).max() < TOLERANCE_PX:
             break
     return movement, ellipses
 

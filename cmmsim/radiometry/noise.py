@@ -231,10 +231,10 @@ class CameraNoise:
             if pattern is None
             else (pattern.sensitivity.ravel(), pattern.offset.ravel())
         )
-        return radiance.ravel(), normal.ravel(), self._figures, *differing
+        return radiance.ravel(), normal.ravel(), self._kernel_parameters, *differing
 
     @property
-    def _figures(self) -> NDArray[np.float32]:
+    def _kernel_parameters(self) -> NDArray[np.float32]:
         """Parameters (6,) for the kernels, see ``noise_kernels.expose_pixels``."""
         return np.array(
             [

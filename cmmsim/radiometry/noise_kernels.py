@@ -18,18 +18,23 @@ SQRT_HALF = math.sqrt(0.5)
 
 @compiled
 def expose_pixels(
-    radiance: Array, normal: Array, figures: Array, sensitivity: Array, offset: Array, grey: Array
+    radiance: Array,
+    normal: Array,
+    parameters: Array,
+    sensitivity: Array,
+    offset: Array,
+    grey: Array,
 ) -> None:
     """Fill the grey values (n,) of pixels in one exposure.
 
     ``radiance`` (n,) is the light on each pixel, and ``normal`` (n,) a standard normal random
-    number per pixel. ``figures`` (6,) are electrons at white, full well, variance in the dark
+    number per pixel. ``parameters`` (6,) are electrons at white, full well, variance in the dark
     (e-²), black level, gain, and the largest grey value. ``sensitivity`` and ``offset`` (n,) are
     empty unless pixels differ. All arrays are float32, except that ``grey`` has the camera's type.
     """
-    dark, black, gain, white = figures[2:]
+    dark, black, gain, white = parameters[2:]
     for k in range(len(radiance)):
-        electrons = electrons_in(k, radiance, figures, sensitivity)
+        electrons = electrons_in(k, radiance, parameters, sensitivity)
         # The variance of shot noise equals the mean number of electrons (Poisson distribution).
         noise = normal[k] * np.sqrt(electrons + dark)
         if len(offset):
@@ -42,7 +47,7 @@ def expose_pixels(
 def average_pixels(
     radiance: Array,
     normal: Array,
-    figures: Array,
+    parameters: Array,
     sensitivity: Array,
     offset: Array,
     frames: int,
@@ -53,21 +58,21 @@ def average_pixels(
     The means are assumed to be normal. Arguments are those of ``expose_pixels``, with one random
     number per pixel for all exposures together.
     """
-    dark, black, gain, white = figures[2:]
+    dark, black, gain, white = parameters[2:]
     for k in range(len(radiance)):
-        electrons = electrons_in(k, radiance, figures, sensitivity)
+        electrons = electrons_in(k, radiance, parameters, sensitivity)
         value = black + gain * (electrons + (offset[k] if len(offset) else np.float32(0.0)))
         mean, variance = moments_of_rounded(value, gain * np.sqrt(electrons + dark), white)
         grey[k] = mean + normal[k] * math.sqrt(variance / frames)
 
 
 @compiled
-def electrons_in(k: int, radiance: Array, figures: Array, sensitivity: Array) -> float:
+def electrons_in(k: int, radiance: Array, parameters: Array, sensitivity: Array) -> float:
     """Return the mean number of electrons that light releases in pixel k, at most the full well."""
-    light = radiance[k] * figures[0]
+    light = radiance[k] * parameters[0]
     if len(sensitivity):
         light *= sensitivity[k]
-    return min(light, figures[1])
+    return min(light, parameters[1])
 
 
 @compiled

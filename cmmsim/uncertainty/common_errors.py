@@ -6,9 +6,8 @@ frames of base and platform (12), and the time at which the right camera exposes
 
 To first order, these errors d change a measured pose by J(pose) d. J is computed without images:
 sticker centres are projected through a rig with errors and triangulated with the known rig.
-Teaching used the same known rig, so the taught frames and sticker places have errors as well.
-Therefore most of the error of a pose cancels. Only the difference between the errors at this pose
-and at teaching remains.
+Teaching used the same known rig, so the taught frames and sticker places have errors as well. The
+errors at teaching and at a measured pose mostly cancel. Only their difference remains.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ The residuals of a body are differences between observed and expected pixels. Ex
 from taught places and the measured pose. The pose of the platform is estimated from the same
 pixels, so the part of the residuals that a pose explains is removed. With n stickers, the 4 n
 residuals then have unit variance in 4 n - 6 directions and are zero in the other six. The base
-stands still, and its pose was taught, so nothing is removed from its residuals. They also show
-movements of the whole rig relative to the base.
+stands still, and its pose was taught, so nothing is removed from its residuals. The base's
+residuals also show movements of the whole rig relative to the base.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Rows:
 
 
 @dataclass
-class Sightings:
+class FrameBlock:
     """Block of frames that show the same stickers of a body.
 
     ``index`` (k,) refers to the body's stickers, and ``places`` (k, 3) are in body axes. The lists
@@ -93,7 +93,7 @@ class Sightings:
         return (apply(self.moves[-1], self.places) - apply(self.moves[0], self.places)) / span
 
 
-def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
+def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows:
     """Return the rows of blocks of frames in which the same stickers of the platform were seen."""
     index = blocks[0].index
     moves = np.array([seen.middle for seen in blocks])
@@ -108,21 +108,21 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> R
     # Orthonormal columns that span the residuals which a change of the pose explains.
     by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
 
-    def left(values: Array) -> Array:
+    def without_pose(values: Array) -> Array:
         """Remove the part of values (b, 4k, ...) that a change of the pose explains."""
         return np.asarray(values - by_pose @ (by_pose.swapaxes(1, 2) @ values))
 
-    drift = left(_whiten(roots, by_rig))
+    drift = without_pose(_whiten(roots, by_rig))
     return Rows(
-        left(residuals[..., None])[..., 0],
+        without_pose(residuals[..., None])[..., 0],
         np.pad(drift, ((0, 0), (0, 0), (0, len(PLACES_OF_RIG)))),
-        drift - left(_whiten(roots, slopes @ taught)),
-        left(_whiten(roots, by_delay)),
-        _offsets(left, roots, index, len(geometry.taught.platform_places)),
+        drift - without_pose(_whiten(roots, slopes @ taught)),
+        without_pose(_whiten(roots, by_delay)),
+        _offsets(without_pose, roots, index, len(geometry.taught.platform_places)),
     )
 
 
-def base_rows(geometry: MeasuringGeometry, blocks: Sequence[Sightings]) -> Rows:
+def base_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows:
     """Return the rows of blocks of frames in which the same stickers of the base were seen."""
     index = blocks[0].index
     move = geometry.camera_from_base
@@ -174,7 +174,7 @@ def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
     return slopes.reshape(2, *points.shape[:2], 2, 3), by_rig.reshape(2, *points.shape[:2], 2, RIG)
 
 
-def _whitened(rig: StereoRig, blocks: Sequence[Sightings]) -> tuple[Array, Array]:
+def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Array]:
     """Return mean differences (b, 4k) between observed and expected pixels of each block.
 
     They are in units of their standard deviations. The second result contains the square roots (b,
@@ -210,15 +210,15 @@ def _small_movement(arms: Array) -> Array:
 
 
 def _offsets(
-    left: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int
+    without_pose: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int
 ) -> Array:
     """Return derivatives (b, 4k, 4 count) of whitened residuals by the offsets of all centres.
 
-    The body has ``count`` stickers, of which those with ``index`` (k,) are seen. ``left`` removes
-    the part that a pose explains.
+    The body has ``count`` stickers, of which those with ``index`` (k,) are seen. ``without_pose``
+    removes the part that a pose explains.
     """
     blocks, k = roots.shape
     every = np.zeros((blocks, 4 * k, 2, count, 2))
-    seen = left(np.repeat(np.tile(roots, 2), 2, axis=1)[..., None] * np.eye(4 * k))
+    seen = without_pose(np.repeat(np.tile(roots, 2), 2, axis=1)[..., None] * np.eye(4 * k))
     every[:, :, :, index] = seen.reshape(blocks, 4 * k, 2, k, 2)
     return every.reshape(blocks, 4 * k, -1)

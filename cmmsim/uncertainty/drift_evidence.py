@@ -50,7 +50,7 @@ ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
 
 class Filter:
-    """Kalman filter of n unknowns. The first w of them are zero at first and walk at random.
+    """Kalman filter of n unknowns. The first w unknowns begin at zero and perform a random walk.
 
     The filter is in information form, so that all models share the products of derivatives. The
     density of the unknowns x is proportional to exp(constant + right x - x precision x / 2).
@@ -70,12 +70,12 @@ class Filter:
         frames since the last update.
         """
         if len(self._walk):
-            self._walk_on(frames)
+            self._predict(frames)
         self.precision += gram
         self.right += right
         self._constant -= 0.5 * squared
 
-    def _walk_on(self, frames: int) -> None:
+    def _predict(self, frames: int) -> None:
         w = len(self._walk)
         walked = frames * self._walk
         if not self.precision[0, 0]:
@@ -99,7 +99,7 @@ class Filter:
         lower, part = _factored(self.precision, self.right)
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
-    def told_of(self, first: int) -> tuple[Array, Array]:
+    def marginal_information(self, first: int) -> tuple[Array, Array]:
         """Return marginal information (d, d) and score (d,) of the first d unknowns, d = first."""
         others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
         return (
@@ -123,7 +123,7 @@ def _factored(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Told:
+class DriftInformation:
     """Information about a drift in units of SIZES, from residuals alone, without the prior.
 
     ``information`` (d, d) is the inverse covariance, and ``score`` (d,) is the information times
@@ -204,13 +204,15 @@ class Evidence:
         return _without_prior(self._walking[slow], self._size, self._walked(slow))[0]
 
     @property
-    def told(self) -> Told:
+    def drift_information(self) -> DriftInformation:
         """Information about the drift from the most likely model of a moved rig."""
         rate, walking = max(self._walking.items(), key=lambda item: item[1].log_likelihood)
         from_start = self._wrong.log_likelihood > walking.log_likelihood
         if from_start:
-            return Told(*_without_prior(self._wrong, RIG, 1.0), from_start)
-        return Told(*_without_prior(walking, self._size, self._walked(rate)), from_start)
+            return DriftInformation(*_without_prior(self._wrong, RIG, 1.0), from_start)
+        return DriftInformation(
+            *_without_prior(walking, self._size, self._walked(rate)), from_start
+        )
 
     def _walked(self, rate: float) -> float:
         """Return the variance of a random walk after all frames so far."""
@@ -219,7 +221,7 @@ class Evidence:
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
     """Return information (d, d) and score (d,) about the first d unknowns, without the prior."""
-    information, score = filtered.told_of(size)
+    information, score = filtered.marginal_information(size)
     # No update yet, so there is no prior to subtract.
     if not information.any():
         return information, score
@@ -258,9 +260,9 @@ class Finding:
     frames, judged_frames : int
         Number of all frames, and of frames in which enough stickers were seen.
     movements : tuple of Movement
-        Few parameters whose movement explains the residuals at the end of the run, in falling order
-        of effect. Other parameters with nearly the same effect might be the true cause. Empty if no
-        movement was detected.
+        A few parameters whose movement explains the residuals at the end of the run, in falling
+        order of effect. Other parameters with nearly the same effect might be the true cause. Empty
+        if no movement was detected.
     explained : float
         Share of the evidence that the movements explain.
     from_start : bool
@@ -304,14 +306,14 @@ class Finding:
         return asdict(self) | {"warning": self.warning, "unseen": list(self.unseen)}
 
 
-def movements(told: Told) -> tuple[tuple[Movement, ...], float]:
+def movements(drift_information: DriftInformation) -> tuple[tuple[Movement, ...], float]:
     """Return a few parameters whose movement explains the residuals, and the explained share.
 
     They are chosen one after the other. Each is the parameter that, together with the parameters
     before, explains most.
     """
-    information = told.information
-    score = told.score
+    information = drift_information.information
+    score = drift_information.score
     whole = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
     chosen: list[int] = []
     share = 0.0

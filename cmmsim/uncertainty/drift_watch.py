@@ -14,7 +14,7 @@ from cmmsim.measuring.measurement import Measurement
 from cmmsim.measuring.observation import Observer, StickerObservation
 from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
-from cmmsim.uncertainty.drift_blocks import RIG, Sightings, base_rows, platform_rows, stacked
+from cmmsim.uncertainty.drift_blocks import RIG, FrameBlock, base_rows, platform_rows, stacked
 from cmmsim.uncertainty.drift_evidence import SIZES, Evidence, Finding, movements, unseen_directions
 from cmmsim.uncertainty.known_rig import KnownRig
 
@@ -105,14 +105,14 @@ class DriftWatch:
         calibration = vectors[:, kept] * np.sqrt(values[kept])
         self._evidence = Evidence(calibration, delay_std, offsets, self.watches_base)
         self._frames = self._counted = self._judged = 0
-        self._platform: Sightings | None = None
-        self._base: Sightings | None = None
+        self._platform: FrameBlock | None = None
+        self._base: FrameBlock | None = None
         self._blocks: list[_Block] = []
         self._largest = 0.0
         self._noticed: int | None = None
 
     def look(self, measurement: Measurement, images: StereoImages, observer: Observer) -> None:
-        """Use the next frame as ``add`` does, and observe the base in its images if watched."""
+        """Add the next frame. If the base is watched, it is observed in the frame's images."""
         self.add(
             measurement, self._base_in(images, observer) if len(measurement.target_ids) else None
         )
@@ -143,9 +143,9 @@ class DriftWatch:
         if not measurement.ok or len(measurement.target_ids) < FEWEST:
             return
         self._judged += 1
-        if not self._goes_on(measurement, base):
-            self._close(self._frames - 1)
-            self._begin(measurement, base)
+        if not self._continues_block(measurement, base):
+            self._end_block(self._frames - 1)
+            self._begin_block(measurement, base)
         assert self._platform is not None
         pixels = measurement.left_pixels, measurement.right_pixels
         self._platform.add(time, measurement.pose, pixels, measurement.pixel_variances)
@@ -153,15 +153,15 @@ class DriftWatch:
             pixels = base.left_pixels, base.right_pixels
             self._base.add(time, np.zeros(6), pixels, base.pixel_variances)
         if len(self._platform.times) == BLOCK:
-            self._close(self._frames)
+            self._end_block(self._frames)
 
     @property
     def finding(self) -> Finding:
         """Finding from the frames since the last ``restart``."""
-        self._close(self._frames)
-        self._count()
-        told = self._evidence.told
-        moved, share = movements(told) if self._noticed is not None else ((), 0.0)
+        self._end_block(self._frames)
+        self._evaluate_blocks()
+        drift_information = self._evidence.drift_information
+        moved, share = movements(drift_information) if self._noticed is not None else ((), 0.0)
         return Finding(
             None if self._noticed is None else self._noticed * self._period,
             self._noticed,
@@ -172,11 +172,11 @@ class DriftWatch:
             self._judged,
             moved,
             share,
-            self._noticed is not None and told.from_start,
+            self._noticed is not None and drift_information.from_start,
             unseen_directions(self._evidence.sensitivity),
         )
 
-    def _goes_on(self, measurement: Measurement, base: StickerObservation | None) -> bool:
+    def _continues_block(self, measurement: Measurement, base: StickerObservation | None) -> bool:
         """Tell whether a frame shows the same stickers as the block that is being filled."""
         if self._platform is None or not np.array_equal(self._platform_ids, measurement.target_ids):
             return False
@@ -185,27 +185,27 @@ class DriftWatch:
             return self._base is None and seen is None
         return np.array_equal(self._base.index, seen)
 
-    def _begin(self, measurement: Measurement, base: StickerObservation | None) -> None:
+    def _begin_block(self, measurement: Measurement, base: StickerObservation | None) -> None:
         """Begin a block of frames with the stickers of this frame."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
         camera_from_base = self.geometry.camera_from_base
-        self._platform = Sightings(index, taught.platform_places[index], camera_from_base)
+        self._platform = FrameBlock(index, taught.platform_places[index], camera_from_base)
         self._base = None
         if base is not None and self.watches_base:
-            self._base = Sightings(base.index, taught.base_places[base.index], camera_from_base)
+            self._base = FrameBlock(base.index, taught.base_places[base.index], camera_from_base)
 
-    def _close(self, end: int) -> None:
+    def _end_block(self, end: int) -> None:
         """End the block that is being filled, after ``end`` frames of the run."""
         if self._platform is None:
             return
         self._blocks.append(_Block(self._platform, self._base, end))
         self._platform = self._base = None
         if len(self._blocks) == TOGETHER:
-            self._count()
+            self._evaluate_blocks()
 
-    def _count(self) -> None:
+    def _evaluate_blocks(self) -> None:
         """Evaluate the finished blocks.
 
         BLAS is limited to one thread: with more, it takes ten times as long on these small
@@ -251,8 +251,8 @@ class _Block:
     ``end`` is the number of frames of the run up to the end of the block.
     """
 
-    platform: Sightings
-    base: Sightings | None
+    platform: FrameBlock
+    base: FrameBlock | None
     end: int
 
     @property

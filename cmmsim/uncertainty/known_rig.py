@@ -86,9 +86,10 @@ class KnownRig:
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
-        """Return the largest standard deviation of the distance from epipolar lines, px.
+        """Return the standard deviation, px, of the distance of a point's image from its epipolar
+        line.
 
-        Errors of the known rig cause these distances. The largest value is that over all points (n,
+        Errors of the known rig cause this distance. The result is the largest one over points (n,
         3) in the camera frame.
         """
         std = np.sqrt(np.diag(self.covariance))

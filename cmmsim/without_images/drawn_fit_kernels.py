@@ -27,11 +27,11 @@ class CentreNoise(NamedTuple):
     """Table of the inverse covariance of a centre.
 
     ``table`` (a, b, c, 3) contains the entries xx, xy, yy of the inverse covariance, divided by the
-    ellipse's mean half axis m. Its axes are m and the ovalness p and q. They begin at ``first``
-    (3,) and have ``steps`` (3,). At a share of light, the covariance is larger by the factor
-    by_light[0] / light² + by_light[1] / light + by_light[2]. ``contrast``, ``ring`` and ``black``
-    are grey values at full light; ``ring`` is relative to ``black``. ``fit_size`` px and
-    ``settings`` are those of the fit.
+    ellipse's mean half axis m. The axes of the table are m and the ovalness p and q, which
+    ``statistical_tracker`` explains. The axes begin at ``first`` (3,) and have ``steps`` (3,). At
+    the share ``light`` of full light, the covariance is larger by the factor by_light[0] / light² +
+    by_light[1] / light + by_light[2]. ``contrast``, ``ring`` and ``black`` are grey values at full
+    light; ``ring`` is relative to ``black``. ``fit_size`` px and ``settings`` are those of the fit.
     """
 
     table: Array
@@ -154,7 +154,7 @@ def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear
 
 
 @compiled
-def holds(centre: float, reach: float, size: int) -> bool:
+def contains(centre: float, reach: float, size: int) -> bool:
     """Tell whether an ellipse lies inside the fitted part of ``size`` px around its centre.
 
     ``centre`` and the half extent ``reach`` are px along one axis.
@@ -211,12 +211,12 @@ class Fits(NamedTuple):
     grounds: Array
 
 
-class Smallest(NamedTuple):
+class DetectionLimits(NamedTuple):
     """Limits for an ellipse that can be fitted.
 
-    ``radius`` is the smallest half width, px. Of the ellipses with the half width ``thin_px``, half
-    fail because they are too thin; ``thin_std_px`` is the standard deviation of this limit between
-    fits. ``contrast`` is the smallest contrast in grey values.
+    ``radius`` is the smallest half width, px. Half of the fits of ellipses with the half width
+    ``thin_px`` fail, because they are too thin; ``thin_std_px`` is the standard deviation of this
+    limit between fits. ``contrast`` is the smallest contrast in grey values.
     """
 
     radius: float
@@ -260,7 +260,11 @@ def nearest_stickers(
 
 @compiled
 def fit_stickers(
-    ellipses: Ellipses, windows: Windows, smallest: Smallest, settings: FitSettings, fits: Fits
+    ellipses: Ellipses,
+    windows: Windows,
+    smallest: DetectionLimits,
+    settings: FitSettings,
+    fits: Fits,
 ) -> None:
     """Fill the random results of the fits in windows.
 

@@ -13,21 +13,28 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project, triangulate
-from cmmsim.geometry.disc_kernels import bent_root, disc_ellipse
+from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
 from cmmsim.geometry.matrix_kernels import from_entries
 from cmmsim.geometry.transform_kernels import (
-    carry,
     multiply,
     pose_covariance,
     pose_transform,
+    transform_point,
     transform_pose,
 )
-from cmmsim.measuring.solver_kernels import MEASURED, STATE, Belief, Outlines, Seen, solve
-from cmmsim.without_images.drawn_fit_kernels import CentreNoise, holds, smeared, tabulated
+from cmmsim.measuring.solver_kernels import (
+    MEASURED,
+    STATE,
+    ObservedStickers,
+    Outlines,
+    SolverLimits,
+    solve,
+)
+from cmmsim.without_images.drawn_fit_kernels import CentreNoise, contains, smeared, tabulated
 from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
 
 # A triangulation, which starts at the expected place, ends with a step shorter than this, m.
-SETTLED = 2e-4
+STEP_TOLERANCE = 2e-4
 
 
 class Frame(NamedTuple):
@@ -39,7 +46,7 @@ class Frame(NamedTuple):
     during the exposure, px.
     """
 
-    stickers: Seen
+    stickers: ObservedStickers
     pixels: Array
     spreads: Array
     variances: Array
@@ -66,7 +73,7 @@ class Limits(NamedTuple):
     ellipse. ``largest_gap`` is the largest squared distance of the two rays. No body may hide a
     point of the sticker's plane within ``clear`` m of its centre. ``vignetting`` is that of the
     lens.
-    ``parted`` px² is the variance of the rays' distance that is due to errors of the rig.
+    ``line_variance`` px² is the variance of the rays' distance that is due to errors of the rig.
     """
 
     grazing: float
@@ -75,32 +82,38 @@ class Limits(NamedTuple):
     largest_gap: float
     clear: float
     vignetting: float
-    parted: float
+    line_variance: float
 
 
-class Eyes(NamedTuple):
+class StereoScene(NamedTuple):
     """Cameras, and the scene in front of them.
 
-    ``looking`` are the true cameras, and ``measuring`` the cameras that the estimator assumes.
-    ``owners`` (n,) are the bodies of the stickers, here all 0 for the platform. The taught
+    ``true_cameras`` are the true cameras, and ``assumed_cameras`` the cameras that the estimator
+    assumes. ``owners`` (n,) are the bodies of the stickers, here all 0 for the platform. The taught
     base_from_camera and camera_from_base are (4, 4).
     """
 
-    looking: Cameras
-    measuring: Cameras
+    true_cameras: Cameras
+    assumed_cameras: Cameras
     stickers: Stickers
     owners: Array
     solids: Solids
     noise: CentreNoise
     limits: Limits
-    belief: Belief
+    solver_limits: SolverLimits
     base_from_camera: Array
     camera_from_base: Array
 
 
 @compiled
-def see(
-    side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: Array, frame: Frame
+def image_stickers(
+    side: int,
+    scene: StereoScene,
+    moves: Array,
+    ends: Array,
+    moving: bool,
+    noise: Array,
+    frame: Frame,
 ) -> None:
     """Fill the pixels and covariances of stickers in one image, and mark unseen ones as not used.
 
@@ -111,25 +124,25 @@ def see(
     """
     count = len(frame.variances)
     used = frame.stickers.used
-    looking = eyes.looking
-    stickers = eyes.stickers
-    limits = eyes.limits
+    true_cameras = scene.true_cameras
+    stickers = scene.stickers
+    limits = scene.limits
     places = np.empty((count, 3))
     normals = np.empty((count, 3))
     hidden = np.empty(count, np.bool_)
     for n in range(count):
-        carry(moves[0], stickers.true[n], 1.0, places[n])
-        carry(moves[0], stickers.normals[n], 0.0, normals[n])
+        transform_point(moves[0], stickers.true[n], 1.0, places[n])
+        transform_point(moves[0], stickers.normals[n], 0.0, normals[n])
         used[n] = used[n] and faces(places[n], normals[n], 0.0)
-    hidden_stickers(moves, places, normals, eyes.owners, limits.clear, eyes.solids, used, hidden)
-    camera = looking.figures[side]
+    hidden_stickers(moves, places, normals, scene.owners, limits.clear, scene.solids, used, hidden)
+    camera = true_cameras.intrinsics[side]
     point = np.empty(3)
-    size = eyes.noise.fit_size
-    table = eyes.noise.table
-    first_node = eyes.noise.first
-    steps = eyes.noise.steps
-    by_light = eyes.noise.by_light
-    smear_step = eyes.noise.settings.smear_step
+    size = scene.noise.fit_size
+    table = scene.noise.table
+    first_node = scene.noise.first
+    steps = scene.noise.steps
+    by_light = scene.noise.by_light
+    smear_step = scene.noise.settings.smear_step
     true = stickers.true
     pixels = frame.pixels[:, side]
     spreads = frame.spreads[:, side]
@@ -139,7 +152,7 @@ def see(
             continue
         u, v, a, b, c, d = project(camera, places[n, 0], places[n, 1], places[n, 2])
         x, y, xx, xy, yy = disc_ellipse(places[n], normals[n], stickers.radius, camera)
-        xx, xy, yy = bent_root(xx, xy, yy, a, b, c, d)
+        xx, xy, yy = distorted_root(xx, xy, yy, a, b, c, d)
         # The centre of the ellipse lies beside the image of the disc's centre (eccentricity).
         middle_u = u + camera[0] * (x - places[n, 0] / places[n, 2])
         middle_v = v + camera[1] * (y - places[n, 1] / places[n, 2])
@@ -147,7 +160,7 @@ def see(
         smear_v = 0.0
         if moving:
             for end in range(2):
-                carry(ends[end], true[n], 1.0, point)
+                transform_point(ends[end], true[n], 1.0, point)
                 other_u, other_v, _, _, _, _ = project(camera, point[0], point[1], point[2])
                 sign = 1.0 if end else -1.0
                 smear_u += sign * other_u
@@ -157,15 +170,15 @@ def see(
         smallest = 0.5 * (xx + yy) - length_of(0.5 * (xx - yy), xy)
         used[n] = (
             smallest > limits.thin_px + limits.thin_std_px * noise[n, 2]
-            and holds(middle_u, length_of(xx, xy), size)
-            and holds(middle_v, length_of(xy, yy), size)
+            and contains(middle_u, length_of(xx, xy), size)
+            and contains(middle_v, length_of(xy, yy), size)
         )
         if not used[n]:
             continue
-        light = light_at(camera, looking.size[side], u, v, limits.vignetting)
+        light = light_at(camera, true_cameras.size[side], u, v, limits.vignetting)
         if length > smear_step:
             wide, tilt, high = smeared(
-                eyes.noise, (xx, xy, yy), light, (middle_u, middle_v), (smear_u, smear_v)
+                scene.noise, (xx, xy, yy), light, (middle_u, middle_v), (smear_u, smear_v)
             )
         else:
             wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
@@ -185,7 +198,9 @@ def see(
 
 
 @compiled
-def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame) -> None:
+def observe(
+    scene: StereoScene, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame
+) -> None:
     """Fill the pixels and covariances in both images, and the mask of used stickers.
 
     ``poses`` (6, 6) of the platform are those in the middle, at the beginning and at the end of the
@@ -207,18 +222,18 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
     for side in range(2):
         for end in range(2 if moving else 0):
             pose_transform(poses[3 * side + 1 + end], platform)
-            multiply(eyes.looking.moves[side], platform, ends[end])
+            multiply(scene.true_cameras.moves[side], platform, ends[end])
         # Both cameras see the same pose unless the right camera exposes later.
         if side == 0 or moving or apart:
             pose_transform(poses[3 * side], platform)
-        multiply(eyes.looking.moves[side], platform, moves[0])
+        multiply(scene.true_cameras.moves[side], platform, moves[0])
         for b in range(len(bodies)):
-            multiply(eyes.looking.moves[side], bodies[b], moves[1 + b])
-        see(side, eyes, moves, ends, moving, noise[side], frame)
+            multiply(scene.true_cameras.moves[side], bodies[b], moves[1 + b])
+        image_stickers(side, scene, moves, ends, moving, noise[side], frame)
 
 
 @compiled
-def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
+def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None:
     """Triangulate the used stickers, with the platform at camera_from_platform ``place`` (4, 4).
 
     Stickers that the estimator would not search for, or would reject, are marked as not used.
@@ -229,17 +244,17 @@ def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
     point = np.empty(3)
     normal = np.empty(3)
     scratch = np.empty((3, 6))
-    cameras = eyes.measuring
-    limits = eyes.limits
+    cameras = scene.assumed_cameras
+    limits = scene.limits
     for n in range(len(seen.used)):
         if not seen.used[n]:
             continue
-        carry(place, eyes.stickers.taught[n], 1.0, expected)
-        carry(place, eyes.stickers.normals[n], 0.0, direction)
+        transform_point(place, scene.stickers.taught[n], 1.0, expected)
+        transform_point(place, scene.stickers.normals[n], 0.0, direction)
         found = True
         for side in range(2):
-            carry(cameras.moves[side], expected, 1.0, point)
-            carry(cameras.moves[side], direction, 0.0, normal)
+            transform_point(cameras.moves[side], expected, 1.0, point)
+            transform_point(cameras.moves[side], direction, 0.0, normal)
             found = found and faces(point, normal, limits.grazing)
             for i in range(2):
                 pixel = frame.pixels[n, side, i]
@@ -248,7 +263,7 @@ def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
             for i in range(3):
                 seen.points[n, i] = expected[i]
             gap = triangulate(
-                cameras, frame.pixels[n], frame.spreads[n], limits.parted, SETTLED,
+                cameras, frame.pixels[n], frame.spreads[n], limits.line_variance, STEP_TOLERANCE,
                 seen.points[n], scratch,
             )  # fmt: skip
             found = gap < limits.largest_gap
@@ -262,28 +277,30 @@ def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
 
 @compiled
 def measure_frame(
-    eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
+    scene: StereoScene, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
     pose: Array, spread: Array, verdict: Array,
 ) -> None:  # fmt: skip
     """Fill the measured pose (6,) and its covariance (6, 6), or NaN if the frame is lost.
 
     The first parameters are those of ``look``. ``verdict`` is filled with the state of the frame.
     """
-    look(eyes, poses, bodies, noise, kept, frame)
+    observe(scene, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))
     place = np.empty((4, 4))
     covariance = np.empty((6, 6))
     pose_transform(poses[0], platform)
-    multiply(eyes.camera_from_base, platform, place)
-    expect(eyes, place, frame)
-    stickers = eyes.stickers
+    multiply(scene.camera_from_base, platform, place)
+    triangulate_stickers(scene, place, frame)
+    stickers = scene.stickers
     none = np.empty((0, 2, 3)), np.empty((0, 2, 6))
-    outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, eyes.measuring)
-    solve(frame.stickers, stickers.taught, outlines, eyes.belief, place, covariance, verdict)
+    outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, scene.assumed_cameras)
+    solve(
+        frame.stickers, stickers.taught, outlines, scene.solver_limits, place, covariance, verdict
+    )
     if verdict[STATE] == MEASURED:
-        multiply(eyes.base_from_camera, place, platform)
+        multiply(scene.base_from_camera, place, platform)
         transform_pose(platform, pose)
-        pose_covariance(pose, eyes.base_from_camera, covariance, spread)
+        pose_covariance(pose, scene.base_from_camera, covariance, spread)
     else:
         pose[:] = np.nan
         spread[:] = np.nan
@@ -291,7 +308,7 @@ def measure_frame(
 
 @compiled
 def measure_frames(
-    eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
+    scene: StereoScene, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
     found: Array, spreads: Array, verdicts: Array,
 ) -> float:  # fmt: skip
     """Apply ``measure_frame`` to N frames; return the longest path of a sticker, px.
@@ -303,7 +320,7 @@ def measure_frames(
     longest = 0.0
     for k in range(len(poses)):
         measure_frame(
-            eyes, poses[k], bodies, noise[k], kept[k], frame, found[k], spreads[k], verdicts[k]
+            scene, poses[k], bodies, noise[k], kept[k], frame, found[k], spreads[k], verdicts[k]
         )
         longest = max(longest, frame.longest[0])
     return longest

@@ -23,7 +23,7 @@ from cmmsim.detection.ellipse_fit import RING_REACH, SMALLEST_RADIUS_PX, Ellipse
 from cmmsim.errors import CmmError
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.disc_image import bend_outlines, bending, project_discs
+from cmmsim.geometry.disc_image import curvature_shift, distort_outlines, project_discs
 from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.renderer import Renderer
@@ -216,8 +216,8 @@ class StatisticalStereoCamera:
         shapes = np.where(facing[:, None, None], shapes, np.eye(2))
         if not camera.distortion.is_zero:
             holds = camera.distort(middles)[1]
-            shift = bending(camera, middles, shapes)
-            bend_outlines(camera, middles, shapes)
+            shift = curvature_shift(camera, middles, shapes)
+            distort_outlines(camera, middles, shapes)
             middles += shift
             facing &= holds
         return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
@@ -311,7 +311,7 @@ class DrawnStickers:
 
     def _fitted(self, windows: "Windows", observer: Observer) -> EllipseFits:
         """Return the simulated fits in windows."""
-        from cmmsim.without_images.drawn_fit_kernels import Fits, Smallest, fit_stickers
+        from cmmsim.without_images.drawn_fit_kernels import DetectionLimits, Fits, fit_stickers
 
         settings = observer.settings
         noise = observer.noise
@@ -323,7 +323,7 @@ class DrawnStickers:
         contrasts, grounds = (np.stack(values) for values in zip(*sides, strict=True))
         shapes = ((2,), (2, 2), (5, 5), (), ())
         found = Fits(np.empty(count, dtype=bool), *(np.empty((count, *shape)) for shape in shapes))
-        smallest = Smallest(
+        smallest = DetectionLimits(
             1.01 * SMALLEST_RADIUS_PX,
             THIN_PX,
             THIN_STD_PX,

@@ -8,13 +8,13 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.disc_kernels import probe_discs
-from cmmsim.geometry.transform_kernels import carry
-from cmmsim.imaging.layer_kernels import enters
+from cmmsim.geometry.transform_kernels import transform_point
+from cmmsim.imaging.layer_kernels import occludes
 
 # Number of points around a sticker that are tested in addition to its middle.
 PROBES = 12
-# A solid that a line of sight meets within the last share TOUCHING of its length does not hide the
-# point, because the point lies on the solid's surface.
+# A solid that a line of sight meets within the last share TOUCHING of the line's length does not
+# hide the point, because the point lies on the solid's surface.
 TOUCHING = 1e-6
 
 
@@ -90,7 +90,7 @@ def hidden_stickers(
     reach = np.full(1, clear)
     for b in range(len(moves)):
         to_body(moves[b], camera, eyes[b])
-        carry(moves[b], solids.middles[b], 1.0, middles[b])
+        transform_point(moves[b], solids.middles[b], 1.0, middles[b])
     for n in range(len(places)):
         hidden[n] = False
         if not asked[n]:
@@ -108,13 +108,13 @@ def hidden_stickers(
             last = solids.starts[b + 1]
             faces = solids.normals[first:last]
             offsets = solids.offsets[first:last]
-            if not enters(eye, point, faces, offsets, clear, 0.0):
+            if not occludes(eye, point, faces, offsets, clear, 0.0):
                 continue
             if not probed:
                 probe_discs(places[n : n + 1], normals[n : n + 1], reach, probes)
                 probed = True
             for k in range(PROBES + 1):
                 to_body(moves[b], probes[0, k], point)
-                if enters(eye, point, faces, offsets, 0.0, TOUCHING):
+                if occludes(eye, point, faces, offsets, 0.0, TOUCHING):
                     hidden[n] = True
                     break

@@ -23,18 +23,18 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.camera_kernels import Cameras
 from cmmsim.geometry.pose import Array, invert
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.measuring.frame_solver import CHANCE, belief_for, lost_reason
+from cmmsim.measuring.frame_solver import CHANCE, lost_reason, solver_limits
 from cmmsim.measuring.measurement import MeasuredPoses, Measurement, lost_measurement
 from cmmsim.measuring.observation import GRAZING
 from cmmsim.measuring.pose_estimator import PoseEstimator
-from cmmsim.measuring.solver_kernels import COLUMNS, FIRST, LEFT, MEASURED, STATE, Seen
+from cmmsim.measuring.solver_kernels import COLUMNS, FIRST, LEFT, MEASURED, STATE, ObservedStickers
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.without_images.drawn_fit_kernels import CentreNoise, fit_covariances
 from cmmsim.without_images.drawn_frame_kernels import (
-    Eyes,
     Frame,
     Limits,
+    StereoScene,
     Stickers,
     measure_frame,
     measure_frames,
@@ -63,7 +63,7 @@ LIGHTS = np.array([0.4, 0.7, 1.0])
 # Probability that a good sticker is rejected because of its outline in either image.
 OUTLINE_CHANCE = 2 * CHANCE
 # A fit of the pose, which starts at the true pose, ends with a rotation smaller than this, rad.
-SETTLED = 1e-4
+STEP_TOLERANCE = 1e-4
 # Number of frames that are measured by one thread with one random stream.
 BLOCK = 512
 
@@ -168,10 +168,10 @@ class StatisticalTracker:
         found = np.empty(6)
         spread = np.empty((6, 6))
         noise, kept = self._draws(exposure.rng, 1)
-        eyes = self._eyes_of(exposure.camera)
+        scene = self._scene_of(exposure.camera)
         drawn = exposure.exposed, exposure.bodies, noise[0], kept[0]
         verdict = np.empty(COLUMNS)
-        measure_frame(eyes, *drawn, frame, found, spread, verdict)
+        measure_frame(scene, *drawn, frame, found, spread, verdict)
         require_short(frame.longest[0])
         estimator = self._estimator
         used = frame.stickers.used
@@ -207,7 +207,7 @@ class StatisticalTracker:
         base_from_body of the base and the obstacles, which stand still.
         """
         count = len(exposed)
-        eyes = self._eyes_of(camera)
+        scene = self._scene_of(camera)
         found = np.empty((count, 6))
         spreads = np.empty((count, 6, 6))
         stickers = np.empty(count, dtype=int)
@@ -219,7 +219,7 @@ class StatisticalTracker:
             noise, kept = self._draws(own, len(poses))
             verdicts = np.empty((len(poses), COLUMNS))
             filled = found[part], spreads[part], verdicts
-            require_short(measure_frames(eyes, poses, bodies, noise, kept, self._frame(), *filled))
+            require_short(measure_frames(scene, poses, bodies, noise, kept, self._frame(), *filled))
             stickers[part] = np.where(verdicts[:, STATE] == MEASURED, verdicts[:, LEFT], 0)
 
         # Kernels release the interpreter's lock. Each block has its own random stream, so the
@@ -228,23 +228,25 @@ class StatisticalTracker:
             list(pool.map(block, starts, rng.spawn(len(starts))))
         return MeasuredPoses(found, spreads, stickers)
 
-    def _eyes_of(self, camera: StatisticalStereoCamera) -> Eyes:
+    def _scene_of(self, camera: StatisticalStereoCamera) -> StereoScene:
         """Return the cameras and their scene in the form of the kernels.
 
         If only the cameras have changed since the last frame, the scene is reused.
         """
         if camera is not self._camera:
             if self._camera is None or camera.scene is not self._camera.scene:
-                self._eyes = _eyes(camera, self._estimator)
+                self._scene = _scene(camera, self._estimator)
             else:
-                self._eyes = self._eyes._replace(looking=_cameras(camera.rig, camera.from_base))
+                self._scene = self._scene._replace(
+                    true_cameras=_cameras(camera.rig, camera.from_base)
+                )
             self._camera = camera
-        return self._eyes
+        return self._scene
 
     def _frame(self) -> Frame:
         n = len(self._estimator.platform.sticker_ids)
         rows = (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3)
-        stickers = Seen(np.empty(n, dtype=bool), *(np.empty(shape) for shape in rows))
+        stickers = ObservedStickers(np.empty(n, dtype=bool), *(np.empty(shape) for shape in rows))
         pixels = np.empty((n, 2, 2))
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
 
@@ -258,7 +260,7 @@ class StatisticalTracker:
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
 
-def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
+def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoScene:
     """Return the cameras and their scene in the form of the kernels."""
     settings = estimator.settings
     taught = estimator.taught
@@ -277,21 +279,21 @@ def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
     places = camera.scene.places[own]
     normals = camera.scene.normals[own]
     taught_places = np.ascontiguousarray(taught.platform_places)
-    return Eyes(
+    return StereoScene(
         _cameras(camera.rig, camera.from_base),
-        estimator.rig.figures,
+        estimator.rig.kernel_cameras,
         Stickers(places, taught_places, normals, camera.scene.radius),
         np.zeros(count, dtype=int),
-        camera.scene.hiding,
+        camera.scene.occluders,
         centre_noise(
             estimator.noise, light.optics.psf_px, settings.fit_size, light.sticker, light.ring
         ),
         limits,
-        belief_for(count, SETTLED),
+        solver_limits(count, STEP_TOLERANCE),
         np.ascontiguousarray(taught.base_from_camera),
         invert(taught.base_from_camera),
     )
 
 
 def _cameras(rig: StereoRig, moves: Sequence[Array]) -> Cameras:
-    return rig.figures._replace(moves=np.stack(moves))
+    return rig.kernel_cameras._replace(moves=np.stack(moves))

@@ -75,12 +75,12 @@ class StickerScene:
 
         hidden = np.empty(len(asked), dtype=bool)
         hidden_stickers(
-            moves, places, normals, self.owners, CLEAR * self.radius, self.hiding, asked, hidden
+            moves, places, normals, self.owners, CLEAR * self.radius, self.occluders, asked, hidden
         )
         return hidden
 
     @cached_property
-    def hiding(self) -> "Solids":
+    def occluders(self) -> "Solids":
         """Solids in the form of ``hidden_stickers``."""
         from cmmsim.without_images.hiding_kernels import Solids
 

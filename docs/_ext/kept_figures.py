@@ -82,7 +82,7 @@ def goals(folder: Path) -> str:
 
 def excitation_errors(folder: Path) -> str:
     """Model against measurement on the exciting trajectory, beside the paper's table 3."""
-    return str(excitation_error_table(kept(folder, "result"), beside_paper=True).markdown())
+    return str(excitation_error_table(kept(folder, "result"), repeats_paper=True).markdown())
 
 
 def accuracy(folder: Path) -> str:

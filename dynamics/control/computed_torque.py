@@ -50,7 +50,7 @@ def error_map(feedback: Feedback) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class WayBack:
+class DecayingErrors:
     """Motion along which errors (m,) decay.
 
     `error` and `rate` are the errors and their rates at the time `begin`, s. `beside` is an
@@ -113,7 +113,7 @@ def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) 
         at = watched.arrival(frame)
         seen = watched.ahead(at)
         taken_off = taken_off + share * (watched.disturbance - taken_off)
-        way = _way_back(assignment, at, seen.coordinates, seen.rates)
+        way = _decaying_errors(assignment, at, seen.coordinates, seen.rates)
         torque = _torque(assignment, way, way, watched.viscous) - taken_off
         watched.issue(frame, torque)
         return torque
@@ -134,7 +134,7 @@ def _measured(assignment: Assignment) -> Command:
     at_rest = assignment.holding - assignment.model.robot.static_torque(
         pose, assignment.model.dynamic
     )
-    way = _way_back(assignment, 0.0, before, np.zeros_like(before))
+    way = _decaying_errors(assignment, 0.0, before, np.zeros_like(before))
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
         nonlocal before, elapsed, integral, way
@@ -145,7 +145,7 @@ def _measured(assignment: Assignment) -> Command:
             before = now
             elapsed = 0.0
             integral = integral + period * (chart.coordinates(assignment.desired(time)[0]) - now)
-            way = _way_back(assignment, time, now, rates)
+            way = _decaying_errors(assignment, time, now, rates)
             way = replace(way, beside=INTEGRAL * feedback.bandwidth**3 * integral)
         arrival = time + assignment.settings.timing.latency_s
         return _torque(assignment, replace(way, begin=arrival), assignment.motion) + at_rest
@@ -153,18 +153,18 @@ def _measured(assignment: Assignment) -> Command:
     return command
 
 
-def _way_back(
+def _decaying_errors(
     assignment: Assignment, time: float, coordinates: np.ndarray, rates: np.ndarray
-) -> WayBack:
+) -> DecayingErrors:
     """Way back from coordinates and rates (m,) at a time, s."""
     chart = assignment.model.robot.geometry.chart
     pose, rate, _ = assignment.desired(time)
     errors = chart.coordinates(pose) - coordinates, chart.coordinates(rate) - rates
-    return WayBack(assignment.motion, chart, error_map(assignment.feedback), time, *errors)
+    return DecayingErrors(assignment.motion, chart, error_map(assignment.feedback), time, *errors)
 
 
 def _torque(
-    assignment: Assignment, way: WayBack, dry: Motion, viscous: np.ndarray | float = 0.0
+    assignment: Assignment, way: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Mean torque (n,) over the first frame of a way back, with the dry friction of the motion
     `dry`.

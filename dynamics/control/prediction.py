@@ -27,7 +27,7 @@ from dynamics.control.inverse_dynamics import Model
 ROUNDS = 12
 """Largest number of iterations of Newton's method over the joints."""
 
-SETTLED = 1e-6
+STEP_TOLERANCE = 1e-6
 """Error of a saturation below which these iterations end."""
 
 LEAST_WIDTH = 1e-9
@@ -43,7 +43,7 @@ It is above zero because it is a divisor.
 """
 
 
-class Blocks(NamedTuple):
+class StateSlices(NamedTuple):
     """Slices of the parts of a state: first the parts that move, then the constant parts."""
 
     coordinates: slice
@@ -54,8 +54,8 @@ class Blocks(NamedTuple):
     offset: slice
 
     @classmethod
-    def of(cls, m: int, n: int) -> "Blocks":
-        """Blocks of a robot with m coordinates and n joints."""
+    def of(cls, m: int, n: int) -> "StateSlices":
+        """StateSlices of a robot with m coordinates and n joints."""
         ends = np.cumsum([m, m, n, n, n, m]).tolist()
         return cls(*(slice(begin, end) for begin, end in pairwise([0, *ends])))
 
@@ -75,7 +75,7 @@ class Prediction:
 
     def __init__(self, model: Model, settings: LoopSettings) -> None:
         robot = model.robot
-        self.blocks = Blocks.of(len(robot.coordinate_names), robot.layout.joints)
+        self.blocks = StateSlices.of(len(robot.coordinate_names), robot.layout.joints)
         rigid, self._coulomb, self._viscous, gains = robot.layout.split(model.parameters)
         self._rigid = rigid[None]
         self._friction = model.friction
@@ -255,7 +255,7 @@ def expected_dry_friction(
         level = level + np.linalg.solve(
             np.eye(len(level)) + (largest * slope)[:, None] * others, miss
         )
-        if np.abs(miss).max() <= SETTLED * largest.max():
+        if np.abs(miss).max() <= STEP_TOLERANCE * largest.max():
             break
     _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
     change = own * largest

@@ -71,7 +71,7 @@ class Figure:
 
     @property
     def sign(self) -> int:
-        """Sign: +1 if a larger value is worse, -1 if it is better."""
+        """Sign: +1 if a larger value is worse, -1 if a larger value is better."""
         return 1 if self.better == "lower" else -1
 
     @property
@@ -194,7 +194,7 @@ class Accuracy:
         """
         __tracebackhide__ = True
         number = float(_numbers(name, "value", value, dimensions=0))
-        self._keep(name, unit, limit, better, value=number)
+        self._add(name, unit, limit, better, value=number)
 
     def sample(
         self,
@@ -241,11 +241,9 @@ class Accuracy:
             raise AccuracyError(
                 f"{name}: the interval of the mean is {low:.4g} .. {high:.4g}, not finite"
             )
-        self._keep(name, unit, limit, better, value=mean, interval=(low, high), count=len(numbers))
+        self._add(name, unit, limit, better, value=mean, interval=(low, high), count=len(numbers))
 
-    def _keep(
-        self, name: str, unit: str, limit: float | None, better: Better, **found: Any
-    ) -> None:
+    def _add(self, name: str, unit: str, limit: float | None, better: Better, **found: Any) -> None:
         __tracebackhide__ = True
         for what, text in (("name", name), ("unit", unit)):
             if not isinstance(text, str) or (what == "name" and not text.strip()) or "\n" in text:

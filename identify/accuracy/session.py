@@ -1,8 +1,8 @@
 """Collection, comparison, saving and display of the figures of a test session.
 
 The figures are user properties in the reports of the tests. pytest-xdist transfers these reports
-from its workers, so the same figures arrive here with and without pytest-xdist. They are sorted by
-node id, so that table and file do not depend on the order of the tests.
+from its workers, so the same figures arrive here with and without pytest-xdist. Figures are sorted
+by node id, so that table and file do not depend on the order of the tests.
 """
 
 from collections.abc import Mapping, Sequence
@@ -117,7 +117,7 @@ class AccuracySession:
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
         self._outcomes: dict[str, str] = {}
-        self._remarks: list[tuple[str, bool]] = []
+        self._lines: list[tuple[str, bool]] = []
         folder = config.getoption("accuracy_dir")
         base = config.rootpath / ".accuracy"
         self._folder = config.invocation_params.dir / folder if folder else base
@@ -143,7 +143,7 @@ class AccuracySession:
                 before = saved.find_saved(self._folder, self._compare)
                 self._saved = before.figures
                 if before.seed != self._seed:
-                    self._remark(
+                    self._add_line(
                         f"{self._compare} was saved with --accuracy-seed {before.seed}, this "
                         f"session has the seed {self._seed}"
                     )
@@ -180,26 +180,26 @@ class AccuracySession:
         if self._compare is not None:
             self._judge(session)
         if self._save is not None:
-            self._keep(session)
+            self._save_figures(session)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         """Show the table."""
-        if not self._figures and not self._remarks:
+        if not self._figures and not self._lines:
             return
         terminalreporter.section("accuracy")
         if self._figures:
             for line in terminal_table(self.figures, self.comparisons, self._compare):
                 terminalreporter.write_line(line)
-        for remark, bad in self._remarks:
+        for remark, bad in self._lines:
             terminalreporter.write_line(remark, red=bad)
 
     def _judge(self, session: pytest.Session) -> None:
-        self._tell_missing(session)
+        self._report_missing(session)
         for pair in self.comparisons.values():
             if pair.limit_change:
-                self._remark(pair.limit_change)
+                self._add_line(pair.limit_change)
             if pair.evidence_change:
-                self._tell(session, pair.evidence_change, guarded=True)
+                self._report_change(session, pair.evidence_change, guarded=True)
             if self._ratio is None:
                 continue
             if pair.mismatch:
@@ -209,7 +209,7 @@ class AccuracySession:
             elif pair.worse_by_more_than(self._ratio):
                 self._fail(session, f"worse by more than {self._ratio:.0%}: {pair.regression}")
 
-    def _tell_missing(self, session: pytest.Session) -> None:
+    def _report_missing(self, session: pytest.Session) -> None:
         """Report saved figures that were not measured.
 
         With --accuracy-fail the session fails if their test ran or was skipped.
@@ -218,13 +218,13 @@ class AccuracySession:
         if not gone:
             return
         count = sum(map(len, gone.values()))
-        self._remark(
+        self._add_line(
             f"{count} of {len(self._saved)} figures saved as {self._compare} were not measured now:"
         )
         for test, names in gone.items():
             outcome = self._outcome(test)
             line = f"  {test}: {', '.join(names)} (the test {WHY_MISSING.get(outcome, outcome)})"
-            self._tell(session, line, guarded=outcome is not None)
+            self._report_change(session, line, guarded=outcome is not None)
 
     def _outcome(self, test: str) -> str | None:
         """Return the outcome of a test or of its module, or None if it did not run."""
@@ -234,11 +234,11 @@ class AccuracySession:
                 return outcome
         return None
 
-    def _keep(self, session: pytest.Session) -> None:
+    def _save_figures(self, session: pytest.Session) -> None:
         path = saved.saved_path(self._folder, self._save)
         if session.exitstatus != pytest.ExitCode.OK or not self._figures:
             why = "the session did not pass" if self._figures else "no figures were recorded"
-            self._remark(f"not saved as {self._save}: {why}")
+            self._add_line(f"not saved as {self._save}: {why}")
             return
         beyond = [f"{figure.test}: {figure.name}" for figure in self.figures if figure.beyond_limit]
         # A test marked xfail does not fail the session, although its figures are beyond limits.
@@ -255,9 +255,11 @@ class AccuracySession:
             self._fail(session, str(error))
         else:
             here = Path.cwd()
-            self._remark(f"saved: {path.relative_to(here) if path.is_relative_to(here) else path}")
+            self._add_line(
+                f"saved: {path.relative_to(here) if path.is_relative_to(here) else path}"
+            )
 
-    def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
+    def _report_change(self, session: pytest.Session, text: str, guarded: bool) -> None:
         """Report a finding of the comparison.
 
         With --accuracy-fail the session fails if the finding is `guarded`.
@@ -265,12 +267,12 @@ class AccuracySession:
         if guarded and self._ratio is not None:
             self._fail(session, text)
         else:
-            self._remark(text)
+            self._add_line(text)
 
-    def _remark(self, text: str, bad: bool = False) -> None:
-        self._remarks.append((text, bad))
+    def _add_line(self, text: str, bad: bool = False) -> None:
+        self._lines.append((text, bad))
 
     def _fail(self, session: pytest.Session, text: str) -> None:
-        self._remark(text, bad=True)
+        self._add_line(text, bad=True)
         if session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED

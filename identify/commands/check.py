@@ -68,7 +68,7 @@ def check(
     from dynamics import load_robot
     from identify.experiment.law_in_loop import feedback
     from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
-    from identify.verification.robot_check import Surroundings, check_robot
+    from identify.verification.robot_check import CheckSettings, check_robot
 
     chosen = load_robot(robot)
     given = chosen_scenario(scenario, settings, None)
@@ -77,7 +77,7 @@ def check(
     )
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector
-    around = Surroundings(
+    around = CheckSettings(
         settings=loop_settings(chosen, given.servo, given.timing, given.control, given.model),
         control=given.control,
         feedback=feedback(given.control, given.timing),

@@ -18,7 +18,7 @@ from identify.commands.options import (
     repeatable,
     tell,
 )
-from identify.files.lock import working_in
+from identify.files.lock import lock_folder
 from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
 from identify.scenario import load_scenario
@@ -127,7 +127,7 @@ def estimators(
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
-    context.with_resource(working_in(folder.path))
+    context.with_resource(lock_folder(folder.path))
     files = RunFiles(folder)
     files.check_made_of("experiment.nc", "validation.nc")
     allow_named([*(only or ()), *(add or ())])
@@ -256,7 +256,7 @@ def variation(
     folder = RunFolder(out)
     progress = terminal_progress(quiet)
     folder.require("scenario.toml", "trajectories.json" if designed else "validation.nc")
-    context.with_resource(working_in(folder.path))
+    context.with_resource(lock_folder(folder.path))
     scenario = load_scenario(folder.whole_scenario)
     robot = load_robot(scenario.robot)
     recorded: dict[str, bytes] = {}

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.commands.options import JsonFile, Plugins, Quiet, allow_named, repeatable, tell
-from identify.files.lock import working_in
+from identify.files.lock import lock_folder
 from identify.files.run_folder import RunFolder
 from identify.progress import print_table
-from identify.runtime import loading
+from identify.runtime import interruptible_imports
 
 if TYPE_CHECKING:
     from identify.diagnosis.diagnosis import Diagnosis
@@ -47,13 +47,13 @@ def diagnose(
       cmmsim diagnose runs/quick-0
       cmmsim diagnose mine --add my_module:backlash
     """
-    with loading():
+    with interruptible_imports():
         from identify.diagnosis.own_cause import own_cause
         from identify.stages.diagnose import diagnose as diagnose_run
 
     RunFolder(run).require("scenario.toml", "experiment.nc", "result.json")
     allow_named(add)
-    context.with_resource(working_in(run))
+    context.with_resource(lock_folder(run))
     found = diagnose_run(run, [own_cause(name) for name in add or ()])
     tell(found.to_dict(), json, quiet, lambda: _say(found))
 

@@ -88,11 +88,11 @@ def urdf(
 
 def _read(read: Callable[..., Any], *files: Path) -> tuple["RobotDescription", list[str]]:
     """Read a robot from untrusted files, within limits of time and memory."""
-    from identify.files.limited_process import StrangerError, within_limits
+    from identify.files.limited_process import UntrustedFileError, within_limits
 
     try:
         found: tuple[RobotDescription, list[str]] = within_limits(read, *files)
-    except StrangerError as error:
+    except UntrustedFileError as error:
         raise RobotFileError(f"{files[0]}: {error}") from None
     return found
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cmmsim.allowed_plugins import ALLOWED, allow_plugin, is_own
+from cmmsim.allowed_plugins import ALLOWED, allow_plugin, is_plugin_name
 from identify.errors import ScenarioError
 from identify.files.atomic import write_text
 from identify.files.run_folder import as_json
@@ -163,7 +163,7 @@ Plugins = Annotated[
 
 def allow_named(names: list[str] | None) -> None:
     """Allow the modules of parts that an option names as ``module:function``."""
-    allow_plugin(*(name.partition(":")[0] for name in names or () if is_own(name)))
+    allow_plugin(*(name.partition(":")[0] for name in names or () if is_plugin_name(name)))
 
 
 JsonFile = Annotated[

@@ -22,7 +22,7 @@ from identify.commands.options import (
     parse_settings,
     tell,
 )
-from identify.files.lock import working_in
+from identify.files.lock import lock_folder
 from identify.files.run_folder import (
     BEGUN,
     UNFINISHED,
@@ -31,7 +31,7 @@ from identify.files.run_folder import (
     new_run_folder,
 )
 from identify.progress import print_warnings, terminal_progress
-from identify.runtime import loading
+from identify.runtime import interruptible_imports
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 """Files that the first two stages write."""
@@ -72,7 +72,7 @@ def run(
                                               joints off by 0.1 mm: a wrong
                                               model, seen in the residuals
     """
-    with loading():
+    with interruptible_imports():
         from identify.setup import Setup, with_renderer
 
     chosen = chosen_scenario(scenario, settings, robot)
@@ -108,7 +108,7 @@ def warm_up(
       cmmsim warm-up
       cmmsim warm-up quick --robot mine.toml
     """
-    with loading():
+    with interruptible_imports():
         from dynamics import built_in_robots
         from identify.experiment.warm_up import warm_up
         from identify.setup import Setup, with_renderer
@@ -155,7 +155,7 @@ def excite(
     # Files of an interrupted search are allowed there, and are replaced.
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
-    with loading():
+    with interruptible_imports():
         from identify.setup import Setup, with_renderer
 
     setup = Setup(with_renderer(chosen), seed)
@@ -185,7 +185,7 @@ def record(
       cmmsim record --out mine
     """
     RunFolder(out).require("scenario.toml", "trajectories.json")
-    context.with_resource(working_in(out))
+    context.with_resource(lock_folder(out))
     _pipeline().record(out, terminal_progress(quiet))
 
 
@@ -255,7 +255,7 @@ def identify(
         folder = RunFolder(out)
         # No trajectories were designed for a user's own record.
         folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
-        context.with_resource(working_in(out))
+        context.with_resource(lock_folder(out))
         _pipeline().identify(out, progress, chosen)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_identification(result, folder.result))
@@ -283,7 +283,7 @@ def validate(
     folder = RunFolder(out)
     if not folder.holds_own_record:
         folder.require(*PLANNED, "result.json")
-    context.with_resource(working_in(out))
+    context.with_resource(lock_folder(out))
     _pipeline().validate(out, terminal_progress(quiet), workers)
     tell(load_result(folder.result), json, quiet, lambda: None)
 
@@ -305,7 +305,7 @@ def report(
     """
     folder = RunFolder(out)
     folder.require("result.json", "experiment.nc")
-    context.with_resource(working_in(out))
+    context.with_resource(lock_folder(out))
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)
@@ -327,7 +327,7 @@ def _summary() -> Any:
 
 def _pipeline() -> Any:
     """Import the stages late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
-    with loading():
+    with interruptible_imports():
         from identify import pipeline
 
     return pipeline

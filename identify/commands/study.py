@@ -17,7 +17,7 @@ from identify.commands.options import (
 )
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import print_table, terminal_progress
-from identify.runtime import STOPPED, cores, loading
+from identify.runtime import STOPPED, cores, interruptible_imports
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -180,7 +180,7 @@ def study(
             f"study {chosen.name!r} has {chosen.rows:,} rows; confirm more than {MANY_ROWS:,} rows "
             "by --yes"
         )
-    with loading():
+    with interruptible_imports():
         from identify.studies.memory import check_memory
         from identify.studies.runner import run_study
         from identify.studies.study_design import prepare
@@ -240,7 +240,7 @@ def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
     for law in laws:
         typer.echo(_law_line(law))
     again = f", {outcome.found} of them from before" if outcome.found else ""
-    again += f" ({outcome.beyond} rows of further repeats stay stored)" if outcome.beyond else ""
+    again += f" ({outcome.surplus} rows of further repeats stay stored)" if outcome.surplus else ""
     figures = ", figures" if (folder / "figures").is_dir() else ""
     typer.echo(f"{outcome.rows} rows{again}; summary.md{figures} and study.parquet: {folder}")
 

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from identify.arrays import Array, triangular_factor
 from identify.diagnosis.cause import Cause, with_causes
-from identify.diagnosis.score import Beside, Score, allowed, cause_columns, parameter_columns, score
+from identify.diagnosis.score import (
+    OrthogonalComplement,
+    Score,
+    allowed,
+    cause_columns,
+    parameter_columns,
+    score,
+)
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -34,7 +41,7 @@ class Point:
         Sizes of the causes.
     residual : ndarray, shape (m,)
         Residuals.
-    beside : Beside
+    beside : OrthogonalComplement
         Space beside the columns of the parameters that no bound holds.
     columns : ndarray, shape (m, k)
         Columns of the causes.
@@ -43,7 +50,7 @@ class Point:
     parameters: Array
     sizes: Array
     residual: Array
-    beside: Beside
+    beside: OrthogonalComplement
     columns: Array
 
     @property
@@ -60,7 +67,7 @@ class Point:
         )
 
     @property
-    def beside_all(self) -> Beside:
+    def beside_all(self) -> OrthogonalComplement:
         """Space beside the columns of the parameters and of the causes."""
         return self.beside.without(self.columns)
 
@@ -130,7 +137,7 @@ def linearised(
     free = (slopes @ problem.bounds.matrix)[:, ~at_bound]
     # a cause is changed from its size while all others stay
     columns = cause_columns(problem, parameters, causes, sizes)
-    return Point(parameters, sizes, residual, Beside.of(free), columns)
+    return Point(parameters, sizes, residual, OrthogonalComplement.of(free), columns)
 
 
 def fit(

@@ -13,7 +13,7 @@ from identify.arrays import Array
 from identify.diagnosis.cause import Cause, in_each_run
 from identify.errors import EstimationError
 from identify.model.loop_model import LoopModel
-from identify.own_parts import Telling, own_function
+from identify.own_parts import PluginFunction, own_function
 
 STEP = 1e-4
 """Step of a cause that carries none."""
@@ -26,7 +26,7 @@ def own_cause(name: str) -> Cause:
     if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < math.inf:
         raise EstimationError(f"cause {name!r} has step = {step!r}, must be a number > 0")
     known = (EstimationError, DynamicsError)
-    told = Telling(f"cause {name!r}", function, EstimationError, known, _check_run)
+    told = PluginFunction(f"cause {name!r}", function, EstimationError, known, _check_run)
     return Cause(
         name=name,
         unit=str(getattr(function, "unit", "1")),

@@ -22,7 +22,7 @@ from scipy.special import chdtrc
 
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
-from identify.diagnosis.score import Beside, Score, score
+from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.explanation import (
     Misfit,
     coloured_score_covariance,
@@ -128,7 +128,11 @@ def misfit_of(rows: Rows, residual: Array) -> Misfit:
 
 
 def rank(
-    causes: Sequence[Cause], columns: Array, residual: Array, beside: Beside, rows: Rows
+    causes: Sequence[Cause],
+    columns: Array,
+    residual: Array,
+    beside: OrthogonalComplement,
+    rows: Rows,
 ) -> tuple[Ranked, ...]:
     """Rank all candidates, the one of most worth first.
 
@@ -174,7 +178,7 @@ def few_alone(columns: Array, residual: Array, lengths: Array) -> tuple[tuple[in
     found = score(columns[:, :0], residual, lengths[:0])
     price = np.log(len(residual)) + 2 * np.log(columns.shape[1])
     for _ in range(FEW):
-        beside = Beside.of(columns[:, list(chain)])
+        beside = OrthogonalComplement.of(columns[:, list(chain)])
         free = beside.part(columns)
         long = np.linalg.norm(free, axis=0)
         shown = long > 0.1 * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)

@@ -134,7 +134,7 @@ def _differences(
 
 
 @dataclass(frozen=True)
-class Beside:
+class OrthogonalComplement:
     """Space beside the columns of a problem's parameters.
 
     basis (m, q): orthonormal basis of these columns.
@@ -143,14 +143,16 @@ class Beside:
     basis: Array
 
     @classmethod
-    def of(cls, columns: Array) -> "Beside":
+    def of(cls, columns: Array) -> "OrthogonalComplement":
         """Return the space beside columns (m, q) that are independent of each other."""
         scale = np.linalg.norm(columns, axis=0)
         return cls(np.linalg.qr(columns[:, scale > 0] / scale[scale > 0])[0])
 
-    def without(self, columns: Array) -> "Beside":
+    def without(self, columns: Array) -> "OrthogonalComplement":
         """Return the part of this space that lies beside further columns (m, k), too."""
-        return Beside(np.hstack([self.basis, Beside.of(self.part(columns)).basis]))
+        return OrthogonalComplement(
+            np.hstack([self.basis, OrthogonalComplement.of(self.part(columns)).basis])
+        )
 
     def part(self, rows: Array) -> Array:
         """Return the part of residuals (m,) or columns (m, k) that lies in this space."""
@@ -213,7 +215,10 @@ def score(columns: Array, residual: Array, lengths: Array) -> Score:
 
 
 def first_columns(
-    problem: OutputErrorProblem, parameters: Array, causes: Sequence[Cause], beside: Beside
+    problem: OutputErrorProblem,
+    parameters: Array,
+    causes: Sequence[Cause],
+    beside: OrthogonalComplement,
 ) -> tuple[tuple[Cause, ...], Array]:
     """Return causes, and their columns (m, k) where none has a size.
 

@@ -110,7 +110,7 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
 
 
 @dataclass(frozen=True)
-class Trial:
+class FittedCandidate:
     """Candidate that was fitted beside those before it.
 
     added: places of its causes. places: those of all causes that are left, in the order of the
@@ -129,7 +129,7 @@ def _trial(
     causes: Sequence[Cause],
     places: tuple[int, ...],
     best: Ranked,
-) -> Trial | None:
+) -> FittedCandidate | None:
     """Fit a candidate beside the causes at some places, or return None where that does not help.
 
     first: optimum without any cause, with the columns of all. now: optimum with those at places.
@@ -151,7 +151,7 @@ def _trial(
         # the model with the cause does not run
         return None
     enough = now.cost - point.cost > np.log(len(now.residual))
-    return Trial(added, kept, point) if enough and set(added) & set(kept) else None
+    return FittedCandidate(added, kept, point) if enough and set(added) & set(kept) else None
 
 
 def _rival(causes: Sequence[Cause], best: Ranked, ranking: Sequence[Ranked]) -> Ranked | None:

@@ -49,7 +49,7 @@ from identify.random_streams import DISTURBED_COPIES, mixed_generator
 MAX_ITERATIONS = 10
 """Largest number of simulated runs."""
 
-SETTLED = 0.05
+STEP_TOLERANCE = 0.05
 """Largest last step of every parameter, as a share of its standard deviation."""
 
 
@@ -66,7 +66,7 @@ def instrumental_variables(evidence: Evidence) -> Estimate:
     count = len(guess.values)
     runs = 0
     moved = np.array([np.inf])
-    while moved.max() > SETTLED and runs < MAX_ITERATIONS:
+    while moved.max() > STEP_TOLERANCE and runs < MAX_ITERATIONS:
         instruments = _simulated_matrix(evidence, equations, unknowns[:count])
         new, covariance = iv_fit(equations, instruments, noise, guess)
         moved = np.abs(new - unknowns)[:count] / standard_deviations(covariance, count)

@@ -17,7 +17,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
-from identify.own_parts import ESTIMATORS, Telling, check_choice, chosen, is_own
+from identify.own_parts import ESTIMATORS, PluginFunction, check_choice, chosen, is_plugin_name
 
 
 @dataclass(frozen=True)
@@ -113,20 +113,20 @@ def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
     for name in names or ():
         check_choice(name, "estimator", ESTIMATORS)
     built_in = [name for name in ESTIMATORS if not names or name in names]
-    own = [name for name in names or () if is_own(name)]
+    own = [name for name in names or () if is_plugin_name(name)]
     return {name: _found(name) for name in built_in + own}
 
 
 def _found(name: str) -> Estimator:
     found = chosen(name, "estimator", ESTIMATORS)
     # Only a user's own estimator needs its errors converted.
-    return found if isinstance(found, Estimator) and not is_own(name) else _own(name, found)
+    return found if isinstance(found, Estimator) and not is_plugin_name(name) else _own(name, found)
 
 
 def _own(name: str, function: Callable[..., Any]) -> Estimator:
     """Return a user's own estimator. All its failures become an EstimationError in one line."""
     known = (EstimationError, DynamicsError)
-    told = Telling(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
+    told = PluginFunction(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
     title = getattr(function, "title", name)
     return Estimator(title, getattr(function, "uses", ""), told)
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from dynamics import Robot
 from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
-from identify.excitation.constraints import Worst
+from identify.excitation.constraints import WorstCase
 from identify.excitation.criteria import log_observability, observability_index
 from identify.excitation.design import Design
 from identify.excitation.information import Knowledge, log_information
@@ -47,7 +47,7 @@ class Entry:
         Evaluations of the criterion and of its gradient, and iterations.
     reason : str
         Reason why the search stopped.
-    worst : tuple of Worst
+    worst : tuple of WorstCase
         Instants at which the trajectory comes nearest to each limit.
     """
 
@@ -61,7 +61,7 @@ class Entry:
     gradients: int
     iterations: int
     reason: str
-    worst: tuple[Worst, ...]
+    worst: tuple[WorstCase, ...]
 
 
 @dataclass(frozen=True)

@@ -194,7 +194,7 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Worst:
+class WorstCase:
     """Instant at which a trajectory comes nearest to a limit.
 
     Value and limit are in ``unit``. ``share`` is the used share of the limit, ``who`` the leg,
@@ -295,7 +295,7 @@ class MotionConstraints:
         # With `cse`, the kinematics that the limits have in common is evaluated only once.
         return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
-    def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
+    def worst(self, trajectory: FourierTrajectory, times: Array) -> list[WorstCase]:
         """Return the instants at which a trajectory comes nearest to each limit.
 
         The trajectory is sampled at `times` (N,) [s]. A share of NaN means out of reach.
@@ -318,14 +318,14 @@ class MotionConstraints:
             value = bound / share if limit.lower else bound * share
             unit = f" {self._box_units[who]}" if limit.name == "box" else limit.unit
             found.append(
-                Worst(limit.name, value, bound, unit, share, limit.who[who], float(times[row]))
+                WorstCase(limit.name, value, bound, unit, share, limit.who[who], float(times[row]))
             )
             first += len(limit.who)
         return found
 
     def check(
         self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9
-    ) -> list[Worst]:
+    ) -> list[WorstCase]:
         """Return `worst` of an admissible trajectory.
 
         Raises TrajectoryError for other trajectories. The message names constraint, leg, value,
@@ -335,7 +335,7 @@ class MotionConstraints:
         broken = [w for w in found if not w.share <= 1 + tolerance]
         if broken:
             raise TrajectoryError(
-                f"the trajectory is not admissible: {max(broken, key=Worst.excess)}"
+                f"the trajectory is not admissible: {max(broken, key=WorstCase.excess)}"
             )
         return found
 

@@ -38,7 +38,7 @@ from identify.arrays import Array, agreed
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import structure
 from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, regressor
-from identify.own_parts import CRITERIA, Telling, chosen, is_own
+from identify.own_parts import CRITERIA, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -82,12 +82,12 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
     """
     name = scenario.excitation.criterion
     make = chosen(name, "excitation.criterion", CRITERIA)
-    if is_own(name):
+    if is_plugin_name(name):
         known = (ScenarioError, TrajectoryError)
         part = f"excitation.criterion {name!r}"
-        make = Telling(part, make, ScenarioError, known, _check_made)
+        make = PluginFunction(part, make, ScenarioError, known, _check_made)
         made: Criterion = make(robot, scenario, unknowns, typical)
-        judge = made.judge and Telling(
+        judge = made.judge and PluginFunction(
             f"judge of {part}", made.judge, ScenarioError, known, _judged
         )
         return replace(made, judge=judge)

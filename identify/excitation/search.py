@@ -14,11 +14,11 @@ from scipy.optimize import differential_evolution
 
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
-from identify.excitation.constraints import MotionConstraints, Worst
+from identify.excitation.constraints import MotionConstraints, WorstCase
 from identify.excitation.criteria import Criterion
 from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, motion, sample_times
 from identify.progress import Progress
-from identify.runtime import honoured, one_thread, raise_noted
+from identify.runtime import interruptible, one_thread, raise_interrupt
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
@@ -59,7 +59,7 @@ class SearchProblem:
         """Instants (N,) [s] at which the result of a search is checked."""
         return sample_times(self.unknowns.fundamental_hz, self.unknowns.harmonics, CHECK_REFINEMENT)
 
-    def worst(self, z: Array) -> list[Worst]:
+    def worst(self, z: Array) -> list[WorstCase]:
         """Return the instants of the check at which z comes nearest to each limit."""
         return self.constraints.worst(self.unknowns.trajectory(z), self.check_times)
 
@@ -84,7 +84,7 @@ class SearchProblem:
             else:
                 outside = middle
             if outside < 1e-3:
-                worst = max(self.worst(middle * z), key=Worst.excess)
+                worst = max(self.worst(middle * z), key=WorstCase.excess)
                 raise TrajectoryError(f"the start is not admissible, even close to home: {worst}")
         return inside * z
 
@@ -246,7 +246,7 @@ STARTS = 3
 """Number of candidates from which IPOPT starts."""
 
 
-@honoured()
+@interruptible()
 def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
     """Return the best result of IPOPT from the best candidates.
 
@@ -313,7 +313,7 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
 def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, Any]]:
     """Return the solution of IPOPT from z, and its statistics."""
     done = solver(x0=z, lbg=-1.0, ubg=1.0)
-    raise_noted()  # IPOPT treats Ctrl-C as a failed evaluation
+    raise_interrupt()  # IPOPT treats Ctrl-C as a failed evaluation
     return done, solver.stats()
 
 

@@ -16,7 +16,7 @@ from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
-from identify.own_parts import LAWS, Telling, chosen, is_own
+from identify.own_parts import LAWS, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Timing
 from identify.scenario.plant_sections import FILTERED, Control
 
@@ -44,7 +44,7 @@ class NamedMotion:
 
 
 @dataclass(frozen=True)
-class Seen:
+class LoopSensor:
     """Measurement in the loop.
 
     Attributes
@@ -81,9 +81,9 @@ class KnownModel:
     doubt: float = VAGUE
 
 
-def by_images(eye: SensorInLoop) -> Seen:
+def by_images(eye: SensorInLoop) -> LoopSensor:
     """Return the measurement by a sensor with images."""
-    return Seen(eye.measure, lambda frame: eye.covariances[frame], eye.common)
+    return LoopSensor(eye.measure, lambda frame: eye.covariances[frame], eye.common)
 
 
 def prepared(
@@ -91,7 +91,7 @@ def prepared(
     law: str,
     known: KnownModel,
     motion: NamedMotion,
-    seen: Seen,
+    seen: LoopSensor,
     latencies: Array | None = None,
 ) -> LawInLoop:
     """Prepare a law to follow a motion.
@@ -106,7 +106,7 @@ def prepared(
         Model of the law.
     motion : NamedMotion
         Motion to follow.
-    seen : Seen
+    seen : LoopSensor
         Measurement in the loop.
     latencies : ndarray, shape (frames,), optional
         Latencies of the commands, s, that the law knows. The default is the latency of the timing.
@@ -124,7 +124,7 @@ def prepared(
     loop = plant.loop
     timing = plant.runs.timing
     robot = plant.nominal
-    chosen_law: Law = _telling(law, chosen(law, "law", LAWS))
+    chosen_law: Law = _plugin_law(law, chosen(law, "law", LAWS))
     times = timing.frame_times(motion.duration_s)
     desired = motion.motion.pose(times)
     try:
@@ -164,13 +164,13 @@ def prepared(
     if law == "computed_torque":
         check_torque_gains(model, settings, desired[0], asked)
     if isinstance(found.controller, EveryFrame):
-        return replace(found, controller=EveryFrame(_telling(law, found.controller.command)))
-    return replace(found, controller=found.controller and _telling(law, found.controller))
+        return replace(found, controller=EveryFrame(_plugin_law(law, found.controller.command)))
+    return replace(found, controller=found.controller and _plugin_law(law, found.controller))
 
 
-def _telling(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
+def _plugin_law(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of a law. Errors of a user's own function are reported in one line."""
-    return Telling(f"law {law!r}", asked, SimulationError) if is_own(law) else asked
+    return PluginFunction(f"law {law!r}", asked, SimulationError) if is_plugin_name(law) else asked
 
 
 def feedback(control: Control, timing: Timing) -> Feedback:

@@ -19,7 +19,7 @@ from identify.errors import IdentifyError, WriteError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop, SensorPlan
 from identify.progress import Progress, SilentProgress
-from identify.runtime import cores, deaf_offspring, end_with_parent
+from identify.runtime import cores, end_with_parent, shield_children
 
 WARM_UP_FRAMES = 12
 """Number of frames of the motion on which everything is compiled."""
@@ -90,7 +90,7 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
             while waiting and len(running) < cores():
                 running.append(waiting.pop(0))
                 # Only this process gets Ctrl-C, and then kills the others.
-                with deaf_offspring():
+                with shield_children():
                     running[-1].start()
             wait([process.sentinel for process in running])
             for process in [one for one in running if one.exitcode is not None]:

@@ -17,7 +17,7 @@ from secrets import token_hex
 from typing import TYPE_CHECKING
 
 from identify.errors import WriteError
-from identify.runtime import held
+from identify.runtime import delay_interrupts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +28,7 @@ TEMPORARY = ".cmmsim-"
 
 @contextmanager
 def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
-    """Convert an error of the block that writes a file into a WriteError with one line.
+    """Convert an exception in a block that writes a file into a WriteError with one line.
 
     ``size`` is the number of bytes of the file, if known.
     """
@@ -73,7 +73,7 @@ def figure_bytes(figure: "Figure", suffix: str, dpi: int = 150) -> bytes:
     return stream.getvalue()
 
 
-@held()
+@delay_interrupts()
 def write_files(
     contents: Mapping[Path, bytes],
     *,
@@ -109,14 +109,15 @@ def write_files(
         with suppress(OSError, ValueError):
             for path in (*beside.values(), *placed):
                 path.unlink(missing_ok=True)
-            take_back(folders)
+            remove_empty_folders(folders)
         raise
 
 
 def check_writable(path: Path | str) -> None:
-    """Raise WriteError if a file cannot be written. This is checked before its content is made.
+    """Raise WriteError if a file cannot be written. Call this before its content is made.
 
-    The reason is that the path is a folder, or that its nearest existing folder is not writable.
+    A file cannot be written if the path is a folder, or if the nearest existing folder is not
+    writable.
     """
     path = Path(path)
     with writing(path):
@@ -133,12 +134,12 @@ def make_folder(folder: Path) -> list[Path]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        take_back(missing[::-1])
+        remove_empty_folders(missing[::-1])
         raise
     return missing[::-1]
 
 
-def take_back(folders: list[Path]) -> None:
+def remove_empty_folders(folders: list[Path]) -> None:
     """Remove folders made by `make_folder`, if they are empty."""
     for folder in reversed(folders):
         with suppress(OSError):
@@ -175,7 +176,7 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
         for path in moved:
             shutil.rmtree(path, ignore_errors=True)
             path.unlink(missing_ok=True)
-        take_back(folders)
+        remove_empty_folders(folders)
         raise
 
 

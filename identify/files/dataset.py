@@ -1,7 +1,7 @@
 """Described xarray datasets over time, with checked dimensions, units and names, in netCDF groups.
 
-Files are written completely or not at all, and errors of reading are clear. `covariance.nc` has the
-covariance of the estimated parameters, in their SI units.
+Files are written completely or not at all. `covariance.nc` has the covariance of the estimated
+parameters, in SI units.
 """
 
 import io
@@ -17,9 +17,9 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.atomic import write_bytes
-from identify.files.limited_process import StrangerError
-from identify.files.seal import is_sealed, sealed
-from identify.files.stranger import ENGINE, Content, load, load_elsewhere
+from identify.files.digest import has_digest, with_digest
+from identify.files.limited_process import UntrustedFileError
+from identify.files.untrusted import ENGINE, Content, load, load_in_process
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
@@ -43,14 +43,14 @@ def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
             stream, mode=mode, group=name or None, engine=ENGINE, encoding=_encoding(dataset)
         )
         mode = "a"
-    return sealed(stream.getvalue())
+    return with_digest(stream.getvalue())
 
 
 def read_group(path: Path | str, group: str = "") -> xr.Dataset:
     """Read one group into memory.
 
     Raises RecordError if there is no such file or group, or if the file is damaged. A file without
-    a digest must also be readable within the limits of `identify.files.stranger`.
+    a digest must also be readable within the limits of `identify.files.untrusted`.
     """
     names, dataset = _read(path, group)
     if dataset is None:
@@ -61,7 +61,7 @@ def read_group(path: Path | str, group: str = "") -> xr.Dataset:
 def group_names(path: Path | str) -> list[str]:
     """Return the sorted names of all groups, nested ones as ``run01/truth``.
 
-    Raises the errors of `read_group`.
+    Raises the same exceptions as `read_group`.
     """
     return _read(path, None)[0]
 
@@ -74,11 +74,11 @@ def _read(path: Path | str, group: str | None) -> Content:
     except OSError as error:
         raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
     # A file with the right digest was written by this program, and is safe to read.
-    if is_sealed(path, content):
+    if has_digest(path, content):
         return load(content, group)
     try:
-        return load_elsewhere(content, group)
-    except StrangerError as error:
+        return load_in_process(content, group)
+    except UntrustedFileError as error:
         raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from None
 
 
@@ -245,7 +245,9 @@ def write_covariance(
 
 
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
-    """Return the units of a robot's parameters, and of others, whose names end with their units."""
+    """Return the units of a robot's parameters, and of other quantities, whose names end with
+    units.
+    """
     units = {name: layout.unit(name) for name in layout.names}
     return units | {name: name.rpartition("_")[2] for name in others}
 

@@ -26,15 +26,15 @@ CODE = "from identify.files.limited_process import serve; serve()"
 TOO_LONG = f"it cannot be read within {LIMIT_S} s"
 
 
-class StrangerError(Exception):
+class UntrustedFileError(Exception):
     """Reason, in one line, why a file cannot be read."""
 
 
 def within_limits(read: Callable[..., Any], *given: object) -> Any:
     """Call a function of a module in another process, within the limits, and return its result.
 
-    Raises StrangerError with the reason if a limit is exceeded, if the process dies, or if the
-    function raises an error. Errors of `dynamics` are raised as they are.
+    Raises UntrustedFileError with the reason if a limit is exceeded, if the process dies, or if the
+    function raises an exception. Exceptions of `dynamics` pass unchanged.
     """
     limited = os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
@@ -51,11 +51,11 @@ def within_limits(read: Callable[..., Any], *given: object) -> Any:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise StrangerError(TOO_LONG) from None
+        raise UntrustedFileError(TOO_LONG) from None
     if _ended_by_alarm(done.returncode):
-        raise StrangerError(TOO_LONG)
+        raise UntrustedFileError(TOO_LONG)
     if done.returncode:
-        raise StrangerError(f"the library that reads it ends with status {done.returncode}")
+        raise UntrustedFileError(f"the library that reads it ends with status {done.returncode}")
     found = pickle.loads(done.stdout)
     if isinstance(found, Exception):
         raise found
@@ -67,7 +67,7 @@ def _ended_by_alarm(status: int) -> bool:
 
 
 def serve() -> None:
-    """Do the call pickled on standard input, and write the pickle of its result or error."""
+    """Read a pickled call from standard input, do it, and write the pickled result or exception."""
     # Output of the library must not be mixed with the bytes of the pickle.
     out = sys.stdout
     sys.stdout = sys.stderr
@@ -84,7 +84,7 @@ def serve() -> None:
     except DynamicsError as error:
         found = error
     except Exception as error:  # the library can raise any error for such a file
-        found = StrangerError(" ".join(str(error).split()) or type(error).__name__)
+        found = UntrustedFileError(" ".join(str(error).split()) or type(error).__name__)
     if hasattr(signal, "alarm"):
         signal.alarm(0)  # what follows is not limited
     out.buffer.write(pickle.dumps(found))

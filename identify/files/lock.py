@@ -7,7 +7,7 @@ from pathlib import Path
 from filelock import BaseFileLock, FileLock, Timeout
 
 from identify.errors import IdentifyError, OutputFolderError
-from identify.files.atomic import make_folder, remove_leftovers, take_back, writing
+from identify.files.atomic import make_folder, remove_empty_folders, remove_leftovers, writing
 
 LOCK = ".lock"
 """Name of the locked file. A file that a killed process has left does not block."""
@@ -17,13 +17,13 @@ PRIVATE = 0o600
 
 
 @contextmanager
-def working_in(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a folder for this process, as `locked` does, and make it if it is missing.
 
     A new folder that remains empty is removed.
 
-    Raises OutputFolderError if another process has locked the folder. Raises WriteError if it
-    cannot be made, or if nothing can be written into it.
+    Raises OutputFolderError if another process has locked the folder. Raises WriteError if the
+    folder cannot be made, or if nothing can be written into the folder.
     """
     with writing(folder):
         made = make_folder(folder)
@@ -31,7 +31,7 @@ def working_in(folder: Path) -> Iterator[None]:
         with locked(folder, OutputFolderError):
             yield
     finally:
-        take_back(made)
+        remove_empty_folders(made)
 
 
 @contextmanager

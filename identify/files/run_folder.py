@@ -15,8 +15,8 @@ import numpy as np
 from dynamics.files import read_bytes
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes, write_bytes, write_files
-from identify.files.lock import LOCK, working_in
-from identify.files.seal import check_netcdf, check_toml, opened_json, sealed_json
+from identify.files.digest import check_netcdf, check_toml, json_with_digest, json_without_digest
+from identify.files.lock import LOCK, lock_folder
 
 LARGEST_JSON = 100_000_000
 """Largest size, in bytes, of a result or of measured static poses."""
@@ -73,7 +73,7 @@ class RunFolder:
     def require(self, *names: str) -> None:
         """Check that files of earlier stages exist, and that netCDF files are not damaged.
 
-        Their digests are compared before a library opens any of them.
+        The digests of netCDF files are compared before a library opens any of these files.
 
         Raises
         ------
@@ -98,7 +98,7 @@ class RunFolder:
 
 @contextmanager
 def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[RunFolder]:
-    """Lock a new or empty folder for this process, see `working_in`.
+    """Lock a new or empty folder for this process, see `lock_folder`.
 
     The folder may contain the names in ``also``. Leftovers of a killed process are ignored.
 
@@ -108,7 +108,7 @@ def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[Run
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
-    with working_in(folder):
+    with lock_folder(folder):
         if any(found.name not in (LOCK, *also) for found in folder.iterdir()):
             raise OutputFolderError(
                 f"output folder {folder} is not empty; name another with --out, or remove it"
@@ -136,7 +136,7 @@ def save_result(path: Path | str, result: dict[str, Any]) -> None:
 
 def result_json(result: dict[str, Any]) -> bytes:
     """Return the file of a result, with its digest. Numbers are converted as in `as_json`."""
-    return _text(sealed_json(_plain(result))).encode()
+    return _text(json_with_digest(_plain(result))).encode()
 
 
 def as_json(result: dict[str, Any]) -> str:
@@ -168,7 +168,7 @@ def load_result(path: Path | str) -> dict[str, Any]:
         raise RecordError(f"{path} is truncated or not JSON: {error}") from error
     if not isinstance(result, dict):
         raise RecordError(f"{path} holds no JSON object")
-    return opened_json(path, result)
+    return json_without_digest(path, result)
 
 
 def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:

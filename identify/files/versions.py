@@ -33,7 +33,7 @@ def versions() -> dict[str, str]:
 def _version(name: str) -> str:
     """Return the version of a package.
 
-    It is cached, because a search takes 4 ms for each row of a study.
+    The version is cached, because a search takes 4 ms for each row of a study.
     """
     try:
         return metadata.version(name)

@@ -14,7 +14,7 @@ LONG_ENOUGH = 0.5
 """Smallest length of the column of a pivot, as a share of the largest remaining length."""
 
 
-def untold(covariance: Array, prior_std: Array) -> Array:
+def unobservable(covariance: Array, prior_std: Array) -> Array:
     """Return orthonormal directions (k, g) of geometric numbers that the poses do not determine.
 
     The numbers are in units of their tolerance. Along these directions the standard deviation stays
@@ -30,7 +30,7 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
     If the numbers change together by these amounts (m and rad), the measured poses hardly change.
     Each combination begins with a number that no other combination contains.
     """
-    directions = untold(covariance, prior_std)
+    directions = unobservable(covariance, prior_std)
     if not len(directions):
         return ()
     pivots = _pivots(directions)
@@ -89,7 +89,7 @@ def check_enough(
     names = robot.geometry.number_names
     rows = len(robot.coordinate_names)
     covariance = posterior(information, scale, len(names))
-    told = len(names) - len(untold(covariance, prior_std))
+    told = len(names) - len(unobservable(covariance, prior_std))
     if poses * rows >= told:
         return
     worst = np.argsort(-np.sqrt(np.diagonal(covariance)) / prior_std, kind="stable")

@@ -12,8 +12,8 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.arrays import Array
 from identify.files.dataset import covariance_netcdf
+from identify.files.digest import toml_with_digest
 from identify.files.run_folder import rms_figures, save_files
-from identify.files.seal import sealed_toml
 from identify.files.versions import versions
 from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
 from identify.geometry.observability import combinations
@@ -83,7 +83,7 @@ class GeometryOutcome:
             "geometry.json": self.entry,
             "geometry.md": geometry_markdown(self.entry),
             "poses.json": self.data.entry(robot),
-            "robot.toml": sealed_toml(robot_text(description, [said])),
+            "robot.toml": toml_with_digest(robot_text(description, [said])),
             "scenario.toml": self.scenario.to_toml(),
             **(pictures or {}),
         }

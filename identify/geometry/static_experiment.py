@@ -95,7 +95,7 @@ def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> 
 
 
 @dataclass(frozen=True)
-class Sighted:
+class MeasuredPlatform:
     """Measured static poses.
 
     Attributes
@@ -118,7 +118,7 @@ class Sighted:
 
 def measured(
     sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress
-) -> Sighted:
+) -> MeasuredPlatform:
     """Measure poses through images.
 
     Averaging reduces only the part of the stated variance that appears as scatter of frames at
@@ -150,7 +150,7 @@ def measured(
     share = min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
     lost = int(len(poses) * frames - counts.sum())
-    return Sighted(means, stated * kept[:, None, None], seen, lost)
+    return MeasuredPlatform(means, stated * kept[:, None, None], seen, lost)
 
 
 def _frames_at(
@@ -184,7 +184,7 @@ def drawn(
     frames: int,
     rng: np.random.Generator,
     progress: Progress,
-) -> Sighted:
+) -> MeasuredPlatform:
     """Draw measured poses without images.
 
     The stated covariance of one frame at each pose, divided by `frames`, is the covariance of the
@@ -208,7 +208,7 @@ def drawn(
         means = means + by_cameras @ rng.standard_normal(by_cameras.shape[2])
     for row in map(int, np.flatnonzero(seen)):
         means[row] += np.linalg.cholesky(covariances[row]) @ rng.standard_normal(6)
-    return Sighted(means, covariances, seen, int((~seen).sum()) * frames)
+    return MeasuredPlatform(means, covariances, seen, int((~seen).sum()) * frames)
 
 
 def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:

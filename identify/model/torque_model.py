@@ -37,7 +37,7 @@ STEPS = 8
 HALVINGS = 8
 """Largest number of halvings of a step."""
 
-SETTLED = 1e-3
+STEP_TOLERANCE = 1e-3
 """Largest change of a pose, in standard deviations, at which the steps end."""
 
 SHORTEST = 4
@@ -61,17 +61,17 @@ class Fit:
     ----------
     start, run
         Coordinates and rates of the start, and the run from there.
-    seen : ndarray, shape (6 n, 2 m)
+    jacobian : ndarray, shape (6 n, 2 m)
         Derivatives of the whitened poses with respect to the start.
-    missed : ndarray, shape (6 n + 2 m,)
+    residuals : ndarray, shape (6 n + 2 m,)
         Residuals of the measured poses, then differences from the filtered start, both in standard
         deviations.
     """
 
     start: Array
     run: ClosedLoopRun
-    seen: Array
-    missed: Array
+    jacobian: Array
+    residuals: Array
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class TorqueModel(LoopModel):
         """
         drawn = []
         for fit in self._fits(parameters, None):
-            directions = np.linalg.qr(fit.seen)[0]
+            directions = np.linalg.qr(fit.jacobian)[0]
             drawn.append(directions @ rng.standard_normal(directions.shape[1]))
         return self.misses(parameters) + np.concatenate(drawn).reshape(-1, 6)
 
@@ -187,14 +187,17 @@ class TorqueModel(LoopModel):
             fit = self._tried(parameters, robot, span, half.start, filtered)
         fit = fit or self._from(parameters, robot, span, filtered, filtered)
         for _ in range(STEPS):
-            step = np.linalg.lstsq(np.vstack([fit.seen, near]), fit.missed, rcond=None)[0]
-            if np.abs(fit.seen @ step).max(initial=0.0) < SETTLED:
+            step = np.linalg.lstsq(np.vstack([fit.jacobian, near]), fit.residuals, rcond=None)[0]
+            if np.abs(fit.jacobian @ step).max(initial=0.0) < STEP_TOLERANCE:
                 break
             # A full step can be too large, and even leave the reach of the robot.
             for halving in range(HALVINGS):
                 start = fit.start - 0.5**halving * step
                 lower = self._tried(parameters, robot, span, start, filtered)
-                if lower is not None and lower.missed @ lower.missed < fit.missed @ fit.missed:
+                if (
+                    lower is not None
+                    and lower.residuals @ lower.residuals < fit.residuals @ fit.residuals
+                ):
                     break
             else:
                 break
@@ -243,21 +246,23 @@ class TorqueModel(LoopModel):
         )
         ok = self.ok[frames]
         by_start = np.asarray(run.start_sensitivity)[:, :, : len(start)]
-        missed = ((run.pose - self.measured[frames])[ok] @ self.whitener.T).ravel()
-        seen = (self.whitener @ by_start[ok]).reshape(-1, len(start))
-        return Fit(start, run, seen, np.concatenate([missed, (start - filtered) / self._width]))
+        residuals = ((run.pose - self.measured[frames])[ok] @ self.whitener.T).ravel()
+        jacobian = (self.whitener @ by_start[ok]).reshape(-1, len(start))
+        return Fit(
+            start, run, jacobian, np.concatenate([residuals, (start - filtered) / self._width])
+        )
 
     def _slopes(self, fit: Fit, ok: np.ndarray) -> Array:
         """Return derivatives (n, 6, p) of a span's poses with respect to the parameters.
 
         They include the change of the fitted start.
         """
-        states = fit.seen.shape[1]
+        states = fit.jacobian.shape[1]
         near = np.diag(1 / self._width)
         by_parameters = np.asarray(fit.run.pose_sensitivity)
-        columns = (self.whitener @ by_parameters[ok]).reshape(len(fit.seen), -1)
+        columns = (self.whitener @ by_parameters[ok]).reshape(len(fit.jacobian), -1)
         columns = np.vstack([columns, np.zeros((states, columns.shape[1]))])
-        moving = np.linalg.lstsq(np.vstack([fit.seen, near]), columns, rcond=None)[0]
+        moving = np.linalg.lstsq(np.vstack([fit.jacobian, near]), columns, rcond=None)[0]
         return np.asarray(
             by_parameters - np.asarray(fit.run.start_sensitivity)[:, :, :states] @ moving
         )

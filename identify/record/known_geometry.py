@@ -9,7 +9,7 @@ from dynamics import DynamicsError, Robot, load_robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import read_covariance
-from identify.files.seal import check_toml
+from identify.files.digest import check_toml
 from identify.record.run_error_covariance import covariance_fault
 from identify.scenario.sections import Geometry
 

@@ -1,7 +1,7 @@
 """Formatting of numbers for reports.
 
-A number gets the digits that its uncertainty allows. It is written as zero if it is only a rounding
-error.
+A number gets the digits that its uncertainty allows. A number that is only a rounding error is
+written as zero.
 """
 
 import math
@@ -58,7 +58,7 @@ def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -
     return f"({text}) × 10{str(power).translate(SUPERSCRIPTS)}" if power else text
 
 
-def spelled(text: str) -> str:
+def typographic(text: str) -> str:
     """Return a sentence from the program with numbers and signs in typographic form."""
     text = re.sub(r"\d+(\.\d+)?e[+-]?\d+", lambda found: number(float(found[0])), text)
     return text.replace("<=", "≤").replace(">=", "≥").replace("**", "^")

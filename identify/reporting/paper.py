@@ -1,8 +1,8 @@
-"""Figures of the paper whose experiment this project repeats.
+"""Numbers from the paper whose experiment this project repeats.
 
-They are given only for runs that repeat the settings of the paper. Rows are the RMS of x, y, z [µm]
-and alpha, beta, gamma [µrad]. They compare the identified model of the paper with measurements of a
-real robot, whose truth was not known.
+Reports state them only for runs that repeat the settings of the paper. Each row is the RMS of x, y,
+z [µm] and alpha, beta, gamma [µrad] of the paper's identified model against measurements of a real
+robot, whose truth was not known.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings

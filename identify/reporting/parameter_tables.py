@@ -20,8 +20,8 @@ Entry = dict[str, Any]
 def parameter_table(result: dict[str, Any]) -> Table:
     """Return the table of the identified parameters.
 
-    It has the initial guess, the truth if it is known, and the estimate with its standard deviation
-    and interval.
+    The columns are the initial guess, the truth if it is known, and the estimate with its standard
+    deviation and interval.
     """
     identification = result["identification"]
     rows = [
@@ -62,7 +62,7 @@ def parameter_table(result: dict[str, Any]) -> Table:
 def scale_sentence(identification: Mapping[str, Any]) -> str:
     """Return the sentence that states what fixes the common factor of all parameters.
 
-    It warns if the intended anchor does not fix it.
+    The sentence is a warning if the intended anchor does not fix the factor.
     """
     anchor = identification["scale_anchor"]
     said = ANCHORS.get(anchor, anchor)
@@ -91,7 +91,7 @@ ANCHORS = {
 def group_table(result: dict[str, Any]) -> Table:
     """Return the table of the base parameters that combine several parameters.
 
-    It has the truth, and the estimate with its standard deviation.
+    The columns are the truth, and the estimate with its standard deviation.
     """
     identification = result["identification"]
     rows = []
@@ -152,7 +152,7 @@ DRIVES = {
 def drive_sentence(identification: Mapping[str, Any]) -> str:
     """Return the sentence that states the law of the drives, and how it is known.
 
-    It is empty if the scenario states the usual law, a PID.
+    The text is empty if the scenario states the usual law, a PID.
     """
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):

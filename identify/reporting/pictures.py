@@ -20,13 +20,13 @@ from identify.reporting.run_data import RunData, read_run
 class Picture:
     """Function that draws a figure, and its caption.
 
-    ``painted`` is true if a page includes the figure as an image, because it has many strokes or
+    ``as_image`` is true if a page includes the figure as an image, because it has many strokes or
     grey values.
     """
 
     draw: Callable[[], Figure]
     caption: str
-    painted: bool = False
+    as_image: bool = False
 
 
 def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
@@ -131,7 +131,7 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
         text = f"The robot {data.robot} half way along its path."
         return {
             "scene": Picture(
-                lambda: overview.overview_figure(cell, data.middle), text, painted=True
+                lambda: overview.overview_figure(cell, data.middle), text, as_image=True
             )
         }
     text = (
@@ -145,9 +145,9 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
     )
     return {
         "scene": Picture(
-            lambda: overview.overview_figure(cell, data.middle, view), text, painted=True
+            lambda: overview.overview_figure(cell, data.middle, view), text, as_image=True
         ),
-        "stereo_frame": Picture(lambda: overview.residual_figure(view), residuals, painted=True),
+        "stereo_frame": Picture(lambda: overview.residual_figure(view), residuals, as_image=True),
     }
 
 

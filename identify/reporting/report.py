@@ -19,7 +19,7 @@ from identify.progress import Progress, SilentProgress
 from identify.reporting import paper
 from identify.reporting.figures.style import PALETTE, drawn, svg_text
 from identify.reporting.goals import check_goals
-from identify.reporting.number_format import spelled
+from identify.reporting.number_format import typographic
 from identify.reporting.pictures import Picture, pictures
 from identify.reporting.report_sections import SECTIONS
 from identify.reporting.run_data import RunData, read_run
@@ -74,7 +74,7 @@ def write_report(
             files[run.figures / f"{name}.png"] = png
             files[run.figures / f"{name}.pdf"] = figure_bytes(figure, ".pdf")
             # An SVG with many strokes would be larger than the image, and slow to display.
-            drawings[name] = painting(png) if picture.painted else svg_text(figure, name)
+            drawings[name] = image_element(png) if picture.as_image else svg_text(figure, name)
             advance()
         files[run.report] = render(data, shown, drawings).encode()
         write_files(files | further(), parents=True)
@@ -95,7 +95,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    said = verdict(data.result, data.cameras_acquitted)
+    said = verdict(data.result, data.cameras_consistent)
     goals = check_goals(data.result)
     return environment.get_template("report.html.j2").render(
         title=f"Identification of {data.robot}",
@@ -109,12 +109,14 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
         first_look=[name for name in FIRST_LOOK if name in shown],
         sections=[build(data) for build in SECTIONS],
         pictures=shown,
-        drawings={n: text if shown[n].painted else _coloured(text) for n, text in drawings.items()},
+        drawings={
+            n: text if shown[n].as_image else _coloured(text) for n, text in drawings.items()
+        },
         paper=paper,
     )
 
 
-def painting(png: bytes) -> str:
+def image_element(png: bytes) -> str:
     """Return an <img> element with a PNG image, reduced to the size for a page."""
     stream = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
@@ -133,7 +135,7 @@ def _subtitle(result: Mapping[str, Any]) -> str:
 
 
 def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{spelled(text[1:])}."
+    return f"{text[:1].upper()}{typographic(text[1:])}."
 
 
 def _coloured(element: str) -> str:

@@ -7,13 +7,13 @@ from typing import Any
 
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.diagnosis_text import diagnosis_table, diagnosis_text
-from identify.reporting.number_format import number, spelled
+from identify.reporting.number_format import number, typographic
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
 
 @dataclass(frozen=True)
-class Fold:
+class FoldedText:
     """Text that is folded under a title.
 
     ``printed`` is true if it is also shown in print. ``verbatim`` is true if its line breaks are
@@ -39,7 +39,7 @@ class Section:
     pictures: tuple[str, ...] = ()
     folded: Mapping[str, str] = field(default_factory=dict)
     tables: tuple[Table, ...] = ()
-    folds: tuple[Fold, ...] = ()
+    folds: tuple[FoldedText, ...] = ()
 
 
 def sensor_section(data: RunData) -> Section:
@@ -58,14 +58,14 @@ def sensor_section(data: RunData) -> Section:
             "uncertainties below are those that the sensor states."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
-    if data.cameras_acquitted:
+    if data.cameras_consistent:
         common_errors = data.result["identification"].get("nuisances")
         beside = ", plus errors that all frames have in common" if common_errors else ""
         said.append(
             "Its errors agree with the noise that it states, and are independent from frame to "
             f"frame{beside}."
         )
-    elif data.cameras_acquitted is not None:
+    elif data.cameras_consistent is not None:
         said.append(
             "Its errors are larger than the noise that it states, or depend on the errors of "
             "earlier frames."
@@ -92,9 +92,9 @@ def fit_section(data: RunData) -> Section:
     found = data.result["identification"]
     text = (
         f"The search took {found['iterations']} steps; it ended because "
-        f"{spelled(found['stop_reason'])}."
+        f"{typographic(found['stop_reason'])}."
     )
-    table = tables.excitation_error_table(data.result, data.beside_paper)
+    table = tables.excitation_error_table(data.result, data.repeats_paper)
     causes = diagnosis_table(data.result)
     return Section(
         "Fit",
@@ -123,7 +123,7 @@ def parameter_section(data: RunData) -> Section:
         *_conditioning_text(found.get("conditioning")),
     ]
     folds = [
-        Fold(f"Not identified, {len(names)} of {len(parameters)}: {reason}", ", ".join(names))
+        FoldedText(f"Not identified, {len(names)} of {len(parameters)}: {reason}", ", ".join(names))
         for reason, names in parameter_tables.unidentified(found)
     ]
     pairs = [parameter_tables.correlation_table(data.result)] if known else []
@@ -145,7 +145,7 @@ def validation_section(data: RunData) -> Section:
         )
         return Section("Validation", (text,))
     both = (
-        tables.validation_table(data.result, data.beside_paper),
+        tables.validation_table(data.result, data.repeats_paper),
         tables.prediction_table(data.result),
     )
     text = f"{len(data.validation)} trajectories that were not used in the identification."
@@ -169,7 +169,7 @@ def provenance_section(data: RunData) -> Section:
             tables.seconds_table(data.result),
             tables.versions_table(data.result),
         ),
-        folds=(Fold("The whole scenario", data.scenario_toml, printed=False, verbatim=True),),
+        folds=(FoldedText("The whole scenario", data.scenario_toml, printed=False, verbatim=True),),
     )
 
 
@@ -222,7 +222,7 @@ def _index_text(data: RunData) -> tuple[str, ...]:
         f"{number(chosen.median_index, 3)} for the middle one, and "
         f"{number(chosen.observability_index, 3)} for the trajectory that was used."
     )
-    if data.beside_paper:
+    if data.repeats_paper:
         text += (
             f" With its own geometry, the paper improved it from {paper.INDEX_FIRST:g} to "
             f"{paper.INDEX_BEST:g} by a genetic algorithm."
@@ -231,7 +231,7 @@ def _index_text(data: RunData) -> tuple[str, ...]:
 
 
 def _paper_text(data: RunData) -> tuple[str, ...]:
-    if not data.beside_paper:
+    if not data.repeats_paper:
         return ()
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "

@@ -24,7 +24,7 @@ from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.reporting.figures.fit import Fit
 from identify.reporting.paper import repeats_the_paper
 from identify.reporting.run_result import check_intervals
-from identify.reporting.verdict import cameras_acquitted
+from identify.reporting.verdict import cameras_consistent
 from identify.scenario import Scenario
 from identify.scene import StereoView, Workcell, stereo_view, workcell
 from identify.trajectory import TrajectorySet, load_trajectories
@@ -69,17 +69,17 @@ class RunData:
         return recorded_scenario(self.experiment)
 
     @cached_property
-    def beside_paper(self) -> bool:
+    def repeats_paper(self) -> bool:
         """True if the run repeats the experiment of the paper, so that both can be compared."""
         return repeats_the_paper(self.scenario_toml)
 
     @cached_property
-    def cameras_acquitted(self) -> bool | None:
+    def cameras_consistent(self) -> bool | None:
         """True if the cameras cannot be the cause of the model's residuals.
 
         None if the truth is not known.
         """
-        return cameras_acquitted(self.experiment, self.truth)
+        return cameras_consistent(self.experiment, self.truth)
 
     @cached_property
     def scene(self) -> Workcell | str:

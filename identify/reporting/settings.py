@@ -62,7 +62,7 @@ def changed_settings(
 
 
 class _Stated(NamedTuple):
-    """Value in a scenario, None if it has none, and the meaning of the value."""
+    """Value of a setting, or None if the scenario lacks it, and the meaning of the setting."""
 
     value: Any
     meaning: str

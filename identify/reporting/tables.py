@@ -153,7 +153,7 @@ def _shares(found: dict[str, Any]) -> str:
     return f" Largest share of the variance of an identified parameter: {said}." if said else ""
 
 
-def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
+def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the model with the measurement on the exciting trajectory.
 
     The columns are before and after identification. For a run that repeats the experiment of the
@@ -163,7 +163,7 @@ def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -
     after = _rms(rms_row(result.get("after")))
     header: tuple[str, ...] = ("component", "before", "after")
     columns: list[Sequence[str]] = [AXIS_HEADER, before, after]
-    if beside_paper:
+    if repeats_paper:
         header += ("paper before", "paper after")
         columns += [list(map(number, paper.BEFORE)), list(map(number, paper.AFTER))]
     return Table(
@@ -174,7 +174,7 @@ def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -
     )
 
 
-def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
+def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the models with measurement and truth on the validation trajectories.
 
     For a run that repeats the experiment of the paper, its table 4 follows.
@@ -185,7 +185,7 @@ def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Tabl
         rows.append((f"{n}: identified, measured", *_rms(rms_row(run["measured"]))))
         if "initial_true" in run:
             rows.append((f"{n}: initial, true", *_rms(rms_row(run["initial_true"]))))
-    if beside_paper:
+    if repeats_paper:
         rows += [
             (f"paper {n}: identified, measured", *map(number, row))
             for n, row in enumerate(paper.VALIDATION, 1)

@@ -1,6 +1,6 @@
 """Variation of the estimates over several runs, compared with table 5 of the paper.
 
-It is given as a table, a figure and the entry of `variation.json`.
+The functions return a table, a figure and the entry of `variation.json`.
 """
 
 from typing import Any
@@ -75,8 +75,8 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
 def variation_table(found: Variation) -> Table:
     """Return the table of the parameters that every run identifies.
 
-    It has the mean, the variation, the variation expected from the intervals, and the variation in
-    the paper.
+    The columns are the mean, the variation, the variation expected from the intervals, and the
+    variation in the paper.
     """
     rows = tuple(
         (

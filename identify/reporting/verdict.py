@@ -1,8 +1,9 @@
 """Verdict on a run in whole sentences.
 
-It states what is right, what is not, the possible causes, and what cannot be known. The model is
-called wrong only if the cameras cannot be the cause. For this, the truth must be known, and the
-errors of the cameras must agree with their stated noise and be independent from frame to frame.
+The verdict states what is right, what is not, the possible causes, and what cannot be known. The
+model is called wrong only if the cameras cannot be the cause. For this, the truth must be known,
+and the errors of the cameras must agree with their stated noise and be independent from frame to
+frame.
 """
 
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class Verdict:
     sentences: tuple[str, ...]
 
 
-def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
-    """Tell whether the errors of the cameras are only the noise that they state.
+def cameras_consistent(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
+    """Tell whether the errors of the cameras are consistent with the noise that the cameras state.
 
     None if the truth is not known, or if the record is too short to judge.
     """
@@ -70,17 +71,17 @@ def cameras_acquitted(record: xr.Dataset, truth: xr.Dataset | None) -> bool | No
     return bool(np.mean(white[ok] ** 2) < CAMERAS_MISS and not coloured)
 
 
-def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
+def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     """Return the verdict on a result.
 
-    ``acquitted`` is the result of `cameras_acquitted`: true if the cameras cannot be the cause of
+    ``consistent`` is the result of `cameras_consistent`: true if the cameras cannot be the cause of
     the residuals.
     """
     every = check_goals(result)
     unseen = bool(result.get("validation"))
     missed = [goal for goal in every if not goal.passed]
     explained = all(goal.passed for goal in explanation_goals(result))
-    sentences = [_residual_sentence(result, explained, acquitted)]
+    sentences = [_residual_sentence(result, explained, consistent)]
     if unseen:
         # A model that does not explain its record is wrong, so that this is stated first.
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
@@ -91,12 +92,12 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
     ]
     # Without validation runs, the truth is not known, and only the residuals can be judged.
     if not unseen:
-        headline = EXPLAINED if explained else _blame(None, result)
+        headline = EXPLAINED if explained else _disagreement(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
     if not missed:
         return Verdict(True, "The identified model moves as the true robot does.", tuple(sentences))
     if not explained:
-        return Verdict(False, _blame(acquitted, result), tuple(sentences))
+        return Verdict(False, _disagreement(consistent, result), tuple(sentences))
     counted = f"{len(missed)} of {len(every)} goals {'is' if len(missed) == 1 else 'are'} not met."
     return Verdict(False, f"The model explains the record, but {counted}", tuple(sentences))
 
@@ -183,7 +184,7 @@ def _distance(rows: Array, turns: bool) -> str:
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
-def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool | None) -> str:
+def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool | None) -> str:
     """State whether the residuals are only noise and, if not, the possible cause."""
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
@@ -202,9 +203,8 @@ def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool 
     said = "; ".join(parts)
     if explained:
         return f"The residuals are the noise of the cameras: {said}."
-    return (
-        f"The residuals are more than the noise of the cameras: {said}. {_cause(acquitted, result)}"
-    )
+    cause = _cause(consistent, result)
+    return f"The residuals are more than the noise of the cameras: {said}. {cause}"
 
 
 def _drift_warning(result: dict[str, Any]) -> str | None:
@@ -215,19 +215,19 @@ def _drift_warning(result: dict[str, Any]) -> str | None:
     return (result.get("drift_watch") or {}).get("warning")
 
 
-def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
+def _cause(consistent: bool | None, result: dict[str, Any]) -> str:
     # If the cameras have moved, the measurement is wrong for any model.
     if warning := _drift_warning(result):
         return (
             f"{warning[0].upper()}{warning[1:]}. Calibrate them again; the record cannot tell "
             "whether the model is right."
         )
-    if acquitted:
+    if consistent:
         return (
             "The cameras are not the cause, because their errors agree with their stated noise: "
             "the geometry, the joints or the friction of the model are not those of the robot."
         )
-    if acquitted is None:
+    if consistent is None:
         return (
             "The cause is the model, or cameras with errors beyond their stated noise; the record "
             "alone cannot tell."
@@ -241,9 +241,9 @@ def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
 EXPLAINED = "The identified model explains the record to within the cameras' noise."
 
 
-def _blame(acquitted: bool | None, result: dict[str, Any]) -> str:
+def _disagreement(consistent: bool | None, result: dict[str, Any]) -> str:
     if _drift_warning(result):
         return "Model and measurement disagree, and the cameras have lost their calibration."
-    if acquitted:
+    if consistent:
         return "The model does not describe the robot."
     return "Model and measurement disagree, because of an error of the model or of the cameras."

@@ -57,7 +57,7 @@ class StereoView:
     found: Mapping[str, Found]
 
 
-class StereoEye:
+class ImagingSensor:
     """Sensor of a workcell that draws images at given poses, and detects the stickers in them.
 
     The sensor is not taught, so a sticker is searched near its nominal place.
@@ -101,8 +101,10 @@ class StereoEye:
             images = np.stack([whole.left, whole.right])
             if self._region is not None:
                 corners, side = self._region
-                images = _Cut(images, np.zeros_like(corners)).windows(corners[:, None], side)[:, 0]
-        cut = _Cut(images, corners)
+                images = _CroppedImages(images, np.zeros_like(corners)).windows(
+                    corners[:, None], side
+                )[:, 0]
+        cut = _CroppedImages(images, corners)
         found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
         # The sensor can have more grey levels than the eight bits of images on the page.
         white = self._sensor.noise.white_level
@@ -110,7 +112,7 @@ class StereoEye:
             pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found
         )
 
-    def _found(self, images: "_Cut", pose: Array, number: int) -> Found:
+    def _found(self, images: "_CroppedImages", pose: Array, number: int) -> Found:
         """Find the stickers of the platform (0) or the base (1)."""
         body = self._cell.bodies[number]
         nominal = self._cell.marked(body.name)
@@ -139,7 +141,7 @@ def stereo_view(
     OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
     """
     at = cell.home if pose is None else np.asarray(pose, dtype=float)
-    return StereoEye(cell, seed, renderer, region_of(cell, [at])).look(at)
+    return ImagingSensor(cell, seed, renderer, region_of(cell, [at])).look(at)
 
 
 def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
@@ -162,7 +164,7 @@ def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_],
     return corners, side
 
 
-class _Cut:
+class _CroppedImages:
     """Parts of two images that can be read with coordinates of the whole images."""
 
     def __init__(self, images: NDArray, corners: NDArray[np.int_]) -> None:

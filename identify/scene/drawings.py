@@ -166,7 +166,7 @@ def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
 def show_image(axes: Axes, view: StereoView, side: int) -> None:
     """Draw one image at its place in the whole image, in px.
 
-    It is brightened, so that dark bodies are visible in print.
+    The image is brightened, so that dark bodies are visible in print.
     """
     image = view.images[side]
     x, y = view.corners[side]

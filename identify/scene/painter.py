@@ -70,8 +70,8 @@ class Painter:
     ) -> None:
         """Add the triangles (m, 3) of a closed body, shaded by the light.
 
-        Their corners run counter-clockwise, seen from outside. They are drawn as if they were
-        nearer by ``towards``, in m.
+        The corners of a triangle run counter-clockwise, seen from outside. The triangles are drawn
+        as if they were nearer by ``towards``, in m.
         """
         # Large faces are divided, because they cannot be sorted by a single distance.
         corners, pieces = trimesh.remesh.subdivide_to_size(vertices, faces, self._piece)

@@ -1,8 +1,8 @@
 """Page that replays a motion: one HTML file that opens without a network.
 
-It shows the scene, the images and the curves. The copy of three.js in trimesh draws the scene, and
-the scripts in `replay_page/` move it. Poses are stored in the page in double precision, so that it
-shows the exact values of the files.
+The page shows the scene, the images and the curves. The copy of three.js in trimesh draws the
+scene, and the scripts in `replay_page/` move it. Poses are stored in the page in double precision,
+so that it shows the exact values of the files.
 """
 
 import base64
@@ -22,7 +22,7 @@ from identify.arrays import Array
 from identify.errors import IdentifyError
 from identify.files.atomic import check_writable, write_text
 from identify.progress import Progress, SilentProgress
-from identify.scene.camera_images import Found, StereoEye, StereoView, region_of
+from identify.scene.camera_images import Found, ImagingSensor, StereoView, region_of
 from identify.scene.drawings import scene_figure
 from identify.scene.gltf import gltf
 from identify.scene.replayed_motion import TRUE, Motion
@@ -67,7 +67,7 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
 def page(motion: Motion, progress: Progress) -> str:
     """Return the page of a motion as one HTML text.
 
-    Raises the errors of `write_page` except WriteError.
+    Raises the same exceptions as `write_page`, except WriteError.
     """
     # For a motion with fewer frames than KEY_FRAMES, `unique` removes repeated frames.
     frames = np.unique(np.linspace(0, len(motion.time) - 1, KEY_FRAMES).round().astype(int))
@@ -76,7 +76,7 @@ def page(motion: Motion, progress: Progress) -> str:
         advance()
         looks = []
         for frame, view in _views(motion, frames):
-            looks.append(_look(frame, view))
+            looks.append(_stereo_data(frame, view))
             advance()
         data = _data(motion, rods) | {"looks": looks}
         still = base64.b64encode(png(scene_figure(motion.cell, motion.drawn[0])))
@@ -126,9 +126,11 @@ def _views(motion: Motion, frames: Array) -> Any:
     if not _has_images(motion):
         return
     chosen = motion.poses[TRUE][frames]
-    eye = StereoEye(motion.cell, motion.seed, motion.renderer, region_of(motion.cell, list(chosen)))
+    sensor = ImagingSensor(
+        motion.cell, motion.seed, motion.renderer, region_of(motion.cell, list(chosen))
+    )
     for frame, pose in zip(frames, chosen, strict=True):
-        yield int(frame), eye.look(pose)
+        yield int(frame), sensor.look(pose)
 
 
 def _data(motion: Motion, rods: Array) -> dict[str, Any]:
@@ -161,7 +163,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
     }
 
 
-def _look(frame: int, view: StereoView) -> dict[str, Any]:
+def _stereo_data(frame: int, view: StereoView) -> dict[str, Any]:
     """Return the data of a stereo view for the page."""
     return {
         "frame": frame,

@@ -1,6 +1,6 @@
-"""Workcell of a robot and the stereo sensor that looks at it, ready to be drawn.
+"""Workcell: a robot and the stereo sensor that looks at the robot, ready to be drawn.
 
-It has bodies, stickers, legs and cameras.
+A workcell has bodies, stickers, legs and cameras.
 """
 
 from collections.abc import Mapping
@@ -74,9 +74,9 @@ class ViewingCamera:
         return np.asarray(self.base_from_camera[:3, 3])
 
     def frustum(self, depth: float) -> Array:
-        """Return the corners (4, 3) of the field of view at a depth, in m.
+        """Return the corners (4, 3), m, of the field of view at a depth, m.
 
-        They are in the base frame, in m, clockwise from the top left corner of the image.
+        The corners are in the base frame, clockwise from the top left corner of the image.
         """
         # The edges of the image have half-integer coordinates, because the centre of the first
         # pixel is (0, 0).
@@ -134,10 +134,9 @@ class Workcell:
         return () if self.robot is None else tuple(parts_of(self.robot.geometry).all)
 
     def rods(self, pose: Array) -> Array:
-        """Return the ends (parts, 2, 3) of the bodies of the legs.
+        """Return the ends (parts, 2, 3) of the legs' bodies in the base frame, m.
 
-        They are in m, in the base frame, with the platform at a pose (6,). Raises
-        dynamics.UnreachablePoseError or dynamics.ChartError.
+        The platform is at a pose (6,). Raises dynamics.UnreachablePoseError or dynamics.ChartError.
         """
         if self.robot is None:
             return np.zeros((0, 2, 3))
@@ -145,9 +144,9 @@ class Workcell:
 
     @cached_property
     def frame(self) -> Array:
-        """Lines (n, 2, 3) between neighbouring base joints of the legs.
+        """Lines (n, 2, 3) between neighbouring base joints of the legs, in the base frame, m.
 
-        They are in m, in the base frame. There are none without a robot.
+        Without a robot, there are no lines.
         """
         if self.robot is None:
             return np.zeros((0, 2, 3))
@@ -174,9 +173,10 @@ class Workcell:
         )
 
     def seen(self, pose: Array) -> Array:
-        """Return the places (k, 3) of the platform's stickers that are visible to both cameras.
+        """Return the places (k, 3) of the platform's stickers that both cameras see, in the base
+        frame, m.
 
-        They are in m, in the base frame, at a pose (6,). Occlusion by other bodies is neglected.
+        The platform is at a pose (6,). Occlusion by other bodies is neglected.
         """
         if self.rig is None or self.sensor is None:
             return np.zeros((0, 3))

@@ -13,10 +13,10 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.sensor_in_loop import check_platform, teach
 from identify.experiment.warm_up import compile_robots
 from identify.files.atomic import write_files
+from identify.files.digest import toml_with_digest
 from identify.files.run_folder import (
     RunFolder,
 )
-from identify.files.seal import sealed_toml
 from identify.geometry.before_a_run import run_geometry
 from identify.geometry.outcome import GeometryOutcome
 from identify.loop_parameters import check_parameter_set
@@ -37,7 +37,7 @@ def is_begun(setup: Setup, folder: Path) -> bool:
         return False
     if run_folder.report.exists():
         return False
-    text = sealed_toml(setup.scenario.to_toml())
+    text = toml_with_digest(setup.scenario.to_toml())
     same = run_folder.scenario.read_text(encoding="utf-8", errors="replace") == text
     return same and load_trajectories(run_folder.trajectories).seed == setup.seed
 
@@ -152,4 +152,4 @@ def _write_plan(
 
 def scenario_file(run_folder: RunFolder, text: str) -> dict[Path, bytes]:
     """Return the content of the scenario file, by its path."""
-    return {run_folder.scenario: sealed_toml(text).encode()}
+    return {run_folder.scenario: toml_with_digest(text).encode()}

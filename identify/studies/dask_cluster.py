@@ -38,7 +38,9 @@ WORKERLESS_SECONDS = 180
 ANSWER_SECONDS = 30
 """Longest allowed time for an answer of a scheduler, s."""
 
-GONE = "the Dask scheduler is gone; the same command with another scheduler continues the study"
+SCHEDULER_LOST = (
+    "the Dask scheduler is gone; the same command with another scheduler continues the study"
+)
 
 REMEDY = "install the same version on all machines"
 
@@ -73,10 +75,10 @@ class DaskExecutor:
             while self._send_more(shared, batches):
                 finished = self._next()
                 if finished:
-                    batches.learn(finished)
+                    batches.update_row_time(finished)
                     yield finished
         except OSError as error:
-            raise gone(error) from error
+            raise scheduler_lost(error) from error
 
     def _send_more(self, shared: Shared, batches: Batches) -> bool:
         """Submit batches so that all workers are busy. Return False at the end.
@@ -84,22 +86,25 @@ class DaskExecutor:
         Rows during which workers have died come last, one at a time.
         """
         workers = self._count_workers()
-        while len(self._open) < BATCHES_A_WORKER * workers and (cases := batches.take(workers)):
+        while len(self._open) < BATCHES_A_WORKER * workers and (
+            cases := batches.next_batch(workers)
+        ):
             self._send(shared, cases)
-        if not self._open and (cases := self._suspects.take()):
+        if not self._open and (cases := self._suspects.next_batch()):
             self._send(shared, cases)
         return bool(self._open)
 
     def _send(self, shared: Shared, cases: list[Case]) -> None:
         # With pure=True, Dask would return the failure of the first try for a second try.
-        future = self._client.submit(_compute_alike, product_version(), shared, cases, pure=False)
+        future = self._client.submit(_compute_checked, product_version(), shared, cases, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
 
     def _next(self) -> list[Finished]:
         """Return the next finished batch.
 
-        The batch is empty if none has finished yet, or if its workers died and it was split.
+        The result is empty if no batch has finished yet, or if the workers died and the batch was
+        split.
         """
         try:
             future = self._done.get(timeout=1.0)
@@ -110,7 +115,7 @@ class DaskExecutor:
         try:
             return self._result(future)
         except KilledWorker:
-            return self._suspects.blame(cases)
+            return self._suspects.record_death(cases)
         except StudyError:
             raise
         except Exception as error:
@@ -123,7 +128,7 @@ class DaskExecutor:
         """Return the rows of a finished batch.
 
         If the rows were lost with their worker, Dask computes them again. The wait is unlimited,
-        but ends with an error if the cluster has no workers.
+        but ends with an exception if the cluster has no workers.
         """
         while True:
             try:
@@ -132,7 +137,7 @@ class DaskExecutor:
                 self._check_cluster()
 
     def _count_workers(self) -> int:
-        """Return the number of workers, asked for at most a second ago.
+        """Return the number of workers. The number is at most a second old.
 
         The number is at least 1, because a worker can still join.
         """
@@ -149,14 +154,14 @@ class DaskExecutor:
 
     def _check_cluster(self) -> None:
         if self._client.status != "running":
-            raise StudyError(GONE)
+            raise StudyError(SCHEDULER_LOST)
         if not self._ask_workers() and time.monotonic() > self._seen + WORKERLESS_SECONDS:
             raise StudyError(
                 f"no Dask worker for {WORKERLESS_SECONDS} s; the same command continues the study"
             )
 
 
-def _compute_alike(version: str, shared: Shared, cases: list[Case]) -> list[Finished]:
+def _compute_checked(version: str, shared: Shared, cases: list[Case]) -> list[Finished]:
     """Compute rows on a worker.
 
     The version is checked here again, because a worker can join after the first check. Raises
@@ -166,9 +171,9 @@ def _compute_alike(version: str, shared: Shared, cases: list[Case]) -> list[Fini
     return compute(shared, cases)
 
 
-def gone(error: OSError) -> StudyError:
+def scheduler_lost(error: OSError) -> StudyError:
     """Return the error of a study whose scheduler no longer answers."""
-    return StudyError(f"{GONE}: {' '.join(str(error).split())}")
+    return StudyError(f"{SCHEDULER_LOST}: {' '.join(str(error).split())}")
 
 
 CONNECT_SECONDS = 20
@@ -229,7 +234,7 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
         try:
             check_workers(client.run(versions, on_error="return"))
         except OSError as error:
-            raise gone(error) from error
+            raise scheduler_lost(error) from error
         yield DaskExecutor(client)
 
 

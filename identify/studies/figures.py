@@ -1,7 +1,7 @@
 """Plots of a study as PNG, PDF and SVG.
 
-They show the figures of the rows against each factor with bands, as a map over two factors, and the
-laws.
+A figure of a row is a number that the row computes, such as an rms error. The plots show figures
+with bands against each factor, figures as a map over two factors, and the laws.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,7 +24,7 @@ from identify.studies.labels import axis_label, number, setting
 from identify.studies.study_file import Law, Study
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
-from identify.studies.theory import Verdict, law_data, point_statistics, with_data
+from identify.studies.theory import Verdict, law_data, point_statistics, rows_with_figures
 
 PANEL = (3.4, 2.8)
 """Width and height of a panel, inches. The width fits a column of a journal."""
@@ -49,7 +49,7 @@ CURVES: list[dict[str, Any]] = [
 """Markers, lines and colours. Curves can be distinguished even without colour."""
 FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
-"""Smallest ratio of the ends of a logarithmic axis. It makes small differences look small."""
+"""Smallest ratio of the ends of a logarithmic axis. With it, small differences look small."""
 WIDEST_BAND = 3.0
 """Largest factor by which bands extend a logarithmic axis beyond the curves. Wider bands are cut.
 """
@@ -200,7 +200,7 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
     for axes, (law, verdict) in zip(panels, laws, strict=True):
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
-        have = with_data(law, done)
+        have = rows_with_figures(law, done)
         curves = _curves(have, others)
         for place, (label, rows) in enumerate(curves):
             levels = _beside(_levels(study, rows, factor), place, len(curves))

@@ -20,7 +20,7 @@ from multiprocessing.connection import wait
 import psutil
 
 from identify.errors import StudyError
-from identify.runtime import deaf_offspring, held
+from identify.runtime import delay_interrupts, shield_children
 from identify.studies.memory import GB
 from identify.studies.runner import Batches, Suspects
 from identify.studies.study_design import Case, Finished, Shared
@@ -41,7 +41,7 @@ MEMORY_SHARE = 0.95
 LOOK_S = 1.0
 """Interval at which the memory of the processes is checked, s."""
 
-STILLBORN = 3
+MOST_FAILED_STARTS = 3
 """Number of consecutive processes that die before they are ready at which the study fails."""
 
 END_S = 10.0
@@ -68,9 +68,9 @@ class ProcessExecutor:
         suspects = Suspects()
         try:
             self._start_missing()
-            while self._hand_out(shared, batches, suspects):
-                for worker in self._heard():
-                    if finished := self._take(worker, batches, suspects):
+            while self._assign_batches(shared, batches, suspects):
+                for worker in self._wait():
+                    if finished := self._collect(worker, batches, suspects):
                         yield finished
                 self._start_missing()
         finally:
@@ -80,7 +80,7 @@ class ProcessExecutor:
 
     def close(self) -> None:
         """End all processes, also in the middle of a row."""
-        with held():
+        with delay_interrupts():
             for worker in self._workers:
                 worker.end()
             self._workers.clear()
@@ -88,7 +88,7 @@ class ProcessExecutor:
     def _start_missing(self) -> None:
         try:
             while len(self._workers) < self._count:
-                with held():
+                with delay_interrupts():
                     self._workers.append(_Worker())
         except OSError as error:
             raise StudyError(
@@ -96,34 +96,35 @@ class ProcessExecutor:
                 f"{error.strerror}; use fewer processes (--workers)"
             ) from error
 
-    def _hand_out(self, shared: Shared, batches: Batches, suspects: Suspects) -> bool:
-        """Give each idle process a batch. Suspect rows come last, one at a time.
+    def _assign_batches(self, shared: Shared, batches: Batches, suspects: Suspects) -> bool:
+        """Give each idle process a batch. Return False at the end.
 
-        Returns False at the end.
+        Rows during which a process died come last, one at a time.
         """
         ready = [worker for worker in self._workers if worker.ready]
         for worker in ready:
             if not worker.cases:
-                worker.give(shared, batches.take(self._count))
+                worker.send(shared, batches.next_batch(self._count))
         # A suspect row is computed alone, so that a second death is certainly its fault.
         if ready and not any(worker.cases for worker in ready):
-            ready[0].give(shared, suspects.take())
+            ready[0].send(shared, suspects.next_batch())
         return not ready or any(worker.cases for worker in ready)
 
-    def _heard(self) -> list["_Worker"]:
-        """Return the processes that have become ready, have finished a batch or have died.
+    def _wait(self) -> list["_Worker"]:
+        """Wait for processes that have become ready, have finished a batch or have died, and return
+        them.
 
-        Waits at most LOOK_S, and also checks the memory of all processes.
+        The wait takes at most LOOK_S. The memory of all processes is checked as well.
         """
         if time.monotonic() > self._looked + LOOK_S:
             self._looked = time.monotonic()
             limit = MEMORY_SHARE * psutil.virtual_memory().total / self._count
             for worker in self._workers:
-                worker.keep_below(limit)
+                worker.limit_memory(limit)
         heard = wait([worker.pipe for worker in self._workers], timeout=LOOK_S)
         return [worker for worker in self._workers if worker.pipe in heard]
 
-    def _take(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
+    def _collect(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
         """Return the rows that a process has finished, or its failed rows if it has died.
 
         The list is empty for a process that has become ready.
@@ -132,25 +133,25 @@ class ProcessExecutor:
         try:
             finished = worker.receive()
         except (EOFError, OSError):
-            return self._bury(worker, suspects)
+            return self._remove_dead(worker, suspects)
         self._stillborn = 0
         if cases:
-            batches.learn(finished)
+            batches.update_row_time(finished)
         return finished
 
-    def _bury(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
+    def _remove_dead(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
         """Remove a dead process. A row that has killed two processes is returned as an error."""
-        with held():
+        with delay_interrupts():
             self._workers.remove(worker)
             worker.end()
         if not worker.ready:
             self._stillborn += 1
-            if self._stillborn >= STILLBORN:
+            if self._stillborn >= MOST_FAILED_STARTS:
                 raise StudyError(
-                    f"{STILLBORN} processes died before they computed a row; "
+                    f"{MOST_FAILED_STARTS} processes died before they computed a row; "
                     "--workers 0 computes in the main process, and may show the reason"
                 )
-        return suspects.blame(worker.cases, worker.fate)
+        return suspects.record_death(worker.cases, worker.end_reason)
 
 
 class _Worker:
@@ -162,7 +163,7 @@ class _Worker:
         Whether the process has loaded its libraries.
     cases : list of Case
         Rows that the process computes now.
-    fate : str
+    end_reason : str
         Text for an error message about the end of the process.
     pipe : Connection
         Main process's end of the pipe.
@@ -171,16 +172,16 @@ class _Worker:
     def __init__(self) -> None:
         self.ready = False
         self.cases: list[Case] = []
-        self.fate = "died"
+        self.end_reason = "died"
         self.pipe, theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=work, args=(theirs,), daemon=True)
         # The tracker is started before the block, because its start would unblock Ctrl-C.
         resource_tracker.ensure_running()
-        with _one_thread_each(), deaf_offspring():
+        with _one_thread_each(), shield_children():
             self._process.start()
         theirs.close()
 
-    def give(self, shared: Shared, cases: list[Case]) -> None:
+    def send(self, shared: Shared, cases: list[Case]) -> None:
         """Send rows to compute, unless the list is empty."""
         self.cases = cases
         if cases:
@@ -198,11 +199,11 @@ class _Worker:
         self.cases = []
         return finished
 
-    def keep_below(self, limit: float) -> None:
+    def limit_memory(self, limit: float) -> None:
         """Kill the process if it uses more memory than the limit, bytes."""
         with suppress(psutil.Error):
             if psutil.Process(self._process.pid).memory_info().rss > limit:
-                self.fate = f"took more than {limit / GB:.3g} GB of memory"
+                self.end_reason = f"took more than {limit / GB:.3g} GB of memory"
                 self._process.kill()
 
     def end(self) -> None:

@@ -1,7 +1,7 @@
 """Run of a study from its first to its last row.
 
-Missing rows are computed, and each batch is stored as soon as it finishes. At the end all rows are
-tabulated.
+Missing rows are computed in batches, and each batch is stored as soon as it finishes. At the end
+all rows are tabulated.
 """
 
 import math
@@ -18,7 +18,7 @@ import pandas as pd
 from cmmsim.allowed_plugins import allow_plugin
 from identify.errors import StudyInterrupted
 from identify.progress import Progress
-from identify.runtime import honoured, raise_noted
+from identify.runtime import interruptible, raise_interrupt
 from identify.studies.rows import find_kind
 from identify.studies.store import VIEW, Journal, open_folder, resolved
 from identify.studies.study_design import Case, Design, Finished, Shared, prepare
@@ -36,13 +36,13 @@ class Outcome:
         Table of all rows.
     found : int
         Number of rows that were finished before this run.
-    beyond : int
+    surplus : int
         Number of stored rows of repeats that the study no longer has.
     """
 
     frame: pd.DataFrame
     found: int
-    beyond: int
+    surplus: int
 
     @property
     def rows(self) -> int:
@@ -70,9 +70,9 @@ def in_this_process() -> Iterator[Executor]:
 
 
 def _serial(shared: Shared, batches: "Batches") -> Iterator[list[Finished]]:
-    while cases := batches.take(workers=1):
+    while cases := batches.next_batch(workers=1):
         finished = compute(shared, cases)
-        batches.learn(finished)
+        batches.update_row_time(finished)
         yield finished
 
 
@@ -131,8 +131,8 @@ def run_study(
     with open_folder(folder, entry, len(design)) as journal:
         found = int(journal.finished.sum())
         try:
-            with honoured():
-                shown = _now_and_then(lambda: so_far(tidy_table(study, journal.rows())))
+            with interruptible():
+                shown = _rate_limited(lambda: so_far(tidy_table(study, journal.rows())))
                 _compute_pending(study.name, shared, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
             # The rows are counted in the file, because Ctrl-C can interrupt their registration.
@@ -143,14 +143,14 @@ def run_study(
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
         write_view(folder / VIEW, frame, study)
-    return Outcome(frame, found, journal.beyond)
+    return Outcome(frame, found, journal.surplus)
 
 
-def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
+def _rate_limited(show: Callable[[], object]) -> Callable[[], None]:
     """Return a function that calls `show`, but only from time to time."""
     next_time = time.perf_counter() + SO_FAR_S
 
-    def perhaps() -> None:
+    def show_if_due() -> None:
         nonlocal next_time
         began = time.perf_counter()
         if began < next_time:
@@ -160,7 +160,7 @@ def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
         # A table of many rows takes long, so its share of the time is limited.
         next_time = began + took + max(SO_FAR_S, took / SO_FAR_SHARE)
 
-    return perhaps
+    return show_if_due
 
 
 def _compute_pending(
@@ -176,7 +176,7 @@ def _compute_pending(
     if not left:
         return
     batches = Batches((design.case(number) for number in journal.pending()), left)
-    raise_noted()
+    raise_interrupt()
     with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
         for finished in execute(shared, batches):
             journal.append(finished)
@@ -205,7 +205,7 @@ class Batches:
         self._left = count
         self._row_seconds = BATCH_SECONDS
 
-    def take(self, workers: int) -> list[Case]:
+    def next_batch(self, workers: int) -> list[Case]:
         """Return the next batch for one of `workers` workers, empty if all rows are handed out.
 
         Towards the end batches become smaller, so that all workers end together.
@@ -216,7 +216,7 @@ class Batches:
         self._left -= len(batch)
         return batch
 
-    def learn(self, finished: list[Finished]) -> None:
+    def update_row_time(self, finished: list[Finished]) -> None:
         """Update the time per row from a finished batch."""
         mean = sum(row.seconds for row in finished) / len(finished)
         # Averaging with the old value limits the effect of one slow batch.
@@ -234,18 +234,21 @@ class Suspects:
         self._rows: list[Case] = []
         self._deaths: Counter[int] = Counter()
 
-    def take(self) -> list[Case]:
+    def next_batch(self) -> list[Case]:
         """Return a list with one row, to be computed alone. It is empty if no row is left."""
         return [self._rows.pop()] if self._rows else []
 
-    def blame(self, cases: list[Case], fate: str = "died") -> list[Finished]:
+    def record_death(self, cases: list[Case], end_reason: str = "died") -> list[Finished]:
         """Register the end of a process that computed these rows.
 
-        A row that was alone, and whose process ended for the second time, is returned as an error.
+        If a row was computed alone, and its process ended for the second time, the row is returned
+        with an error.
         """
         self._deaths.update(case.number for case in cases)
         if len(cases) == 1 and self._deaths[cases[0].number] > 1:
-            error = f"KilledWorker: its process {fate}, and again when it computed this row alone"
+            error = (
+                f"KilledWorker: its process {end_reason}, and again when it computed this row alone"
+            )
             return [Finished(cases[0].number, {}, 0.0, error)]
         self._rows += cases
         return []
@@ -271,7 +274,7 @@ def _compute(shared: Shared, case: Case) -> Finished:
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # sys.exit() in a row must not end the study
-        raise_noted()
+        raise_interrupt()
         text = " ".join(f"{type(error).__name__}: {error}".split())
         return Finished(case.number, {}, time.perf_counter() - start, text)
     return Finished(case.number, figures, time.perf_counter() - start)

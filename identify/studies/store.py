@@ -1,14 +1,14 @@
 """Folder of a study: its study, the lock while the study runs, and the journal of its rows.
 
 ``study.json`` is the resolved study with the versions of the software that began it. ``rows.jsonl``
-holds its finished rows, ``study.parquet`` the table of these rows, and ``study.nc`` their figures
-by factors.
+is the journal of finished rows, ``study.parquet`` the table of these rows, and ``study.nc`` their
+figures by factors.
 
 The journal is an append-only file of JSON lines. Finished rows are on the disk before a worker gets
 its next batch. A line counts only if it is complete. After a crash, an incomplete last line is cut
 off when the file is opened again. A database (sqlite3, write-ahead log) appends 22,000 rows per
 second and this journal 9,000, while rows finish at about 100 per second. With one damaged byte in
-its log, the database silently returned 99 rows of 200. This journal reports the damaged line.
+the log, the database silently returned 99 rows of 200. This journal reports the damaged line.
 """
 
 import json
@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cmmsim.files import read_sensor_file
 from identify.errors import StudyError, StudyInterrupted
-from identify.files.atomic import make_folder, take_back, write_text
+from identify.files.atomic import make_folder, remove_empty_folders, write_text
 from identify.files.lock import LOCK, locked
 from identify.files.versions import same_versions, versions
 from identify.studies.study_design import Finished, Shared
@@ -57,13 +57,13 @@ FINISHED = TypeAdapter(Finished)
 
 
 class Journal:
-    """Journal of the finished rows of a study with ``rows`` rows, a context that closes the file.
+    """Journal of the finished rows of a study with ``rows`` rows. As a context, it closes its file.
 
     Attributes
     ----------
     path : Path
         The file.
-    beyond : int
+    surplus : int
         Number of rows in the file that belong to repeats that the study no longer has.
     finished : ndarray of bool, shape (rows,)
         True for each finished row.
@@ -71,7 +71,7 @@ class Journal:
 
     def __init__(self, path: Path, rows: int) -> None:
         self.path = path
-        self.beyond = 0
+        self.surplus = 0
         with written(path):
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
         self.finished: NDArray[np.bool_] = np.zeros(rows, dtype=bool)
@@ -126,7 +126,7 @@ class Journal:
         if row.number < len(self.finished):
             self.finished[row.number] = True
         else:
-            self.beyond += 1
+            self.surplus += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
         """Yield the row and the end position of each line, up to an incomplete last line."""
@@ -198,7 +198,7 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
         with _locked_study(folder, entry, rows, new) as journal:
             yield journal
     finally:
-        take_back(made)
+        remove_empty_folders(made)
 
 
 @contextmanager
@@ -214,7 +214,7 @@ def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> 
                 yield journal
         except StudyError as error:
             if new and not _has_rows(folder) and not isinstance(error, StudyInterrupted):
-                _take_back(folder)
+                _remove_new_files(folder)
             raise
 
 
@@ -261,7 +261,7 @@ def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
     return begun
 
 
-def _take_back(folder: Path) -> None:
+def _remove_new_files(folder: Path) -> None:
     """Remove the files of a study that did not begin."""
     with suppress(OSError):
         for name in (STUDY, JOURNAL, LOCK):

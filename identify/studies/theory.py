@@ -9,10 +9,10 @@ covariance is the sandwich estimate of that score, so the distribution can diffe
 
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
-need the number of independent errors in a row's figure, while this band uses their scatter over the
-rows. In simulations with two or more rows it contained the rms of three or more normal numbers in
-95 to 97 % of cases. For single normal numbers, the worst case, it did so in at least 92 %. A single
-row has no band.
+need the number of independent errors in a row's figure, while this band uses the scatter of the
+figure over the rows. In simulations with two or more rows, the band contained the true rms in 95 to
+97 % of cases if a figure was the rms of three or more normal numbers. If a figure was a single
+normal number, the worst case, it did so in at least 92 %. A single row has no band.
 
 A law fails if the 99 % interval excludes its statement, widened by the law's tolerance. Otherwise
 it passes if the interval is narrow. If the interval is wide, there are too few rows, and the law is
@@ -31,7 +31,7 @@ from identify.errors import StudyError
 from identify.studies.study_file import Law, Study
 
 ITERATIONS = 100
-SETTLED = 1e-10
+STEP_TOLERANCE = 1e-10
 SMALLEST = 1e-12
 """Smallest square at the start of the fit, as a share of the largest one."""
 
@@ -91,7 +91,7 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         ratio = squares / np.exp(design @ beta)
         step = np.linalg.lstsq(design, ratio - 1.0, rcond=None)[0]
         change = float(np.abs(design @ step).max())
-        if change < SETTLED:
+        if change < STEP_TOLERANCE:
             break
         # To avoid divergence, a step changes no mean square by more than a factor of e.
         beta = beta + step / max(1.0, change)
@@ -216,7 +216,7 @@ def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
     return [_check(law, study, done) for law in study.theory]
 
 
-def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
+def rows_with_figures(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
     """Return the rows that have all figures of a law.
 
     Raises StudyError if no row has one of these figures. The message names the existing figures.
@@ -255,7 +255,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     else:
         check = _order
     try:
-        return check(law, study, with_data(law, frame))
+        return check(law, study, rows_with_figures(law, frame))
     except StudyError as error:
         return Verdict(law, "undecided", reason=str(error))
 
@@ -268,7 +268,7 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     low, high = fit.interval(design.shape[1] - 1, CONFIDENCE)
     expected = float(law.exponent or 0.0)
     half = 0.5 * (high - low)
-    verdict = _decided(low - law.tolerance <= expected <= high + law.tolerance, half)
+    verdict = _verdict(low - law.tolerance <= expected <= high + law.tolerance, half)
     return Verdict(law, verdict, float(fit.coefficients[-1]), low, high, len(frame))
 
 
@@ -277,7 +277,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     ratios = law_data(law, frame) / _divisor(str(law.equals), frame)
     fit = scale_regression(ratios**2, np.full((len(frame), 1), 2.0))
     low, high = fit.interval(0, CONFIDENCE)
-    verdict = _decided(low <= law.tolerance and high >= -law.tolerance, 0.5 * (high - low))
+    verdict = _verdict(low <= law.tolerance and high >= -law.tolerance, 0.5 * (high - low))
     measured, low, high = np.exp([fit.coefficients[0], low, high]).tolist()
     return Verdict(law, verdict, measured, low, high, len(frame))
 
@@ -302,9 +302,9 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, float]:
-    """Return low, middle and high of a coefficient among the last `steps` coefficients.
+    """Return the interval of one of the last `steps` coefficients: low end, estimate and high end.
 
-    It is the coefficient with the smallest lower end of its interval.
+    The interval with the lowest low end is chosen.
     """
     places = range(len(fit.coefficients) - steps, len(fit.coefficients))
     low, k = min((fit.interval(k, CONFIDENCE)[0], k) for k in places)
@@ -348,7 +348,7 @@ def _numeric(name: str, frame: pd.DataFrame) -> Array:
     return values
 
 
-def _decided(holds: bool, half: float) -> str:
+def _verdict(holds: bool, half: float) -> str:
     if not holds:
         return "failed"
     return "passed" if half <= RESOLUTION else "undecided"

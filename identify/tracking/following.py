@@ -9,7 +9,7 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.run import saturated_frames
 from identify.arrays import Array
-from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, prepared
+from identify.experiment.law_in_loop import KnownModel, LoopSensor, NamedMotion, prepared
 from identify.experiment.plant import Plant
 from identify.experiment.run import Latencies
 
@@ -23,7 +23,7 @@ It is not zero, because an observer needs a positive definite covariance.
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackingRun:
     """Run of a robot that follows a motion.
 
     ``desired`` (N, 6) are the desired poses. ``expected`` are the coordinates (N, m) and
@@ -61,7 +61,7 @@ class Followed:
 
 def by_drawing(
     covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False
-) -> Seen:
+) -> LoopSensor:
     """Return a measurement that draws poses at random, in place of a sensor.
 
     The poses scatter about the true poses with a covariance (6, 6). Lost frames (N,) have no pose.
@@ -78,7 +78,7 @@ def by_drawing(
         return None if lost[frame] else np.asarray(pose + drawn[frame])
 
     stated = NEARLY_EXACT * covariance if exact else covariance
-    return Seen(measure, lambda frame: stated)
+    return LoopSensor(measure, lambda frame: stated)
 
 
 def follow(
@@ -86,9 +86,9 @@ def follow(
     law: str,
     known: KnownModel,
     motion: NamedMotion,
-    seen: Seen,
+    seen: LoopSensor,
     latencies: Latencies = USUAL,
-) -> Followed:
+) -> TrackingRun:
     """Follow a motion under a law that uses a model.
 
     ``latencies`` replace the latencies of the scenario. Raises the errors of `prepared`, and
@@ -103,4 +103,4 @@ def follow(
         means = np.array([estimate.coordinates for estimate in in_loop.expected])
         covariances = np.array([estimate.covariance for estimate in in_loop.expected])
         expected = means, covariances
-    return Followed(run, reference.poses, expected, in_loop.drives.torque_limit)
+    return TrackingRun(run, reference.poses, expected, in_loop.drives.torque_limit)

@@ -33,7 +33,7 @@ FEWEST_ROWS = 6
 
 
 @dataclass(frozen=True)
-class AlongCoordinates:
+class CoordinateMotion:
     """Motion of a platform by functions of time.
 
     The functions return the coordinates (N, m) at times (N,) [s], and their first and second
@@ -82,7 +82,7 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
     return found
 
 
-def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
+def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:
     """Return a motion along a circle through home, with a radius in m.
 
     At full speed one turn takes ``turn_s``, in s. The speed rises smoothly during the first
@@ -120,10 +120,10 @@ def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
         second = np.cos(phi) * rising - np.sin(phi) * w**2
         return laid(first, second, 0 * home)
 
-    return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
+    return CoordinateMotion(robot.geometry.chart, (place, rate, acceleration))
 
 
-def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
+def square(robot: Robot, side: float, edge_s: float) -> CoordinateMotion:
     """Return a motion along a square from home.
 
     It moves along the first coordinate, then along the second, and back in the same order. Each
@@ -156,7 +156,7 @@ def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
         s = share(t)
         return rows(t, 60 * s * (1 - s) * (1 - 2 * s) / edge_s**2, 0 * home, 0.0)
 
-    return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
+    return CoordinateMotion(robot.geometry.chart, (place, rate, acceleration))
 
 
 def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
@@ -235,7 +235,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
             * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
         )
 
-    motion = AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2)))
+    motion = CoordinateMotion(robot.geometry.chart, (held(0), held(1), held(2)))
     return NamedMotion(path.stem, motion, end)
 
 

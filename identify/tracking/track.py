@@ -21,7 +21,7 @@ from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
-from identify.experiment.law_in_loop import KnownModel, NamedMotion, Seen, by_images, prepared
+from identify.experiment.law_in_loop import KnownModel, LoopSensor, NamedMotion, by_images, prepared
 from identify.experiment.plant import Plant
 from identify.experiment.run import Latencies, delay_right_camera, drawn_latencies, excitation_run
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, teach
@@ -33,7 +33,7 @@ from identify.random_streams import NOISE, TRACKED, child, stream_seed
 from identify.record.conditions import SERVO
 from identify.scenario import load_scenario
 from identify.setup import Setup
-from identify.tracking.following import Followed, by_drawing, follow
+from identify.tracking.following import TrackingRun, by_drawing, follow
 from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
@@ -102,7 +102,7 @@ def track(
     known = {name: known_model(plant, name) for name in models if name != "identified"}
     if run_folder and "identified" in models:
         known["identified"] = model_of_run(plant, run_folder, scenario.robot)
-    unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
+    unseen = LoopSensor(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     # Whether a law can follow a motion does not depend on the model, so any model will do.
     true = known_model(plant, "true")
     # This check precedes the teaching of the sensor, because teaching takes long.
@@ -197,7 +197,7 @@ def follow_by_images(
     seed: int,
     number: int = 0,
     advance: Advance = lambda n=1: None,
-) -> tuple[Followed, Seen]:
+) -> tuple[TrackingRun, LoopSensor]:
     """Follow a motion under a law with a model, with images in the loop.
 
     Noise and latencies depend on the seed and on the motion's number. The mean latency and the

@@ -55,7 +55,7 @@ START = "starting guess"
 
 
 @dataclass(frozen=True)
-class Examination:
+class ComparisonTruth:
     """Truth against which estimators are compared.
 
     Attributes
@@ -226,7 +226,7 @@ def examination(
     side: ModelSide,
     true: Array,
     unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
-) -> Examination:
+) -> ComparisonTruth:
     """Set up the examination from true parameters (p,) and (record, truth) pairs of validation.
 
     Raises EstimationError if the record identifies no base parameter, or if there is no validation
@@ -249,11 +249,14 @@ def examination(
         raise EstimationError(
             "the record identifies no base parameter: there is nothing to compare"
         )
-    return Examination(side, true, base.combinations[shown], tuple(unseen))
+    return ComparisonTruth(side, true, base.combinations[shown], tuple(unseen))
 
 
 def compare(
-    evidence: Evidence, asked: Examination, estimators: Mapping[str, Estimator], progress: Progress
+    evidence: Evidence,
+    asked: ComparisonTruth,
+    estimators: Mapping[str, Estimator],
+    progress: Progress,
 ) -> list[Score]:
     """Score the initial guess and each estimator.
 
@@ -269,7 +272,7 @@ def compare(
     return scores
 
 
-def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examination) -> Score:
+def _score(name: str, estimator: Estimator, evidence: Evidence, asked: ComparisonTruth) -> Score:
     try:
         found = estimator(evidence)
     except (EstimationError, DynamicsError) as error:

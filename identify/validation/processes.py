@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
 from typing import Any, TypeVar
 
-from identify.runtime import deaf_offspring, end_with_parent, held
+from identify.runtime import delay_interrupts, end_with_parent, shield_children
 
 R = TypeVar("R")
 
@@ -38,11 +38,11 @@ def mapped(
     others = set(active_children())
     with ProcessPoolExecutor(count, get_context("spawn"), _begin, (start,)) as pool:
         try:
-            with deaf_offspring():  # the pool starts its processes when it gets the tasks
+            with shield_children():  # the pool starts its processes when it gets the tasks
                 found = pool.map(function, *tasks)
             yield found
         except BaseException:
-            with held():
+            with delay_interrupts():
                 for process in set(active_children()) - others:
                     process.kill()
             raise

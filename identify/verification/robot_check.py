@@ -30,7 +30,7 @@ from identify.scenario.plant_sections import Control
 SAMPLES = 2000
 """Number of random joint coordinates over the travel."""
 
-UNFELT = 1e-9
+NEGLIGIBLE_CHANGE = 1e-9
 """Largest relative change of an acceleration that counts as zero."""
 
 
@@ -56,7 +56,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class CheckSettings:
     """Loop and sensor with which a robot is checked.
 
     Attributes
@@ -82,7 +82,7 @@ class Surroundings:
 
 
 def check_robot(
-    robot: Robot, parameters: Array, around: Surroundings, progress: Progress | None = None
+    robot: Robot, parameters: Array, around: CheckSettings, progress: Progress | None = None
 ) -> list[Finding]:
     """Return all findings about a robot with all its parameters."""
     # Each check is a function, so that progress can be shown between checks.
@@ -222,11 +222,13 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
         )
         felt = (
             f"accelerations change by up to {100 * largest:.2g} %"
-            if largest > UNFELT
+            if largest > NEGLIGIBLE_CHANGE
             else "no motion changes"
         )
         text = f"no rigid body has these; corrected, {felt}: {'; '.join(grouped(inertias.changes))}"
-    yield Finding("inertias", largest <= UNFELT, largest, UNFELT, "1", leg, text)
+    yield Finding(
+        "inertias", largest <= NEGLIGIBLE_CHANGE, largest, NEGLIGIBLE_CHANGE, "1", leg, text
+    )
 
 
 def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Iterator[Finding]:
@@ -269,7 +271,7 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     )
 
 
-def _designed(robot: Robot, parameters: Array, around: Surroundings) -> Iterator[Finding]:
+def _designed(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
     """Check the gains of the servo and of computed_torque.
 
     If a bandwidth and a damping are requested, gains of the servo are also designed.

@@ -43,10 +43,10 @@ def outlines(rig, camera_from_body, places, normals, radius):
     return np.array(found).reshape(2, len(places), 2, 2)
 
 
-def triangulate(rig, pixels, covariances, near, parted=0.0):
+def triangulate(rig, pixels, covariances, near, line_variance=0.0):
     """Points (n, 3) and covariances (n, 3, 3) from pixels (2, n, 2), by OpenCV's derivatives."""
     points = np.array(near)
-    weights = np.linalg.inv(covariances + parted * np.eye(2))
+    weights = np.linalg.inv(covariances + line_variance * np.eye(2))
     for _ in range(8):
         normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
         for side, (camera, move) in enumerate(zip(rig.cameras, rig.from_camera, strict=True)):
@@ -57,7 +57,7 @@ def triangulate(rig, pixels, covariances, near, parted=0.0):
             right += np.einsum("nij,nj->ni", weighted, pixels[side] - found)
         points += np.linalg.solve(normal, right[..., None])[..., 0]
     noise = 0.25 * np.einsum("cnii->n", covariances)
-    return points, np.linalg.inv(normal) * (noise / (noise + parted))[:, None, None]
+    return points, np.linalg.inv(normal) * (noise / (noise + line_variance))[:, None, None]
 
 
 def rigid_start(source, target):

@@ -226,10 +226,10 @@ def test_triangulated_points_are_those_of_opencvs_derivatives(lens):
     rng, points = np.random.default_rng(3), apply(CAMERA_FROM_BODY, BODY.nominal)
     pixels = rig.project(points)[0] + 0.1 * rng.standard_normal((2, 18, 2))
     spread = np.stack([pixel_covariances(rng, 18) for _ in range(2)])
-    for parted in (0.0, 1e-3):
-        expected = plain.triangulate(rig, pixels, spread, points, parted)
+    for line_variance in (0.0, 1e-3):
+        expected = plain.triangulate(rig, pixels, spread, points, line_variance)
         for near in (None, points + 1e-3):
-            found = triangulate(rig, *pixels, *spread, near=near, parted=parted)
+            found = triangulate(rig, *pixels, *spread, near=near, line_variance=line_variance)
             np.testing.assert_allclose(found.points, expected[0], rtol=0, atol=1e-12)
             size = np.abs(expected[1]).max()
             np.testing.assert_allclose(found.covariances, expected[1], rtol=0, atol=5e-8 * size)

@@ -153,7 +153,7 @@ def test_a_filter_finds_what_one_gaussian_of_all_residuals_says():
     )
     assert found.log_likelihood == pytest.approx(expected, rel=1e-10)
     spread = states[15:17, 15:17] - last @ np.linalg.solve(covariance, last.T)
-    information, score = found.told_of(2)
+    information, score = found.marginal_information(2)
     np.testing.assert_allclose(information, np.linalg.inv(spread), rtol=1e-9)
     np.testing.assert_allclose(
         score, information @ last @ np.linalg.solve(covariance, seen.ravel()), rtol=1e-9

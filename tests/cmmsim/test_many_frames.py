@@ -137,10 +137,15 @@ def test_each_in_motion_is_measured_as_alone(kind):
     plain = []
     for pose, rate, around in zip(poses, rates, near, strict=True):
         half, moved = 0.001 * rate, expected(sensor, around) @ invert(pose_to_transform(pose))
-        swept = moved @ pose_to_transform(pose - half), moved @ pose_to_transform(pose + half)
+        exposure_ends = (
+            moved @ pose_to_transform(pose - half),
+            moved @ pose_to_transform(pose + half),
+        )
         images = sensor.look(pose, rod, pose_rate=rate)
         try:
-            plain.append(sensor.estimator.measure(images, expected(sensor, around), swept)[0])
+            plain.append(
+                sensor.estimator.measure(images, expected(sensor, around), exposure_ends)[0]
+            )
         except cmmsim.LostError:
             plain.append(None)
     sensor.start_run(3)

@@ -14,8 +14,8 @@ from cmmsim.imaging.pyrender_meshes import (
     GROUND_SIDES,
     LARGEST_SAG,
     RIM_SAMPLES,
-    Laid,
-    LaidSolids,
+    PaintedSolids,
+    PaintedWindows,
     disc_mesh,
 )
 from cmmsim.imaging.renderer import NEAR, Drawable, View, Views
@@ -59,19 +59,19 @@ def looking_down(corners, size=14):
     return [View(CAMERA, turned[None], (x, y), (size, size)) for x, y in corners]
 
 
-def laid(drawable, views):
+def painted(drawable, views):
     together = Views.of(views)
-    return LaidSolids(drawable).laid(together, drawable.reaching(together))
+    return PaintedSolids(drawable).painted(together, drawable.reaching(together))
 
 
 def test_sticker_on_a_box_is_laid_and_the_box_fills_the_window():
     """The upper side, 0.95 m away, reaches 105.3 px from the middle."""
-    found = laid(
+    found = painted(
         body(stack(), box()), looking_down([(493, 393), (595, 393), (599, 393), (600, 500)])
     )
     np.testing.assert_array_equal(found.solid, [1, 1, 1, 1])
     np.testing.assert_array_equal(found.filled, [True, False, False, False])
-    assert laid(body(stack(), box()), looking_down([(590, 393)])).filled.all()
+    assert painted(body(stack(), box()), looking_down([(590, 393)])).filled.all()
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_sticker_on_a_box_is_laid_and_the_box_fills_the_window():
     ],
 )
 def test_what_may_hide_something_is_drawn_by_depth(patches):
-    found = laid(body(*patches), looking_down([(500, 393)], 60))
+    found = painted(body(*patches), looking_down([(500, 393)], 60))
     assert found.solid.tolist() == [-1]
     assert not found.filled.any()
 
@@ -105,7 +105,7 @@ def test_laid_windows_show_what_is_drawn_by_depths(monkeypatch):
     camera, drawable = crossed_by_links(sensor)
     for _ in range(6):
         views = sticker_views(sensor, camera, rng)
-        found = laid(drawable, views)
+        found = painted(drawable, views)
         kinds |= set(
             zip(
                 (found.solid >= 0).tolist(),
@@ -117,8 +117,8 @@ def test_laid_windows_show_what_is_drawn_by_depths(monkeypatch):
         without = render.render_windows(drawable, views, SUPERSAMPLING, 0.02)
         with monkeypatch.context() as patched:
             none = np.full(len(views), -1)
-            nowhere = Laid(none, np.zeros(len(views), dtype=bool), none)
-            patched.setattr(LaidSolids, "laid", lambda *_, nowhere=nowhere: nowhere)
+            nowhere = PaintedWindows(none, np.zeros(len(views), dtype=bool), none)
+            patched.setattr(PaintedSolids, "painted", lambda *_, nowhere=nowhere: nowhere)
             np.testing.assert_array_equal(
                 without, render.render_windows(drawable, views, SUPERSAMPLING, 0.02)
             )

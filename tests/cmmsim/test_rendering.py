@@ -14,11 +14,17 @@ import cmmsim
 from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import analytic, pyrender_renderer
-from cmmsim.imaging.layer_kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
+from cmmsim.imaging.layer_kernels import (
+    Discs,
+    Solids,
+    cover_by_polygon,
+    draw_layers,
+    polygon_contains,
+)
 from cmmsim.imaging.renderer import Drawable
 from cmmsim.imaging.scene_bodies import ConvexSolid, solid_mesh
 from cmmsim.imaging.stereo_camera import SUPERSAMPLING
-from cmmsim.imaging.view_kernels import convex_hull, outlined
+from cmmsim.imaging.view_kernels import convex_hull, solid_outlines
 from tests.cmmsim.sensors import (
     CAMERA,
     centre_errors,
@@ -143,7 +149,7 @@ def test_outline_covers_what_sampling_says():
     rod = cmmsim.rod(0.02, 0.004)
     scene = analytic.scene_of(Drawable([solid_mesh(rod, 0.5)], [0], 1.5))
     move = pose_to_transform([0.0, 0.0, 1.5, 0.9, 0.4, 0.0])
-    solids = outlined(scene, move[None], CAMERA.focal_lengths, CAMERA.centre, np.array([-1]))
+    solids = solid_outlines(scene, move[None], CAMERA.focal_lengths, CAMERA.centre, np.array([-1]))
     half_planes = solids.half_planes[: solids.starts[1]]
     pixels = CAMERA.project(apply(move, np.asarray(rod.vertices)))[0]
     np.testing.assert_allclose(
@@ -155,7 +161,7 @@ def test_outline_covers_what_sampling_says():
     assert np.abs(coarse - fine).max() < 0.1
     x, y = np.meshgrid(np.arange(40), np.arange(40))
     inside = [
-        polygon_holds(half_planes, corner[0] + i, corner[1] + j, 1, 1)
+        polygon_contains(half_planes, corner[0] + i, corner[1] + j, 1, 1)
         for i, j in zip(x.ravel(), y.ravel(), strict=True)
     ]
     np.testing.assert_allclose(fine.ravel()[inside], 1.0, atol=1e-6)
@@ -247,7 +253,7 @@ def test_layers_are_laid_as_plain_numpy_lays_them():
     expected = 0.2 + cover * (0.4 - 0.2)
     for share, level in zip((shares[0], shares[1] * (1.0 - cover)), levels, strict=True):
         expected += share * (level - expected)
-    for function in (lay_layers, lay_layers.py_func):
+    for function in (draw_layers, draw_layers.py_func):
         images = np.full((1, 16, 16), 0.2, dtype=np.float32)
         function(images, np.array([0]), corner[None], solids, 6, discs)
         np.testing.assert_allclose(images[0], expected, atol=3e-7)

@@ -19,7 +19,12 @@ from cmmsim.measuring.observation import StickerObservation
 from cmmsim.measuring.solver_kernels import COLUMNS, LEFT, SEEN, STATE
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.without_images.drawn_fit_kernels import fit_covariances, tabulated
-from cmmsim.without_images.drawn_frame_kernels import MEASURED, expect, look, measure_frame
+from cmmsim.without_images.drawn_frame_kernels import (
+    MEASURED,
+    measure_frame,
+    observe,
+    triangulate_stickers,
+)
 from cmmsim.without_images.drawn_stickers import LONGEST_STREAK_PX, THIN_PX, THIN_STD_PX
 from cmmsim.without_images.statistical_tracker import StatisticalTracker
 from tests.cmmsim import plain
@@ -136,13 +141,13 @@ def test_the_estimator_says_the_same_of_the_same_stickers(lens, known):
             rng.random() < 0.5
         )  # a sticker that now and then contradicts the others
         verdict = np.empty(COLUMNS)
-        eyes, kept = tracker._eyes_of(seen.camera), np.ones(18, bool)
+        scene, kept = tracker._scene_of(seen.camera), np.ones(18, bool)
         draws = seen.exposed, seen.bodies, noise, kept
         near = invert(estimator.taught.base_from_camera) @ pose_to_transform(pose)
-        look(eyes, *draws, frame)
-        expect(eyes, near, frame)
+        observe(scene, *draws, frame)
+        triangulate_stickers(scene, near, frame)
         index, settings = np.flatnonzero(frame.stickers.used), estimator.settings
-        measure_frame(eyes, *draws, frame, found, spread, verdict)
+        measure_frame(scene, *draws, frame, found, spread, verdict)
         if verdict[STATE] != MEASURED:
             continue
         pixels, spreads = frame.pixels.swapaxes(0, 1), frame.spreads.swapaxes(0, 1)
@@ -171,7 +176,7 @@ def test_the_table_is_what_the_fit_states(light):
     direction, rms.
     """
     sensor = statistical("all")
-    noise = StatisticalTracker(sensor.estimator)._eyes_of(sensor.camera).noise
+    noise = StatisticalTracker(sensor.estimator)._scene_of(sensor.camera).noise
     _, shapes = random_ellipses(np.random.default_rng(0), 60, noise.fit_size, radii=(3.8, 1.4))
     mean, found = np.zeros((60, 2, 2)), np.empty((60, 5, 5))
     places = (np.arange(4) + 0.5) / 4 - 0.5

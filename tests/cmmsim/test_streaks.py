@@ -82,7 +82,7 @@ def test_streaks_tell_the_movement_but_for_its_sign(rate):
         streaks_of(sensor, sensor.look(pose, pose_rate=rate), pose),
         true_movements(sensor, pose, rate),
     )
-    assert difference(movements(sensor, *found.swept), true) < 0.5
+    assert difference(movements(sensor, *found.exposure_ends), true) < 0.5
     assert found.longest_px == pytest.approx(np.linalg.norm(true, axis=-1).max(), abs=0.3)
 
 
@@ -93,7 +93,10 @@ def test_partly_hidden_stickers_are_no_streaks():
         assert streaks_of(sensor, partly_hidden(sensor.look(pose), 3), pose) is None
         moving = partly_hidden(sensor.look(pose, pose_rate=rate), 3)
         found = streaks_of(sensor, moving, pose)
-        assert difference(movements(sensor, *found.swept), true_movements(sensor, pose, rate)) < 0.5
+        assert (
+            difference(movements(sensor, *found.exposure_ends), true_movements(sensor, pose, rate))
+            < 0.5
+        )
         measured = sensor.estimator.measure_anew(moving, camera_from(sensor, pose))[0]
         assert set(measured.target_ids) == set(sensor.platform.sticker_ids[3:])
 

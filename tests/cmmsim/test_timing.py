@@ -84,8 +84,8 @@ def test_the_prediction_goes_on_through_missed_frames():
         def locate(self, images):
             return at(images.number)
 
-        def measure(self, images, predicted, swept=None):
-            assert swept is None
+        def measure(self, images, predicted, exposure_ends=None):
+            assert exposure_ends is None
             expected.append(predicted[0, 3])
             return lost_measurement("stands for a good one"), at(images.number)
 

@@ -23,7 +23,7 @@ from dynamics.closed_loop import (
     simulate_servo,
     stability,
 )
-from dynamics.control.computed_torque import WayBack, computed_torque, error_map
+from dynamics.control.computed_torque import DecayingErrors, computed_torque, error_map
 from dynamics.control.feedforward import feedforward, joint_commands
 from dynamics.control.gains import design_servo, servo_figures, torque_figures
 from dynamics.control.inverse_dynamics import FITTED, Model, spans
@@ -159,7 +159,7 @@ def test_a_torque_held_for_a_frame_brings_the_rates_where_the_way_back_has_them(
     parameters, motion, period = robot.parameter_sets["initial"].vector, Swing(robot), 1 / 60
     settings = LoopSettings(SERVO, FAST, steps_per_frame=16, drives=Drives(torques=True))
     error = 0.01 * motion.size
-    way = WayBack(motion, motion.chart, error_map(Feedback(60.0)), 0.0, error, 0 * error)
+    way = DecayingErrors(motion, motion.chart, error_map(Feedback(60.0)), 0.0, error, 0 * error)
     torque = spans(Model(robot, parameters, settings.friction), way, np.zeros(1), period).torque
     beside = np.tile(motion.pose(np.zeros(1))[0] - error, (2, 1))
     run = simulate_commands(

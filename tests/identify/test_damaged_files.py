@@ -11,7 +11,7 @@ import xarray as xr
 from identify.errors import OutputFolderError, RecordError
 from identify.files import limited_process
 from identify.files.dataset import read_group
-from identify.files.lock import LOCK, locked, working_in
+from identify.files.lock import LOCK, lock_folder, locked
 from identify.files.run_folder import RunFolder, load_result
 from identify.record.recording import read
 from tests.identify.commands import command, one_line, refusal
@@ -69,18 +69,18 @@ def test_what_hangs_kills_or_fills_the_reader_of_a_strangers_file_is_one_line(
         assert says in refusal(RecordError, read_group, path)
 
 
-PATCHED = """from identify.files import limited_process, stranger
+PATCHED = """from identify.files import limited_process, untrusted
 limited_process.LIMIT_S = 1
 def load(*_):"""
-SERVED = "stranger.load = load\nlimited_process.serve()"
+SERVED = "untrusted.load = load\nlimited_process.serve()"
 
 
 def test_a_folder_is_for_one_process_and_a_lock_that_was_left_or_is_anothers_holds_nobody_up(
     tmp_path,
 ):
     folder = tmp_path / "a" / "b"
-    with working_in(folder):
-        said = refusal(OutputFolderError, lambda: working_in(folder).__enter__())
+    with lock_folder(folder):
+        said = refusal(OutputFolderError, lambda: lock_folder(folder).__enter__())
         assert "is in use by another process" in said
         (folder / ".cmmsim-1234-result.json").touch()
     assert list(folder.iterdir()) == [folder / ".cmmsim-1234-result.json"]
@@ -90,7 +90,7 @@ def test_a_folder_is_for_one_process_and_a_lock_that_was_left_or_is_anothers_hol
     assert list(folder.iterdir()) == []
     folder.rmdir()
     folder.parent.rmdir()
-    with working_in(folder):
+    with lock_folder(folder):
         pass
     assert list(tmp_path.iterdir()) == []
 

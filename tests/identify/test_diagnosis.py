@@ -14,7 +14,7 @@ from dynamics.geometry import RobotGeometry
 from identify.diagnosis.cause import Cause, in_each_run
 from identify.diagnosis.diagnose import diagnosis_from
 from identify.diagnosis.own_cause import own_cause
-from identify.diagnosis.score import Beside, score
+from identify.diagnosis.score import OrthogonalComplement, score
 from identify.diagnosis.selection import CHANCE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
@@ -257,7 +257,7 @@ def test_the_statistic_is_the_fall_of_the_cost_by_a_fit_of_the_same_columns():
     without, fitted = (
         residual - rows @ np.linalg.lstsq(rows, residual)[0] for rows in (parameters, both)
     )
-    beside = Beside.of(parameters)
+    beside = OrthogonalComplement.of(parameters)
     found = score(beside.part(causes), beside.part(residual), np.linalg.norm(causes, axis=0))
     assert found.statistic == pytest.approx(without @ without - fitted @ fitted)
     assert found.sizes == pytest.approx(-np.linalg.lstsq(both, residual)[0][7:])
@@ -268,7 +268,7 @@ def test_the_statistic_is_the_fall_of_the_cost_by_a_fit_of_the_same_columns():
 def test_a_cause_that_the_parameters_take_up_has_no_statistic():
     rng = np.random.default_rng(1)
     parameters = rng.standard_normal((50, 4))
-    beside = Beside.of(parameters)
+    beside = OrthogonalComplement.of(parameters)
     column = parameters @ rng.standard_normal((4, 1))
     residual = beside.part(rng.standard_normal(50))
     found = score(beside.part(column), residual, np.linalg.norm(column, axis=0))

@@ -72,8 +72,8 @@ def test_what_no_pose_can_tell_stays_nominal_and_is_named():
     """A platform that cannot turn shows the places of both its joints as differences alone."""
     made, robot = drawn("delta3", 1, poses_of("delta3", ONE_DRAW)), load_robot("delta3")
     found, names = made.calibrated("delta3"), robot.geometry.number_names
-    untold = {name for name, told in zip(names, found.observable, strict=True) if not told}
-    assert untold == {name for name in names if "joint" in name}
+    unobservable = {name for name, told in zip(names, found.observable, strict=True) if not told}
+    assert unobservable == {name for name in names if "joint" in name}
     groups = combinations(names, found.covariance, found.prior_std)
     assert set(groups) == {
         f"leg{leg}.base_joint.{axis} + leg{leg}.platform_joint.{axis}"

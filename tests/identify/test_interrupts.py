@@ -1,4 +1,4 @@
-"""Ctrl-C at a bad moment: held, noted, and one line for the user."""
+"""Ctrl-C at a bad moment: held, record_interrupts, and one line for the user."""
 
 import signal
 import sys
@@ -9,7 +9,13 @@ import pytest
 
 from identify.errors import StudyInterrupted
 from identify.progress import SilentProgress
-from identify.runtime import held, honoured, loading, noted, raise_noted
+from identify.runtime import (
+    delay_interrupts,
+    interruptible,
+    interruptible_imports,
+    raise_interrupt,
+    record_interrupts,
+)
 from identify.studies.runner import run_study
 from tests.identify.commands import command
 from tests.identify.study_rows import DARK, PATIENCE, journal, process, small_study
@@ -34,7 +40,7 @@ def broken_import():
 def test_held_ctrl_c_waits_for_the_end_of_the_block():
     done = []
 
-    @held()
+    @delay_interrupts()
     def block():
         ctrl_c()
         done.append("the rest of the block")
@@ -47,24 +53,24 @@ def test_held_ctrl_c_waits_for_the_end_of_the_block():
 
 
 def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed_and_an_inner_blocks_is_noted_in_the_outer_one():
-    with noted():
-        raise_noted()
+    with record_interrupts():
+        raise_interrupt()
         swallowed()
         with pytest.raises(KeyboardInterrupt):
-            raise_noted()
-    raise_noted()
+            raise_interrupt()
+    raise_interrupt()
     for happens in (ctrl_c, broken_import, swallowed):
-        with noted() as outer:
-            with pytest.raises(KeyboardInterrupt), honoured():
+        with record_interrupts() as outer:
+            with pytest.raises(KeyboardInterrupt), interruptible():
                 happens()
             assert outer.came
-    with pytest.raises(ImportError, match="no library"), honoured():
+    with pytest.raises(ImportError, match="no library"), interruptible():
         raise ImportError("no library")
 
 
 def test_ctrl_c_that_an_import_swallowed_is_raised_at_the_next_one():
     before = list(sys.meta_path)
-    with noted(), loading():
+    with record_interrupts(), interruptible_imports():
         with pytest.raises(ModuleNotFoundError):
             import_module("no_such_library")
         swallowed()
@@ -100,7 +106,7 @@ def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_wa
         with pytest.raises(StudyInterrupted, match="1 of 3 rows are done"):
             run_study(chosen, tmp_path / str(disguise), SilentProgress())
         assert journal(tmp_path / str(disguise)) == [0]
-    with noted():
+    with record_interrupts():
         swallowed()
         with pytest.raises(StudyInterrupted, match="0 of 3 rows are done"):
             run_study(chosen, tmp_path / "b", SilentProgress(), workers)

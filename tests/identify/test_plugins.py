@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.allowed_plugins import ALLOWED, Telling, allow_plugin, allowed_plugins, own_part
+from cmmsim.allowed_plugins import (
+    ALLOWED,
+    PluginFunction,
+    allow_plugin,
+    allowed_plugins,
+    import_plugin,
+)
 from cmmsim.detection.detector import find_detector
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import load_robot
@@ -62,13 +68,13 @@ def test_a_file_runs_no_code_of_a_module_that_is_not_allowed_and_says_what_to_ty
 def test_a_module_is_allowed_by_name_with_what_is_within_it_and_nothing_else(monkeypatch):
     monkeypatch.setenv(ALLOWED, " json , xml")
     assert allowed_plugins() == ("json", "xml")
-    assert own_part("criterion", "xml.sax:parse")
-    assert own_part("criterion", "json:loads")
+    assert import_plugin("criterion", "xml.sax:parse")
+    assert import_plugin("criterion", "json:loads")
     for name in ("jsonx:loads", "js:loads", "os:abort", "xmlrpc.client:dumps"):
-        assert "not allowed" in refusal(cmmsim.CmmError, own_part, "criterion", name)
+        assert "not allowed" in refusal(cmmsim.CmmError, import_plugin, "criterion", name)
     for name in ("json/..:x", "os; rm -rf:x", ":x", "json:", "json:a.b", "../json:loads"):
         assert "is not of the form module:name" in refusal(
-            cmmsim.CmmError, own_part, "criterion", name
+            cmmsim.CmmError, import_plugin, "criterion", name
         )
     allow_plugin("os")
     assert allowed_plugins() == ("json", "xml", "os")
@@ -76,7 +82,7 @@ def test_a_module_is_allowed_by_name_with_what_is_within_it_and_nothing_else(mon
 
 
 def test_a_part_that_ends_the_program_is_one_line():
-    part = Telling("law 'own:law'", lambda: sys.exit(0), cmmsim.CmmError)
+    part = PluginFunction("law 'own:law'", lambda: sys.exit(0), cmmsim.CmmError)
     assert "law 'own:law' raised SystemExit: 0" in refusal(cmmsim.CmmError, part)
 
 
@@ -91,7 +97,7 @@ def test_rows_of_a_study_run_where_its_command_allowed_their_kind(stranger, monk
 
 
 def test_a_function_that_tells_what_it_raises_reaches_other_processes():
-    told = pickle.loads(pickle.dumps(Telling("detector", int, ScenarioError)))
+    told = pickle.loads(pickle.dumps(PluginFunction("detector", int, ScenarioError)))
     assert told("3") == 3
     assert "detector raised ValueError: invalid" in refusal(ScenarioError, told, "x")
 

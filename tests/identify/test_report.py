@@ -21,12 +21,12 @@ from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.figures import estimates, fit, paths, style
 from identify.reporting.figures.fit import Fit
 from identify.reporting.goals import check_goals, within_tolerance
-from identify.reporting.number_format import interval, number, rounded, spelled, with_deviation
+from identify.reporting.number_format import interval, number, rounded, typographic, with_deviation
 from identify.reporting.pictures import pictures
 from identify.reporting.report import render, write_report
 from identify.reporting.report_sections import SECTIONS
 from identify.reporting.run_data import read_run
-from identify.reporting.verdict import cameras_acquitted, key_numbers, verdict
+from identify.reporting.verdict import cameras_consistent, key_numbers, verdict
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, random_trajectory
 from tests.identify.synthetic import short_run, truth_of
@@ -415,15 +415,15 @@ def test_a_model_is_called_wrong_only_where_the_cameras_cannot_be_the_cause(resu
 def test_cameras_are_acquitted_when_they_err_by_white_noise_of_the_size_that_they_state():
     record, plant = short_run()
     truth = truth_of(plant)
-    assert cameras_acquitted(record, truth) is True
-    assert cameras_acquitted(record, None) is None
+    assert cameras_consistent(record, truth) is True
+    assert cameras_consistent(record, None) is None
     bold = record.assign(measured_covariance=record["measured_covariance"] / 4)
-    assert cameras_acquitted(bold, truth) is False, "they state half of their noise"
+    assert cameras_consistent(bold, truth) is False, "they state half of their noise"
     lasting = record["measured_position"] + 5e-6 * np.sin(6 * record["time"])
-    assert cameras_acquitted(record.assign(measured_position=lasting), truth) is False, (
+    assert cameras_consistent(record.assign(measured_position=lasting), truth) is False, (
         "an error that lasts"
     )
-    assert cameras_acquitted(record.isel(time=slice(20)), truth.isel(time=slice(20))) is None, (
+    assert cameras_consistent(record.isel(time=slice(20)), truth.isel(time=slice(20))) is None, (
         "too short to say"
     )
 
@@ -447,7 +447,7 @@ def test_numbers_have_the_digits_that_they_deserve_and_what_is_rounding_is_zero(
     assert rounded(-6.688e-15, 1.3) == 0.0
     assert rounded(-6.688e-15, 1e-14) == -6.688e-15
     assert (
-        spelled("cost changed by 3.35e-07 <= tol1 = 1e-06")
+        typographic("cost changed by 3.35e-07 <= tol1 = 1e-06")
         == "cost changed by 3.35 × 10⁻⁷ ≤ tol1 = 1 × 10⁻⁶"
     )
 
@@ -618,11 +618,11 @@ def test_papers_figures_are_those_of_its_text():
 def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_is_not_identifiable(
     result,
 ):
-    table = tables.excitation_error_table(result, beside_paper=True)
+    table = tables.excitation_error_table(result, repeats_paper=True)
     assert table.rows[0] == ("x [µm]", "diverged", "20", "1260", "408")
     assert table.rows[5] == ("gamma [µrad]", "diverged", "82", "2800", "725")
     assert tables.excitation_error_table(result).rows[5] == ("gamma [µrad]", "diverged", "82")
-    validation = tables.validation_table(result, beside_paper=True)
+    validation = tables.validation_table(result, repeats_paper=True)
     assert validation.header[1] == "x [µm]"
     assert validation.rows[0][:4] == ("1: identified, true", "1", "1.4", "1.8")
     assert len(validation.rows) == 2 * 2 + 10

@@ -49,7 +49,7 @@ def stop(folder, rows, error=KeyboardInterrupt, **entries):
 
     def execute(setup, batches):
         for _ in range(rows):
-            yield compute(setup, batches.take(1))
+            yield compute(setup, batches.next_batch(1))
         raise error
 
     with pytest.raises((StudyError, SystemError)) as caught:
@@ -60,8 +60,8 @@ def stop(folder, rows, error=KeyboardInterrupt, **entries):
 @pytest.mark.parametrize(("row_seconds", "workers"), [(1e-5, 1), (0.004, 2), (0.1, 8), (30.0, 3)])
 def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, workers):
     batches, sizes, numbers = Batches((Case(number, 0, {}) for number in range(5000)), 5000), [], []
-    while cases := batches.take(workers):
-        batches.learn([Finished(case.number, {}, row_seconds) for case in cases])
+    while cases := batches.next_batch(workers):
+        batches.update_row_time([Finished(case.number, {}, row_seconds) for case in cases])
         sizes.append(len(cases))
         numbers += [case.number for case in cases]
     assert numbers == list(range(5000))
@@ -231,9 +231,9 @@ def test_fewer_repeats_leave_the_others_out_of_the_table_but_lose_none(whole, tm
     options = {"log": str(log)}
     stop(tmp_path / "a", 13, options=options)
     two, three = (run(tmp_path / "a", options=options, repeats=repeats) for repeats in (2, 3))
-    assert (two.found, two.rows, two.beyond) == (12, 12, 1)
+    assert (two.found, two.rows, two.surplus) == (12, 12, 1)
     same_numbers(two.frame, whole[1][:12])
-    assert (three.found, three.beyond) == (13, 0)
+    assert (three.found, three.surplus) == (13, 0)
     same_numbers(three.frame, whole[1])
     assert sorted(map(int, log.read_text().split())) == list(range(18))
 

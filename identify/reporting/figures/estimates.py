@@ -31,8 +31,8 @@ class RelativeErrors(NamedTuple):
 def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
     """Return the relative errors of the identifiable parameters of a result.
 
-    The distances are zero if there is no interval. If the truth is not known, values are in per
-    cent of the estimate, and the error is zero.
+    Without an interval, the distances to its ends are zero. If the truth is not known, values are
+    in per cent of the estimate, and the error is zero.
     """
     shown = {
         n: p
@@ -107,8 +107,8 @@ def group_figure(
     """Draw the parameters of each base parameter, with their shares.
 
     A row is a base parameter that combines several parameters, and a column is a parameter. The
-    area of a dot is the share of the parameter, by coefficient times initial guess. The dot is open
-    if the parameter is subtracted. A star marks an identified base parameter.
+    area of a dot is the parameter's share of the sum: coefficient times initial guess. The dot is
+    open if the parameter is subtracted. A star marks an identified base parameter.
     """
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
     columns = [

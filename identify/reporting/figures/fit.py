@@ -97,7 +97,7 @@ class Fit:
     def error_curves(self, i: int) -> list[Curve]:
         """Return the errors of the identified model in component i, in µm or µrad.
 
-        They are relative to the measurement and, if it is known, also to the truth.
+        The errors are relative to the measurement and, if the truth is known, also to the truth.
         """
         curves = [
             Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
@@ -163,7 +163,7 @@ class Fit:
 def fit_figure(fit: Fit) -> Figure:
     """Draw the measured poses and both models, with the errors below each component.
 
-    It corresponds to figures 12 and 13 of the paper.
+    The figure corresponds to figures 12 and 13 of the paper.
     """
     shown = moving(fit.identified)
     rows = -(-len(shown) // 3)
@@ -253,7 +253,8 @@ HATCHES = ("", "////", "xxxx")
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
     """Draw the RMS of the identified model on each validation trajectory.
 
-    It is drawn against truth and measurement, together with the prediction and the goals.
+    The RMS is computed against truth and measurement. The prediction and the goals are drawn as
+    well.
     """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)

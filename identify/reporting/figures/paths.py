@@ -151,7 +151,8 @@ def ellipse_figure(
     shown
         Indices of the components that move. Each pair of them has a panel.
     errors
-        True minus measured poses (N, 6), if the truth is known. They are enlarged equally.
+        True minus measured poses (N, 6), if the truth is known. They are enlarged like the
+        ellipses.
     """
     # Lost frames have neither a pose nor a covariance.
     kept = np.flatnonzero(

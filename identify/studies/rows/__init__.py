@@ -1,9 +1,10 @@
 """Kinds of row that a study can have.
 
 A built-in kind is one file here, and an entry in ``KINDS``. A user's own kind is named
-``module:function``. It is a function ``run(scenario, seed)`` or ``run(scenario, seed, options)`` of
-the scenario, the row's ``numpy.random.SeedSequence``, and the options by name. It returns the
-figures of the row by name, with units in the names. Workers must be able to import its module.
+``module:function``. The function is ``run(scenario, seed)`` or ``run(scenario, seed, options)``,
+where ``seed`` is the row's ``numpy.random.SeedSequence``, and ``options`` are given by name. It
+returns the figures of the row by name, with units in the names. Workers must be able to import the
+module.
 """
 
 import inspect
@@ -11,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from identify.errors import StudyError
-from identify.own_parts import is_own, own_function
+from identify.own_parts import is_plugin_name, own_function
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.estimators import ESTIMATION
 from identify.studies.rows.identified import IDENTIFICATION
@@ -32,7 +33,7 @@ def find_kind(name: str) -> Kind:
     Raises StudyError if there is no such kind (the message names the built-in kinds), module or
     function, or if the function has other arguments.
     """
-    if is_own(name):
+    if is_plugin_name(name):
         return _own(name, own_function(name, "kind", StudyError))
     if name not in KINDS:
         raise StudyError(

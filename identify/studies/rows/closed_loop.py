@@ -26,8 +26,8 @@ from identify.studies.rows.kind import (
     PLANT,
     UNWATCHED,
     Column,
+    KeysRead,
     Kind,
-    Reads,
     Row,
 )
 from identify.studies.rows.row_sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
@@ -62,7 +62,7 @@ class ClosedLoopOptions(Section):
     )
 
 
-READS = Reads(
+READS = KeysRead(
     (
         "scenario.robot",
         *PICTURES,
@@ -79,14 +79,14 @@ READS = Reads(
         *LIMITS,
         "scenario.validation.duration_s",
     ),
-    idle=(NOISE_OFF, *PLANT),
+    ineffective=(NOISE_OFF, *PLANT),
 )
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
     """Compute one row.
 
-    Raises EstimationError if no frame was measured, LoopFailure, and the errors of the sensor.
+    Raises EstimationError if no frame was measured, LoopFailure, and the exceptions of the sensor.
     """
     setup = Setup(scenario.with_overrides(UNWATCHED))
     plan = setup.sensor_plan

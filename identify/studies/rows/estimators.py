@@ -55,9 +55,9 @@ FIGURES = {
     ),
     "seconds": ("s", "time of the estimate", 1.0, None),
 }
-"""Unit, meaning, factor and field of the score for each figure, by the end of its name.
+"""Unit, meaning, factor and field of the score for each figure, by the end of the figure's name.
 
-If the field is None, its name is the end of the figure's name.
+If the field is None, the end of the figure's name is the name of the field.
 """
 
 STARTING = START.replace(" ", "_")
@@ -89,7 +89,7 @@ COLUMNS = {
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
     """Compute one row. Figures that an estimator does not return are missing.
 
-    Raises EstimationError, and the errors of experiment and sensor.
+    Raises EstimationError, and the exceptions of experiment and sensor.
     """
     made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
     robot = made.plant.nominal

@@ -1,9 +1,9 @@
 """Rows of kind `identification`: a record, the parameters identified from it, and their errors.
 
 By default the sensor is `drawn`: it adds Gaussian noise with the covariance that the scenario's
-sensor states at the home pose, so the entries of the sensor take effect. With images, the sensor
-teaches itself, seeded by the row. All rows have the same exciting and validation trajectories, from
-`trajectory_seed`. Rows thus differ only by their factors and their noise.
+sensor states at the home pose. The entries of that sensor therefore have an effect. With images,
+the sensor teaches itself, seeded by the row. All rows have the same exciting and validation
+trajectories, from `trajectory_seed`. Rows thus differ only by their factors and their noise.
 """
 
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ from identify.studies.rows.kind import (
     SENSOR,
     UNWATCHED,
     Column,
-    Idle,
+    IneffectiveKeys,
+    KeysRead,
     Kind,
-    Reads,
     Row,
     timing,
 )
@@ -147,37 +147,37 @@ class IdentificationOptions(RecordOptions):
 
 
 DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
-READS = Reads(
+READS = KeysRead(
     ("scenario.", *SENSOR, "sensor.timing."),
-    but=(
+    excluding=(
         "scenario.name",
         "scenario.description",
         "scenario.sensor_note",
         "scenario.identification.qr_threshold",
         "scenario.rig.watch",
     ),
-    idle=(
-        Idle(
+    ineffective=(
+        IneffectiveKeys(
             NOISE_OFF.keys,
             {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"},
             NOISE_OFF.why,
         ),
-        Idle(
+        IneffectiveKeys(
             ("sensor.camera.noise",),
             DRAWN,
             "options.sensor is drawn: the stated noise is added in any case",
         ),
-        Idle(
+        IneffectiveKeys(
             ("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")),
             DRAWN,
             "options.sensor is drawn: no picture of a motion is taken",
         ),
-        Idle(
+        IneffectiveKeys(
             ("scenario.payload.",),
             {"scenario.identification.scale_anchor": lambda anchor: anchor != "payload"},
             "scenario.identification.scale_anchor is not payload",
         ),
-        Idle(
+        IneffectiveKeys(
             ("scenario.excitation.generations",),
             {"scenario.excitation.method": lambda how: how != "evolutionary"},
             "scenario.excitation.method is not evolutionary",
@@ -191,8 +191,8 @@ READS = Reads(
 class Recorded:
     """Runs of a row.
 
-    `excitation` is the plant's run of the exciting trajectory. `unseen` are its runs of the
-    validation trajectories. `records` are all records to identify from, first the record of
+    `excitation` is the plant's run of the exciting trajectory, and `unseen` are the plant's runs of
+    the validation trajectories. `records` are all records to identify from, first the record of
     `excitation`. `number` is the seed of all runs.
     """
 
@@ -209,7 +209,7 @@ def row_setup(settings: Scenario, number: int) -> Setup:
 
 
 def recorded(setup: Setup, options: RecordOptions) -> Recorded:
-    """Run the plant of a row with its sensor. Raises the errors of experiment and sensor."""
+    """Run the plant of a row with its sensor. Raises the exceptions of experiment and sensor."""
     number = setup.seed
     settings = setup.scenario.excitation
     plant = setup.plant
@@ -237,7 +237,7 @@ def recorded(setup: Setup, options: RecordOptions) -> Recorded:
 def compute(
     scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions
 ) -> Row:
-    """Compute one row. Raises EstimationError, and the errors of experiment and sensor."""
+    """Compute one row. Raises EstimationError, and the exceptions of experiment and sensor."""
     made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
     plant = made.plant
     robot = plant.nominal
@@ -365,7 +365,7 @@ def designed_trajectories(setup: Setup, seed: int) -> TrajectorySet:
     """Return the trajectories of a setup, designed once per process.
 
     The design does not depend on the plant, nor on the sections rig and geometry of the scenario.
-    Rows that differ only in these share their trajectories.
+    Rows that differ only there share their trajectories.
     """
     design = {"rig": Rig(), "plant": PlantSwitches(), "geometry": Geometry(), "renderer": "auto"}
     return _designed(setup.scenario.model_copy(update=design).to_toml(), seed)

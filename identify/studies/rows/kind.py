@@ -1,4 +1,6 @@
-"""Definition of a kind of row: its function, its figures, its options, and the keys it reads."""
+"""Definition of a kind of row: a function, its options, its figures, and the keys that it reads. A
+figure is a number that the function computes, such as an rms error.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -19,7 +21,7 @@ from identify.studies.study_file import Range, Study
 
 
 @dataclass(frozen=True)
-class Idle:
+class IneffectiveKeys:
     """Keys that have no effect under a condition.
 
     Attributes
@@ -38,31 +40,33 @@ class Idle:
 
 
 @dataclass(frozen=True)
-class Reads:
+class KeysRead:
     """Keys that a kind reads, beside all of its options.
 
     Attributes
     ----------
     keys : tuple of str
         Dotted paths, or sections that end in a dot.
-    but : tuple of str
-        Exceptions: keys in these sections that the kind does not read.
-    idle : tuple of Idle
+    excluding : tuple of str
+        Keys in these sections that the kind does not read.
+    ineffective : tuple of IneffectiveKeys
         Keys that have no effect under some conditions.
     """
 
     keys: tuple[str, ...]
-    but: tuple[str, ...] = ()
-    idle: tuple[Idle, ...] = ()
+    excluding: tuple[str, ...] = ()
+    ineffective: tuple[IneffectiveKeys, ...] = ()
 
     def covers(self, path: str) -> bool:
         """Return whether the kind reads a dotted path under any condition."""
-        return path.startswith("options.") or (among(path, self.keys) and not among(path, self.but))
+        return path.startswith("options.") or (
+            among(path, self.keys) and not among(path, self.excluding)
+        )
 
     def __str__(self) -> str:
         read, left = (
             ", ".join(f"{key}*" if key.endswith(".") else key for key in keys)
-            for keys in (self.keys, self.but)
+            for keys in (self.keys, self.excluding)
         )
         return f"{read}{' but ' if left else ''}{left}"
 
@@ -112,7 +116,7 @@ LIMITS = (
 )
 """Keys of the limits of a random path."""
 
-NOISE_OFF = Idle(
+NOISE_OFF = IneffectiveKeys(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
     {"sensor.camera.noise": lambda noise: not noise},
     "sensor.camera.noise is false: pictures have no noise, and only its stated covariance would "
@@ -120,7 +124,7 @@ NOISE_OFF = Idle(
 )
 
 PLANT = (
-    Idle(
+    IneffectiveKeys(
         ("scenario.plant.geometry_seed",),
         {
             f"scenario.plant.{name}": lambda error: error == 0
@@ -128,12 +132,12 @@ PLANT = (
         },
         "scenario.plant.geometry_error_m is 0, and so are the other geometry errors",
     ),
-    Idle(
+    IneffectiveKeys(
         ("scenario.plant.joint_damping_N_m_s_rad", "scenario.plant.motor_inertia_kg_m2"),
         {"scenario.plant.joint_stiffness_N_m_rad": lambda stiffness: stiffness is None},
         "scenario.plant.joint_stiffness_N_m_rad is not given: the joints are rigid",
     ),
-    Idle(
+    IneffectiveKeys(
         ("scenario.plant.joint_damping_N_s_m", "scenario.plant.motor_mass_kg"),
         {"scenario.plant.joint_stiffness_N_m": lambda stiffness: stiffness is None},
         "scenario.plant.joint_stiffness_N_m is not given: the joints are rigid",
@@ -160,11 +164,11 @@ BESIDE = (
 """Keys that are allowed among the changes of any kind.
 
 They are labels, the renderer, the drift watch, and all keys that a scenario checks against its
-frame rate, because a change of the frame rate can require a change of these keys.
+frame rate. A change of the frame rate can require a change of such a key.
 """
 
 
-def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
+def check_read(study: Study, reads: KeysRead, first: Scenario, options: BaseModel) -> None:
     """Refuse factors, changes and options that rows never read, or that have no effect in any row.
 
     The check uses the statements of each kind about its keys. Computing rows to find keys without
@@ -174,7 +178,7 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
     ----------
     study : Study
         The study.
-    reads : Reads
+    reads : KeysRead
         Keys that its kind reads.
     first : Scenario
         Scenario of the first row.
@@ -197,12 +201,13 @@ def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) 
                 f"{setting} does nothing: rows of kind {study.kind!r} do not read it; they read "
                 f"{reads}, and their options"
             )
-        for idle in reads.idle:
-            if among(path, idle.keys) and all(
-                _always(holds, key, study, first, options) for key, holds in idle.where.items()
+        for ineffective in reads.ineffective:
+            if among(path, ineffective.keys) and all(
+                _always(holds, key, study, first, options)
+                for key, holds in ineffective.where.items()
             ):
                 raise StudyError(
-                    f"{setting} does nothing in rows of kind {study.kind!r} where {idle.why}"
+                    f"{setting} does nothing in rows of kind {study.kind!r} where {ineffective.why}"
                 )
 
 
@@ -264,8 +269,8 @@ class Column:
 class Kind:
     """Kind of row of a study.
 
-    A user's own kind has only a name and a function. Its figures are known from its rows. It can
-    have any options, or none.
+    A user's own kind has only a name and a function. The figures of such a kind are known from its
+    rows, and any options are allowed, or none.
 
     Attributes
     ----------
@@ -280,7 +285,7 @@ class Kind:
         Figures of a row.
     options : type or None
         Model of the options.
-    reads : Reads or None
+    reads : KeysRead or None
         Keys that rows read.
     takes_options : bool
         Whether options are allowed.
@@ -294,7 +299,7 @@ class Kind:
     what: str = ""
     columns: Mapping[str, Column] = field(default_factory=dict)
     options: type[Section] | None = None
-    reads: Reads | None = None
+    reads: KeysRead | None = None
     takes_options: bool = True
     memory: Callable[[Setup, Any], float] | None = None
 

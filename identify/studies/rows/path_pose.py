@@ -2,8 +2,8 @@
 
 The path is a random trajectory with the scenario's settings of the excitation. Exposure, latency,
 its jitter and dropout have the scenario's values. A row is a short stretch of the path from a
-random instant on. All its pictures are measured in one call. Stickers are looked for at their true
-places on the path, without search and without tracking. A measured pose refers to the middle of its
+random instant on. All pictures of the stretch are measured in one call. Each sticker is expected at
+its true place, so there is neither search nor tracking. A measured pose refers to the middle of its
 exposure. The row has the error of the measured poses, and the error of the pose in use, which is
 the last pose that has arrived. Teaching is exact by default.
 """
@@ -19,7 +19,16 @@ from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.scenario.section import Section
 from identify.setup import Setup
-from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
+from identify.studies.rows.kind import (
+    NOISE_OFF,
+    PATH,
+    PICTURES,
+    Column,
+    KeysRead,
+    Kind,
+    Row,
+    timing,
+)
 from identify.studies.rows.row_sensor import (
     POSE_COLUMNS,
     Teaching,
@@ -65,14 +74,14 @@ class PathPoseOptions(Section):
     )
 
 
-READS = Reads(
+READS = KeysRead(
     (
         *PICTURES,
         *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
         *PATH,
     ),
-    but=("sensor.stickers.obstacle_level",),
-    idle=(NOISE_OFF,),
+    excluding=("sensor.stickers.obstacle_level",),
+    ineffective=(NOISE_OFF,),
 )
 
 
@@ -113,7 +122,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
     """Return the errors (m, 6) of the pose in use from the first arrival to the last.
 
-    No pose comes into use before an earlier pose.
+    Poses come into use in the order in which they were measured.
     """
     arrivals = np.maximum.accumulate(arrivals)
     count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))

@@ -1,10 +1,10 @@
 """Rows of kind `static_pose`: the sensor alone looks at a platform that stands still.
 
 Each row draws one or several poses in the scenario's excitation box around the sensor's home pose,
-and takes several pictures of each pose. Stickers are looked for near predicted places with random
-errors, as after the prediction of a tracker. No picture is searched as a whole. Dropout removes
-pictures without changing the others. Teaching is exact by default, so that rows show observation
-noise alone.
+and takes several pictures of each pose. Stickers are searched near predicted places. The
+predictions have random errors, like those of a tracker. No picture is searched as a whole. Dropout
+removes pictures without changing the others. Teaching is exact by default, so that rows show
+observation noise alone.
 """
 
 from collections.abc import Iterator
@@ -27,9 +27,9 @@ from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
     Column,
-    Idle,
+    IneffectiveKeys,
+    KeysRead,
     Kind,
-    Reads,
     Row,
     timing,
 )
@@ -47,7 +47,7 @@ SENSOR = 1
 DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
-"""Standard deviation of the predicted pose, m and rad, near which stickers are looked for.
+"""Standard deviation of the predicted pose, m and rad, near which stickers are searched.
 
 It is the error of a tracker's prediction.
 """
@@ -105,17 +105,17 @@ class StaticPoseOptions(Section):
     )
 
 
-READS = Reads(
+READS = KeysRead(
     (*PICTURES, *timing("frame_rate_hz", "exposure_s", "dropout"), *BOX),
-    but=("sensor.stickers.obstacle_level",),
-    idle=(
+    excluding=("sensor.stickers.obstacle_level",),
+    ineffective=(
         NOISE_OFF,
-        Idle(
+        IneffectiveKeys(
             ("options.captures",),
             {"options.hold_s": lambda hold: hold is not None},
             "options.hold_s is given: it sets the number of pictures",
         ),
-        Idle(
+        IneffectiveKeys(
             timing("frame_rate_hz"),
             {"options.hold_s": lambda hold: hold is None},
             "options.hold_s is not given: options.captures sets the number of pictures",
@@ -125,7 +125,7 @@ READS = Reads(
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Capture:
     """Result of one picture of a pose.
 
     Attributes
@@ -150,9 +150,10 @@ class _Seen:
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
     """Compute one row.
 
-    Raises EstimationError, with a reason, if every picture was lost, and the errors of the sensor.
+    Raises EstimationError, with a reason, if every picture was lost, and the exceptions of the
+    sensor.
     """
-    eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
+    sensor = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, POSES))
     dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
     box = np.repeat(
@@ -163,27 +164,27 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
         if options.hold_s is None
         else max(1, scenario.timing.frames(options.hold_s))
     )
-    seen: list[_Seen] = []
+    seen: list[_Capture] = []
     lost = ""
-    planned = _pictures(eye.sensor.home, box, (options.poses, captures), rng)
+    planned = _pictures(sensor.sensor.home, box, (options.poses, captures), rng)
     while together := list(islice(planned, TOGETHER)):
         poses, near = (np.array(values) for values in list(zip(*together, strict=True))[1:])
         # Pictures that drop out are measured too, so that dropout does not change later noise.
         for (number, pose, _), measured in zip(
-            together, eye.sensor.measure_each(poses, near), strict=True
+            together, sensor.sensor.measure_each(poses, near), strict=True
         ):
-            if dropout.random() < (share := eye.sensor.timing.dropout):
+            if dropout.random() < (share := sensor.sensor.timing.dropout):
                 lost = f"dropped frame (a share of {share:.3g} drops out)"
             elif not measured.ok:
                 lost = measured.reason
             else:
-                errors = _sticker_errors(eye, measured, pose)
-                seen.append(_Seen(number, measured.pose - pose, measured.covariance, *errors))
+                errors = _sticker_errors(sensor, measured, pose)
+                seen.append(_Capture(number, measured.pose - pose, measured.covariance, *errors))
     if not seen:
         raise EstimationError(
             f"no pose was found in any of {captures * options.poses} pictures: {lost}"
         )
-    return _row(eye, seen, captures * options.poses)
+    return _row(sensor, seen, captures * options.poses)
 
 
 def _pictures(
@@ -191,8 +192,8 @@ def _pictures(
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield for each picture the number of its pose, the pose (6,), and the predicted pose (6,).
 
-    Stickers are looked for near the predicted pose. `count` holds the number of poses, and the
-    number of pictures per pose.
+    Stickers are searched near the predicted pose. `count` holds the number of poses, and the number
+    of pictures per pose.
     """
     for number in range(count[0]):
         pose = home + box * rng.uniform(-1.0, 1.0, 6)
@@ -200,20 +201,22 @@ def _pictures(
             yield number, pose, pose + PREDICTION_ERROR * rng.standard_normal(6)
 
 
-def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:
+def _sticker_errors(
+    sensor: RowSensor, seen: cmmsim.Measurement, pose: Array
+) -> tuple[Array, Array]:
     """Return the errors of the k stickers seen.
 
     The first array (k, 3) holds distance, error along the line of sight and error across it, m. The
     second array (2, k, 2) holds the errors of the centres in both images, px.
     """
-    estimator = eye.sensor.estimator
+    estimator = sensor.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
-    places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
-    in_camera = apply(invert(eye.truth.base_from_camera), places)
+    places = apply(cmmsim.pose_to_transform(pose), sensor.truth.platform_places[index])
+    in_camera = apply(invert(sensor.truth.base_from_camera), places)
     pixels, _ = estimator.rig.project(in_camera)
-    sight = places - eye.middle
+    sight = places - sensor.middle
     distance = np.linalg.norm(sight, axis=1)
-    errors = (seen.points - in_camera) @ eye.truth.base_from_camera[:3, :3].T
+    errors = (seen.points - in_camera) @ sensor.truth.base_from_camera[:3, :3].T
     along = np.einsum("ki,ki->k", errors, sight) / distance
     across = np.sqrt(np.maximum(np.einsum("ki,ki->k", errors, errors) - along**2, 0.0))
     return np.column_stack([distance, along, across]), np.stack(
@@ -221,14 +224,14 @@ def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tu
     ) - pixels
 
 
-def _row(eye: RowSensor, seen: list[_Seen], captures: int) -> Row:
+def _row(sensor: RowSensor, seen: list[_Capture], captures: int) -> Row:
     errors = np.array([one.error for one in seen])
     of_pose = np.array([one.pose for one in seen])
     means = np.array([errors[of_pose == number].mean(axis=0) for number in np.unique(of_pose)])
     points = np.concatenate([one.points for one in seen])
     centres = np.concatenate([one.centres for one in seen], axis=1)
-    noise = eye.sensor.noise
-    rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
+    noise = sensor.sensor.noise
+    rim_grey: Array = np.asarray(noise.mean_grey(np.array(sensor.rim)), dtype=float)
     return {
         "captures": captures,
         "lost_frames": captures - len(seen),

@@ -1,8 +1,9 @@
-"""Rows of kind `tracking`: the plant follows validation trajectories under a law with a model.
+"""Rows of kind `tracking`: a control law that knows a model follows validation trajectories.
 
 For comparison, the plant also follows the same motions under `pid`, with the same noise. The model
-is the initial guess, a model identified from a record of this row, or the true model. It can also
-lie between the truth and the initial guess, or have a relative error in all parameters.
+is the initial guess, a model identified from a record of this row, or the true model. A model
+between the truth and the initial guess is possible as well, and a model with a relative error in
+all parameters.
 """
 
 from dataclasses import replace
@@ -27,12 +28,12 @@ from identify.studies.rows.kind import (
     PICTURES,
     PLANT,
     Column,
+    KeysRead,
     Kind,
-    Reads,
     Row,
 )
 from identify.studies.rows.row_sensor import rms_um
-from identify.tracking.following import Followed
+from identify.tracking.following import TrackingRun
 from identify.tracking.motions import motions
 from identify.tracking.track import follow_by_images, known_model, model_of_result
 
@@ -113,7 +114,7 @@ class TrackingOptions(Section):
     )
 
 
-READS = Reads(
+READS = KeysRead(
     (
         *PICTURES,
         "scenario.robot",
@@ -129,12 +130,12 @@ READS = Reads(
         "scenario.excitation.",
         "scenario.identification.",
     ),
-    idle=(NOISE_OFF, *PLANT),
+    ineffective=(NOISE_OFF, *PLANT),
 )
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
-    """Compute one row. Raises the errors of sensor, identification and laws (LoopFailure)."""
+    """Compute one row. Raises the exceptions of sensor, identification and laws (LoopFailure)."""
     number = stream_seed(seed, EXPERIMENT)
     setup = row_setup(scenario, number)
     plant = setup.plant
@@ -151,7 +152,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     # `motions` also returns a circle and a square, which are not used here.
     unseen = motions(setup.design, number)[: setup.design.unseen.count]
 
-    def followed(law: str, known: KnownModel) -> list[Followed]:
+    def followed(law: str, known: KnownModel) -> list[TrackingRun]:
         return [
             follow_by_images(plant, sensor, law, known, motion, number, k)[0]
             for k, motion in enumerate(unseen)
@@ -185,11 +186,11 @@ def _model(setup: Setup, options: TrackingOptions) -> KnownModel:
     return model_of_result(identify(record, setup.robot, setup.scenario))
 
 
-def _rms(runs: list[Followed], axes: slice) -> float:
+def _rms(runs: list[TrackingRun], axes: slice) -> float:
     return rms_um(np.concatenate([one.errors for one in runs])[:, axes])
 
 
-def _against(done: list[Followed], start: list[Followed], truth: list[Followed]) -> Row:
+def _against(done: list[TrackingRun], start: list[TrackingRun], truth: list[TrackingRun]) -> Row:
     row: Row = {}
     for name, axes, unit in AXES:
         own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
@@ -202,7 +203,7 @@ def _against(done: list[Followed], start: list[Followed], truth: list[Followed])
     return row
 
 
-def _figures(done: list[Followed], beside: list[Followed]) -> Row:
+def _figures(done: list[TrackingRun], beside: list[TrackingRun]) -> Row:
     row: Row = {}
     for name, axes, unit in AXES:
         own, pid = (_rms(runs, axes) for runs in (done, beside))

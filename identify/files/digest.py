@@ -23,12 +23,12 @@ _COMMENT = "# sha256 "
 _REMEDY = ", of all that follows; delete this line to keep a change made by hand"
 
 
-def sealed(content: bytes) -> bytes:
+def with_digest(content: bytes) -> bytes:
     """Return a netCDF file with its digest after its end, where HDF5 ignores it."""
     return content + _TRAILER + _hex(content) + b"\n"
 
 
-def is_sealed(path: Path | str, content: bytes) -> bool:
+def has_digest(path: Path | str, content: bytes) -> bool:
     """Tell whether a netCDF file has a digest.
 
     Raises RecordError if the digest is wrong.
@@ -36,7 +36,7 @@ def is_sealed(path: Path | str, content: bytes) -> bool:
     start = len(content) - len(_TRAILER) - _HEX - 1
     if start < 0 or content[start : start + len(_TRAILER)] != _TRAILER:
         return False
-    if content[start:] != sealed(content[:start])[start:]:
+    if content[start:] != with_digest(content[:start])[start:]:
         raise RecordError(f"{path} is damaged: {_DIFFERS}; write it anew")
     return True
 
@@ -46,15 +46,15 @@ def check_netcdf(path: Path) -> None:
 
     Raises RecordError if the digest is wrong or the file cannot be read.
     """
-    is_sealed(path, _content(path))
+    has_digest(path, _content(path))
 
 
-def sealed_json(entry: Mapping[str, Any]) -> dict[str, Any]:
+def json_with_digest(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a JSON file with its digest as the first entry."""
     return {KEY: _of_json(entry), **entry}
 
 
-def opened_json(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
+def json_without_digest(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a JSON file without its digest.
 
     Raises RecordError if the digest is wrong.
@@ -65,7 +65,7 @@ def opened_json(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
     return held
 
 
-def sealed_toml(text: str) -> str:
+def toml_with_digest(text: str) -> str:
     """Return a TOML file with its digest in a comment of the first line."""
     return f"{_COMMENT}{_hex(text.encode()).decode()}{_REMEDY}\n{text}"
 

@@ -24,7 +24,7 @@ The group is None if it was not requested or does not exist.
 def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
     """Load a group of at most ``most`` bytes of numbers, and the names of all groups.
 
-    Raises the errors of the library, and ValueError if the group is larger.
+    Raises the exceptions of the library, and ValueError if the group is larger.
     """
     names: list[str] = []
     with h5py.File(io.BytesIO(content), "r") as file:
@@ -42,10 +42,10 @@ def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
         return names, dataset.load()
 
 
-def load_elsewhere(content: bytes, group: str | None) -> Content:
+def load_in_process(content: bytes, group: str | None) -> Content:
     """Load as `load` does, but in another process and within limits.
 
-    Raises StrangerError.
+    Raises UntrustedFileError.
     """
     found: Content = within_limits(load, content, group, LIMIT_BYTES)
     return found
