@@ -23,6 +23,7 @@ from dynamics.compiled.operations import (
     constant,
     lanes_for,
     type_name,
+    words_for,
 )
 from dynamics.compiled.quick_arithmetic import quickened
 from dynamics.errors import DynamicsError
@@ -148,12 +149,7 @@ class FunctionBody:
             raise DynamicsError(
                 f"{self._name}: no machine code for the operation {operation}; known: {known}"
             )
-        words = {"double": type_name(width), "i1": type_name(width, "i1")}
-        words |= {
-            name: constant([value] * width)
-            for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))
-        }
-        words["true"] = "true" if width == 1 else f"<{', '.join(['i1 true'] * width)}>"
+        words = words_for(width)
         last = before = ""
         lines = MEANING[operation]
         if operation in OF_TRUTH and operands[0] in self._truth:

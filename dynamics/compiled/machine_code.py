@@ -8,8 +8,10 @@ that are alike are computed in vectors, one lane each (see `lanes`), with the sa
 """
 
 import ctypes
+import gc
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from hashlib import sha256
@@ -84,8 +86,8 @@ def compiled_functions(
     """Compile the functions that `build()` returns, or load them from the cache, by name.
 
     `content` identifies everything that the functions depend on besides this package. `hot` names
-    functions that inner loops evaluate. They are optimised further, and their rounding may differ
-    from CasADi's. Compiling takes some seconds. Raises DynamicsError for an operation that has no
+    functions that inner loops evaluate. They are optimised, and their rounding may differ from
+    CasADi's. Compiling takes some seconds. Raises DynamicsError for an operation that has no
     translation.
     """
     digest = sha256(_package_digest() + content)
@@ -94,36 +96,83 @@ def compiled_functions(
     name = f"{digest.hexdigest()[:24]}.robot"
     compiled = load_object(name)
     if compiled is None:
-        compiled = _compile(build(), hot)
+        with _without_garbage_collection():
+            compiled = _compile(build(), hot)
         save_object(name, compiled)
     return _load(compiled)
 
 
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Suspend the search for unused cycles of objects.
+
+    A graph has a million objects and no cycles. Searching them takes a third of the time in which a
+    function is translated.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
-    """Line of JSON with the shapes of inputs and outputs of each function, then the machine code.
+    """Line of JSON, then the machine code of the hot functions, and that of the others.
+
+    The line has the shapes of inputs and outputs of each function, and the length of the first
+    machine code.
+
+    Optimising takes LLVM ten times as long as translating. Functions that are not hot are only
+    translated. They then take up to twice as long, and their results are the same.
+    """
+    inner = [one for one in functions if one.name() in hot]
+    others = [one for one in functions if one.name() not in hot]
+    codes = [_optimised(inner, hot) if inner else b"", _translated(others) if others else b""]
+    shaped = {function.name(): shapes(function) for function in functions}
+    return json.dumps([shaped, len(codes[0])]).encode() + b"\n" + b"".join(codes)
+
+
+def _optimised(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
+    """Machine code of functions that inner loops evaluate.
 
     LLVM's passes vectorise pairs of equal operations, which makes functions a seventh faster.
     Column functions would become slower: their common values are computed before the loop, and
     there are not enough registers for them.
     """
-    module = llvm.parse_assembly(llvm_text(functions, hot))
-    module.verify()
     machine = _machine()
+    module = _module(llvm_text(functions, hot), machine)
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
+    for one in functions:
+        if not isinstance(one, ColumnFunction):
+            builder.getFunctionPassManager().run(module.get_function(one.name()), builder)
+    return bytes(machine.emit_object(module))
+
+
+def _translated(functions: list[AnyFunction]) -> bytes:
+    """Machine code of functions, with one instruction after the other as they are written."""
+    machine = _machine(level=0)
+    return bytes(machine.emit_object(_module(llvm_text(functions), machine)))
+
+
+def _module(text: str, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+    """LLVM module for a processor."""
+    module = llvm.parse_assembly(text)
+    module.verify()
     module.triple = machine.triple
     module.data_layout = str(machine.target_data)
-    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
-    columns = [function.name() for function in functions if isinstance(function, ColumnFunction)]
-    for name in [name for name in hot if name not in columns]:
-        builder.getFunctionPassManager().run(module.get_function(name), builder)
-    shaped = {function.name(): shapes(function) for function in functions}
-    return json.dumps(shaped).encode() + b"\n" + bytes(machine.emit_object(module))
+    return module
 
 
 def _load(compiled: bytes) -> dict[str, MachineFunction]:
     """Load functions from the bytes that `_compile` returned."""
-    shapes, _, code = compiled.partition(b"\n")
+    line, _, code = compiled.partition(b"\n")
+    shapes, length = json.loads(line)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    for part in (code[:length], code[length:]):
+        if part:
+            engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
     over_rows = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
     return {
@@ -135,12 +184,12 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
             over_rows(engine.get_function_address(f"{name}.rows")),
             engine,
         )
-        for name, (inputs, outputs) in json.loads(shapes).items()
+        for name, (inputs, outputs) in shapes.items()
     }
 
 
-def _machine() -> llvm.TargetMachine:
-    """Description of this processor for LLVM.
+def _machine(level: int = 2) -> llvm.TargetMachine:
+    """Description of this processor for LLVM, with a level of optimisation from 0 to 3.
 
     LLVM fuses and reorders nothing, so that a seed gives the same numbers on every processor.
     """
@@ -148,7 +197,7 @@ def _machine() -> llvm.TargetMachine:
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_triple(llvm.get_process_triple())
     return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=_features(), opt=2, jit=True
+        cpu=llvm.get_host_cpu_name(), features=_features(), opt=level, jit=True
     )
 
 

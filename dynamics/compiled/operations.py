@@ -1,6 +1,7 @@
 """LLVM instructions for CasADi's operations, on numbers and on vectors."""
 
-import numpy as np
+import struct
+from functools import cache
 
 MOST_LANES = 8
 """Number of doubles in the widest register of present processors."""
@@ -81,5 +82,18 @@ def constant(values: list[float]) -> str:
 
     They are written by their bits, because decimals could be rounded.
     """
-    bits = [f"0x{np.float64(value).view(np.uint64):016X}" for value in values]
+    bits = [f"0x{struct.pack('>d', value).hex().upper()}" for value in values]
     return bits[0] if len(bits) == 1 else f"<{', '.join(f'double {one}' for one in bits)}>"
+
+
+@cache
+def words_for(width: int) -> dict[str, str]:
+    """Types and constants in `MEANING`, by name, for vectors of `width` numbers."""
+    return {
+        "double": type_name(width),
+        "i1": type_name(width, "i1"),
+        "zero": constant([0.0] * width),
+        "one": constant([1.0] * width),
+        "minus": constant([-1.0] * width),
+        "true": "true" if width == 1 else f"<{', '.join(['i1 true'] * width)}>",
+    }

@@ -72,7 +72,7 @@ def _with_approximations(graph: Graph) -> Graph:
         operands = tuple(placed[k] for k in node.operands)
         if node.operation not in _approximations():
             placed.append(len(nodes))
-            nodes.append(node._replace(operands=operands))
+            nodes.append(node.of(operands))
             continue
         function, output = _approximations()[node.operation]
         call = function.name(), operands
@@ -90,7 +90,7 @@ def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> l
             placed.append(operands[node.entry[0]])
             continue
         placed.append(len(nodes))
-        nodes.append(node._replace(operands=tuple(placed[k] for k in node.operands)))
+        nodes.append(node.of(tuple(placed[k] for k in node.operands)))
     return [placed[found] for (found,) in function.outputs]
 
 
@@ -115,7 +115,7 @@ def _with_reciprocals(graph: Graph) -> Graph:
             node = Node("MUL")
             operands = (operands[0], inverse)
         placed.append(len(nodes))
-        nodes.append(node._replace(operands=operands))
+        nodes.append(node.of(operands))
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
 
 
@@ -150,7 +150,7 @@ def _fused(graph: Graph) -> Graph:
                 rest = operands[1] if added else put(Node("NEG", operands[1:]))
                 operands = (*factors(node.operands[0]), rest)
                 node = Node("FMA")
-        placed.append(put(node._replace(operands=operands)))
+        placed.append(put(node.of(operands)))
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
 
 
@@ -160,9 +160,7 @@ def _once_each(graph: Graph) -> Graph:
     placed: list[int] = []
     for node in graph.nodes:
         placed.append(
-            nodes.setdefault(
-                node._replace(operands=tuple(placed[k] for k in node.operands)), len(nodes)
-            )
+            nodes.setdefault(node.of(tuple(placed[k] for k in node.operands)), len(nodes))
         )
     return Graph(list(nodes), [[placed[k] for k in of] for of in graph.outputs])
 
