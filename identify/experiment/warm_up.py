@@ -42,7 +42,9 @@ def warm_up(
 ) -> None:
     """Compile the code of the runs of a plant, and of further robots, into the caches on disk.
 
-    Each task has its own process, because LLVM compiles on one core. All cores are used.
+    Each task has its own process, because LLVM compiles on one core. All cores are used. The loop
+    depends on the number of joints, not on the robot. Robots with as many joints as another one
+    wait until that one is compiled, and then find the loop in the cache.
 
     Raises the errors of a run before its first frame, IdentifyError if a process dies, and
     WriteError if code cannot be stored.
@@ -51,9 +53,17 @@ def warm_up(
         "the robot": partial(_compile_plant, plant),
         "the sensor": partial(_compile_sensor, plant, sensor),
     }
-    tasks |= {name: partial(_compile_named, name) for name in robots}
+    first = {len(plant.robot.geometry.legs): "the robot"}
+    after: dict[str, str] = {}
+    for name in robots:
+        tasks[name] = partial(_compile_named, name)
+        joints = len(load_robot(name).geometry.legs)
+        if joints in first:
+            after[name] = first[joints]
+        else:
+            first[joints] = name
     with progress.stage("compile", len(tasks)) as advance:
-        _side_by_side(tasks, advance)
+        _side_by_side(tasks, after, advance)
 
 
 def _compile_plant(plant: Plant) -> None:
@@ -76,8 +86,13 @@ def _compile_named(name: str) -> None:
     compile_robots((load_robot(name),), SilentProgress())
 
 
-def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
-    """Run named tasks, each in a new process, with one process per core at a time."""
+def _side_by_side(
+    tasks: dict[str, Task], after: dict[str, str], advance: Callable[[], None]
+) -> None:
+    """Run named tasks, each in a new process, with one process per core at a time.
+
+    A task that is a key of `after` begins when the task that is named there has ended.
+    """
     spawn = get_context("spawn")
     unkept = spawn.SimpleQueue()
     waiting = [
@@ -87,11 +102,14 @@ def _side_by_side(tasks: dict[str, Task], advance: Callable[[], None]) -> None:
     running: list[SpawnProcess] = []
     try:
         while waiting or running:
-            while waiting and len(running) < cores():
-                running.append(waiting.pop(0))
+            unfinished = {process.name for process in waiting + running}
+            ready = [one for one in waiting if after.get(one.name) not in unfinished]
+            for process in ready[: cores() - len(running)]:
+                waiting.remove(process)
+                running.append(process)
                 # Only this process gets Ctrl-C, and then kills the others.
                 with shield_children():
-                    running[-1].start()
+                    process.start()
             wait([process.sentinel for process in running])
             for process in [one for one in running if one.exitcode is not None]:
                 running.remove(process)
