@@ -9,7 +9,6 @@ import numpy as np
 from dynamics.checks import floats
 from dynamics.geometry import RobotGeometry
 from dynamics.legs.leg import Segment
-from dynamics.parameters import parameter_layout
 from dynamics.robot import Robot
 from dynamics.robot_platform import CHART_TOLERANCE
 
@@ -85,7 +84,7 @@ class Parts:
     """Parts of all legs of a geometry, leg by leg, each from the base on."""
 
     def __init__(self, geometry: RobotGeometry) -> None:
-        layout = parameter_layout(geometry.legs)
+        layout = geometry.layout
         self.all: list[Part] = []
         rows: list[int] = []
         first = 0

@@ -212,6 +212,8 @@ def within(quantity: Any) -> Within:
 Mass = Annotated[float, Within(1e-12, 1e6, "kg", zero=True)]
 """Range from a grain of silicon to a thousand tonnes."""
 Inertia = Annotated[float, Within(1e-24, 1e9, "kg m^2", zero=True)]
+FirstMoment = Annotated[float, Within(-1e9, 1e9, "kg m")]
+Product = Annotated[float, Within(-1e9, 1e9, "kg m^2")]
 Length = Annotated[float, Within(1e-6, 1e3, "m")]
 Place = Annotated[float, Within(-1e3, 1e3, "m or rad")]
 """Coordinate of a point, or an angle."""

@@ -15,6 +15,7 @@ from dynamics.errors import RobotFileError
 from dynamics.kinematics.platform import FREEDOMS, Chart, base_from_platform
 from dynamics.legs.geometric_numbers import POINTS, deviations, moved, unit_of, values
 from dynamics.legs.leg import Leg
+from dynamics.parameters import ParameterLayout, parameter_layout
 
 SAME_PLACE = 1e-6
 """Distance, m, below which joints of two legs coincide."""
@@ -26,7 +27,9 @@ class RobotGeometry:
 
     `travel_limit` is the largest magnitude of a joint coordinate, rad or m. `gravity` (3,) is in
     m/s^2. Lengths are in m, and vectors are in the axes of the base unless stated otherwise. Legs
-    are assembled: the branch of each leg's inverse kinematics at home is selected.
+    are assembled: the branch of each leg's inverse kinematics at home is selected. `full_bodies`
+    are the names of the bodies with ten inertial parameters instead of four (see
+    `parameters.parameter_layout`).
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -36,6 +39,7 @@ class RobotGeometry:
     chart: Chart
     travel_limit: float
     gravity: np.ndarray
+    full_bodies: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         gravity = np.array(self.gravity, dtype=float)
@@ -56,6 +60,8 @@ class RobotGeometry:
         object.__setattr__(
             self, "legs", tuple(leg.assembled(at, k + 1) for k, (leg, at) in enumerate(at_home))
         )
+        # raises ParameterError for the name of a full body that there is not
+        self.layout  # noqa: B018
 
     @property
     def home_pose(self) -> np.ndarray:
@@ -72,6 +78,11 @@ class RobotGeometry:
         """Platform joints A (legs, 3), in the axes of the platform, m."""
         return np.array([leg.platform_joint for leg in self.legs])
 
+    @cached_property
+    def layout(self) -> ParameterLayout:
+        """Dynamic parameters of a robot with this geometry."""
+        return parameter_layout(self.legs, self.full_bodies)
+
     @property
     def prismatic(self) -> bool:
         """True if the actuators slide, False if they rotate."""
@@ -81,6 +92,8 @@ class RobotGeometry:
     def digest(self) -> bytes:
         """Digest of all numbers except the travel limit, for caches."""
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
+        if any(self.layout.full):
+            content.update(repr(self.layout.full).encode())
         for leg in self.legs:
             content.update(repr([(name, _plain(value)) for name, value in leg]).encode())
         return content.digest()
@@ -105,6 +118,19 @@ class RobotGeometry:
         It is the RMS distance of the joints A from the origin of the platform.
         """
         return float(np.sqrt(np.mean(np.sum(self.platform_joints**2, axis=1))))
+
+    @property
+    def body_lengths(self) -> np.ndarray:
+        """Length (bodies,), m, of each body in the order of the layout.
+
+        It is the characteristic length for the platform, and the length of the rod that draws it
+        for a body of a leg.
+        """
+        found = np.full(len(self.layout.bodies), self.characteristic_length)
+        for leg, of_leg in zip(self.legs, self.layout.of_leg, strict=True):
+            for body, segment in zip(of_leg, leg.segments(), strict=True):
+                found[body] = np.linalg.norm(segment.rod[1] - segment.rod[0])
+        return found
 
     def joints_at(self, pose: np.ndarray) -> np.ndarray:
         """Platform joints A (legs, 3) at a pose (6,), in the axes of the base, m."""
@@ -265,6 +291,11 @@ class MovableGeometry:
     def platform_joints(self) -> list[ca.SX]:
         """Platform joint A (3,) of each leg, in the axes of the platform, m."""
         return [ca.SX(leg.platform_joint) for leg in self.legs]
+
+    @property
+    def layout(self) -> ParameterLayout:
+        """Layout of the nominal geometry."""
+        return self.nominal.layout
 
     @property
     def chart(self) -> Chart:

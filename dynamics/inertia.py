@@ -12,21 +12,23 @@ changes them as little as possible. If it can, it changes only values without ef
 - If all three moments do work, as on the platform, they are changed to the nearest valid moments in
   the least-squares sense.
 
+A full body keeps its mass and its centre of mass. The second moments of its mass are changed to the
+nearest positive ones.
+
 `acceleration_changes` measures the effect on the motion of the robot at random states.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dynamics.errors import ParameterError
 from dynamics.legs.leg import Body
-from dynamics.parameters import ParameterLayout
+from dynamics.parameters import CENTRED, ParameterLayout
+from dynamics.pseudo_inertia import body_fault, nearest_body
 from dynamics.robot import Robot
+from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
 from dynamics.workspace import measure
-
-MOMENTS = ("Ixx", "Iyy", "Izz")
 
 # Smallest mass and inertia. Engines refuse a moving body without them; MuJoCo's limit is 1e-15.
 SMALLEST = 1e-12
@@ -42,7 +44,7 @@ class UnphysicalInertiaError(ParameterError):
 
 @dataclass(frozen=True)
 class BodyInertias:
-    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4).
+    """Inertial parameters (bodies, 10) of each body as a full body.
 
     `changes` describes the changes by body. It is empty if nothing was changed.
     """
@@ -63,7 +65,7 @@ def physical_inertias(
     broken = {
         body: fault
         for body, row in zip(layout.bodies, given, strict=True)
-        if (fault := _fault(row))
+        if (fault := body_fault(row, SMALLEST))
     }
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
@@ -75,27 +77,13 @@ def physical_inertias(
     changes = dict[str, str]()
     for index, body in enumerate(layout.bodies):
         if body in broken:
-            values[index] = _repaired(layout.kinds[index], given[index])
+            if layout.full[index]:
+                values[index] = nearest_body(given[index], 2 * SMALLEST)
+            else:
+                kind = layout.kinds[index]
+                values[index, CENTRED] = _repaired(kind, given[index, CENTRED])
             changes[body] = _difference(given[index], values[index])
     return BodyInertias(values, changes)
-
-
-def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
-    """Text on a principal moment that exceeds the sum of the other two.
-
-    It may exceed the sum by the share `rounding`. The text is empty if a rigid body can have the
-    moments.
-    """
-    largest = max(moments, key=moments.__getitem__)
-    others = [name for name in moments if name != largest]
-    # sums of two of the largest floats overflow
-    halves = sum(moments[name] / 2 for name in others)
-    if moments[largest] / 2 <= (1 + rounding) * halves:
-        return ""
-    return (
-        f"{largest} {moments[largest]:g} > "
-        f"{' + '.join(f'{name} {moments[name]:g}' for name in others)}"
-    )
 
 
 def grouped(texts: dict[str, str]) -> list[str]:
@@ -108,16 +96,8 @@ def grouped(texts: dict[str, str]) -> list[str]:
     return [f"{', '.join(names)}: {text}" for text, names in bodies.items()]
 
 
-def _fault(row: np.ndarray) -> str:
-    """Text on the fault in the mass and moments (4,) of a body. It is empty without a fault."""
-    for name, value in zip(("mass", *MOMENTS), row, strict=True):
-        if value < SMALLEST:
-            return f"{name} = {value:g} is below {SMALLEST:g}"
-    return moments_fault(dict(zip(MOMENTS, row[1:].tolist(), strict=True)))
-
-
 def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
-    """Mass and moments of a body, changed as little as possible."""
+    """Mass and moments (4,) of a centred body, changed as little as possible."""
     mass = max(row[0], SMALLEST)
     # sums of three of the largest floats overflow
     moments = np.maximum(row[1:], SMALLEST) / 4
@@ -160,7 +140,7 @@ def _nearest_moments(moments: np.ndarray) -> np.ndarray:
 
 def _difference(before: np.ndarray, after: np.ndarray) -> str:
     """Text on the values that were changed."""
-    named = zip(("mass", *MOMENTS), before, after, strict=True)
+    named = zip(FULL_INERTIAL, before, after, strict=True)
     return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
 
 
@@ -177,7 +157,7 @@ def acceleration_changes(
 ) -> dict[str, float]:
     """Largest |change| / |acceleration| of forward dynamics for each changed body.
 
-    `inertias` (bodies, 4) are masses and moments in the order of the layout. Bodies with the same
+    `inertias` (bodies, 10) are full bodies in the order of the layout. Bodies with the same
     values in the parameters (p,) are omitted. Linear and angular accelerations are compared
     separately, over the states of `travel_states`. Raises ParameterError for parameters outside
     their range.
@@ -189,7 +169,8 @@ def acceleration_changes(
     effects = {}
     for index, body in enumerate(layout.bodies):
         other = own.copy()
-        layout.bodies_of(other)[index] = inertias[index]
+        rows = layout.body_slices[index]
+        other[rows] = layout.rigid_of(inertias)[rows]
         if not np.array_equal(other, own):
             change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
             # sizes are zero if the platform cannot rotate

@@ -12,11 +12,19 @@ from numpy.typing import ArrayLike
 
 from dynamics.checks import Shape, floats
 from dynamics.errors import ParameterError
-from dynamics.legs.leg import INERTIAL, Body, Leg
+from dynamics.legs.leg import Body, Leg
+from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL, INERTIAL, MOMENTS, PRODUCTS
 
-PLATFORM = Body("platform", ("Ixx", "Iyy", "Izz"))
+PLATFORM = Body("platform", MOMENTS)
 JOINT_PID = ("lp", "li", "ld")
 
+
+SIGNED = (*FIRST_MOMENTS, *PRODUCTS)
+"""Inertial parameters that may be negative."""
+
+ALL_TEN = list(range(len(FULL_INERTIAL)))
+CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
+"""Places of the parameters of a centred body among those of a full body."""
 
 LANES = 8
 """Number of derivatives that are computed at once."""
@@ -60,13 +68,16 @@ class ParameterLayout:
     """Parameters of a robot: of its bodies, of joint friction, and of the joint PID.
 
     `bodies` are the names of all bodies, the platform first, and `kinds` are their kinds. `of_leg`
-    are the indices of the bodies of each leg. `prismatic` is True if the actuators slide.
+    are the indices of the bodies of each leg. `prismatic` is True if the actuators slide. `full` is
+    True for each body with ten inertial parameters, and False for each centred body, which has
+    four.
     """
 
     bodies: tuple[str, ...]
     kinds: tuple[Body, ...]
     of_leg: tuple[tuple[int, ...], ...]
     prismatic: bool
+    full: tuple[bool, ...]
 
     @property
     def joints(self) -> int:
@@ -80,8 +91,20 @@ class ParameterLayout:
 
     @cached_property
     def rigid_names(self) -> tuple[str, ...]:
-        """Names of the inertial parameters: mass and moments, body by body."""
-        return tuple(f"{body}.{name}" for body in self.bodies for name in INERTIAL)
+        """Names of the inertial parameters, body by body."""
+        return tuple(
+            f"{body}.{name}"
+            for body, full in zip(self.bodies, self.full, strict=True)
+            for name in (FULL_INERTIAL if full else INERTIAL)
+        )
+
+    @cached_property
+    def signed(self) -> np.ndarray:
+        """True for each dynamic parameter (p,) that may be negative.
+
+        These are the first moments and the products of inertia.
+        """
+        return np.isin([name.split(".")[1] for name in self.dynamic_names], SIGNED)
 
     @cached_property
     def coulomb_names(self) -> tuple[str, ...]:
@@ -137,17 +160,47 @@ class ParameterLayout:
         """Slice of the gains of the joint PID."""
         return slice(self.viscous.stop, self.viscous.stop + len(JOINT_PID))
 
-    def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
-        """View of the inertial parameters with one row (mass, Ixx, Iyy, Izz) per body."""
-        return rigid[..., self.rigid].reshape(*rigid.shape[:-1], len(self.bodies), len(INERTIAL))
+    @property
+    def full_bodies(self) -> tuple[str, ...]:
+        """Names of the bodies with ten inertial parameters."""
+        return tuple(body for body, full in zip(self.bodies, self.full, strict=True) if full)
 
-    def leg_rows(self, leg: int) -> list[int]:
-        """Indices of the inertial parameters of a leg's bodies, one body after the other."""
-        return [
-            len(INERTIAL) * body + entry
-            for body in self.of_leg[leg]
-            for entry in range(len(INERTIAL))
+    @cached_property
+    def body_slices(self) -> tuple[slice, ...]:
+        """Slice of the inertial parameters of each body."""
+        counts = [len(FULL_INERTIAL) if full else len(INERTIAL) for full in self.full]
+        ends = np.cumsum(counts).tolist()
+        return tuple(slice(end - count, end) for end, count in zip(ends, counts, strict=True))
+
+    def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
+        """Inertial parameters (..., bodies, 10) of all bodies as full bodies."""
+        found = np.zeros((*rigid.shape[:-1], len(self.bodies), len(FULL_INERTIAL)))
+        for body, own in enumerate(self.body_slices):
+            found[..., body, ALL_TEN if self.full[body] else CENTRED] = rigid[..., own]
+        return found
+
+    def rigid_of(self, bodies: np.ndarray) -> np.ndarray:
+        """Inertial parameters (..., r) of full bodies (..., bodies, 10).
+
+        This is the inverse of `bodies_of`. The first moments and products of inertia of centred
+        bodies are left out.
+        """
+        rows = [
+            bodies[..., body, ALL_TEN if full else CENTRED] for body, full in enumerate(self.full)
         ]
+        return np.concatenate(rows, axis=-1)
+
+    def converted(self, dynamic: np.ndarray, other: "ParameterLayout") -> np.ndarray:
+        """Dynamic parameters (..., p) in the layout of the same robot with other full bodies.
+
+        New parameters of full bodies are zero.
+        """
+        rigid = other.rigid_of(self.bodies_of(dynamic))
+        return np.concatenate([rigid, dynamic[..., self.rigid.stop : self.dynamic.stop]], axis=-1)
+
+    def leg_slices(self, leg: int) -> list[slice]:
+        """Slice of the inertial parameters of each body of a leg."""
+        return [self.body_slices[body] for body in self.of_leg[leg]]
 
     @property
     def joint_unit(self) -> str:
@@ -176,32 +229,36 @@ class ParameterLayout:
         """Dynamic parameters as floats (p,), or (N, p) if `batch` is True.
 
         Raises ParameterError for a wrong shape, for a value that is NaN, infinite or negative, and
-        for a platform without mass. The message has the parameter with its value, unit and limit,
-        and its row in a batch.
+        for a platform without mass. First moments and products of inertia may be negative. The
+        message has the parameter with its value, unit and limit, and its row in a batch.
         """
         count = len(self.dynamic_names)
         shapes: list[Shape] = [(count,), ("N", count)]
         parameters = floats(
             "parameters", values, *shapes[: 1 + batch], error=ParameterError, finite=False
         )
-        allowed = (parameters >= 0) & (parameters < np.inf)
+        allowed = (self.signed | (parameters >= 0)) & (np.abs(parameters) < np.inf)
         allowed[..., 0] &= parameters[..., 0] > 0
         if allowed.all():
             return parameters
         place = tuple(int(index) for index in np.argwhere(~allowed)[0])
         name = self.dynamic_names[place[-1]]
-        limit = ">= 0" if place[-1] else "> 0"
+        limit = " and > 0" if not place[-1] else "" if self.signed[place[-1]] else " and >= 0"
         where = f" (row {place[0]})" if len(place) > 1 else ""
         raise ParameterError(
-            f"{name} = {parameters[place]:g} {self.unit(name)} is not allowed, must be finite and "
+            f"{name} = {parameters[place]:g} {self.unit(name)} is not allowed, must be finite"
             f"{limit}{where}"
         )
 
 
-def parameter_layout(legs: Sequence[Leg]) -> ParameterLayout:
+def parameter_layout(legs: Sequence[Leg], full: Sequence[str] = ()) -> ParameterLayout:
     """Layout of a robot with these legs.
 
-    The platform is first. The first bodies of all legs follow, and then their second bodies.
+    The platform is first. The first bodies of all legs follow, and then their second bodies. `full`
+    are the names of the bodies or kinds of bodies with ten inertial parameters, such as link2 or
+    link, or "all".
+
+    Raises ParameterError, with the valid names, for an unknown name.
     """
     found: list[tuple[int, Body]] = []
     for place in range(max(len(leg.bodies) for leg in legs)):
@@ -214,14 +271,32 @@ def parameter_layout(legs: Sequence[Leg]) -> ParameterLayout:
         tuple(1 + k for k, (owner, _) in enumerate(found) if owner == number)
         for number in range(len(legs))
     ]
-    names = tuple(f"{body.name}{number + 1}" for number, body in found)
-    kinds = tuple(body for _, body in found)
+    names = ("platform", *(f"{body.name}{number + 1}" for number, body in found))
+    kinds = (PLATFORM, *(body for _, body in found))
+    valid = {"all", *names, *(kind.name for kind in kinds)}
+    if unknown := [name for name in full if name not in valid]:
+        raise ParameterError(
+            f"there is no body {unknown[0]!r}; valid: all, "
+            f"{', '.join(dict.fromkeys(kind.name for kind in kinds))}, or a body such as "
+            f"{names[-1]}"
+        )
     return ParameterLayout(
-        ("platform", *names), (PLATFORM, *kinds), tuple(of_leg), legs[0].prismatic
+        names,
+        kinds,
+        tuple(of_leg),
+        legs[0].prismatic,
+        tuple(
+            bool({"all", name, kind.name} & set(full))
+            for name, kind in zip(names, kinds, strict=True)
+        ),
     )
 
 
-UNITS = {"mass": "kg", "Ixx": "kg m^2", "Iyy": "kg m^2", "Izz": "kg m^2"}
+UNITS = (
+    {"mass": "kg"}
+    | dict.fromkeys(FIRST_MOMENTS, "kg m")
+    | dict.fromkeys((*MOMENTS, *PRODUCTS), "kg m^2")
+)
 REVOLUTE = {
     "coulomb": "N m",
     "viscous": "N m s/rad",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from numpy.typing import ArrayLike
 from dynamics.checks import check_choice, check_type, floats, shown
 from dynamics.errors import DynamicsError, RobotFileError, ShapeError, SingularPoseError
 from dynamics.geometry import RobotGeometry
+from dynamics.parameter_set import ParameterSet
 from dynamics.robot_dynamics import RobotDynamics
-from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
+from dynamics.robot_file import RobotDescription, read_robot_file
 from dynamics.robot_functions import CASADI, casadi_function
 
 StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -197,6 +199,45 @@ class Robot(RobotDynamics):
         dynamic = self.layout.check(values[:count])
         sets = {"initial": ParameterSet(dynamic, values[count:])}
         return Robot(RobotDescription(self.name, self.geometry, sets), self.functions_of)
+
+    def with_full_bodies(self, names: Sequence[str]) -> Robot:
+        """Robot whose named bodies are full bodies, with ten inertial parameters each.
+
+        All other bodies are centred, with four. A body that becomes a full body moves as before,
+        because its new parameters are zero. A body that becomes centred loses its first moments
+        and products of inertia.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of bodies such as "link3", of kinds of bodies such as "link", or "all".
+
+        Returns
+        -------
+        Robot
+            The other robot, or this robot if nothing changes.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such body. The message lists the valid names.
+
+        Examples
+        --------
+        >>> robot.with_full_bodies(["platform"]).parameter_names[:4]
+        ('platform.mass', 'platform.mcx', 'platform.mcy', 'platform.mcz')
+        """
+        geometry = replace(self.geometry, full_bodies=tuple(names))
+        if geometry.layout == self.layout:
+            return self
+        sets = {
+            name: ParameterSet(
+                self.layout.converted(given.dynamic, geometry.layout), given.joint_pid
+            )
+            for name, given in self.parameter_sets.items()
+        }
+        nominal = replace(self.functions_of, full_bodies=tuple(names))
+        return Robot(RobotDescription(self.name, geometry, sets), nominal)
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
         """Robot with another geometry with the same kinds of legs. It has its own functions.

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from dynamics.checks import Acceleration, Damping, Force, Gain, Inertia, Mass, Place, Travel, shown
+from dynamics.checks import Acceleration, Place, Travel, shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.files import Name, check_name, is_file, parse_toml, read_text
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
-from dynamics.legs.leg import INERTIAL
-from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
+from dynamics.parameter_set import Parameters, ParameterSet, Strict, parameter_set
 
 MOST_COMPLAINTS = 24
 """Largest number of faults in a message: four for each of six legs."""
@@ -41,66 +40,7 @@ FAMILIES = {
 }
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _know_every_key(cls, values: object) -> object:
-        unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
-        if unknown:
-            raise ValueError(
-                f"unknown key {', '.join(unknown)}; valid: {', '.join(cls.model_fields)}"
-            )
-        return values
-
-
-class BodyInertia(_Strict):
-    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2.
-
-    Each is one value, or a list with one value per leg.
-    """
-
-    mass: Mass | list[Mass]
-    Ixx: Inertia | list[Inertia]
-    Iyy: Inertia | list[Inertia]
-    Izz: Inertia | list[Inertia]
-
-
-class Friction(_Strict):
-    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints.
-
-    Each is one value, or a list with one value per leg.
-    """
-
-    coulomb: Force | list[Force]
-    viscous: Damping | list[Damping]
-
-
-class JointPid(_Strict):
-    """Gains of the joint PID, which all joints share.
-
-    `unit` is the unit of lp. It must be stated if the actuators slide.
-    """
-
-    lp: Gain
-    li: Gain
-    ld: Gain
-    unit: Literal["N m/rad", "N/m"] | None = None
-
-
-class Parameters(BaseModel):
-    """Set of parameters: platform, joints, gains, and a table for each kind of leg body."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-    __pydantic_extra__: dict[str, BodyInertia] = Field(init=False)
-
-    platform: BodyInertia
-    joint: Friction
-    joint_pid: JointPid
-
-
-class RobotFile(_Strict):
+class RobotFile(Strict):
     """A parallel robot. Lengths are in m, angles in rad, masses in kg.
 
     A pose is [x y z alpha beta gamma].
@@ -119,6 +59,11 @@ class RobotFile(_Strict):
     travel_limit: Travel = Field(description="largest magnitude of a joint coordinate, rad or m")
     gravity: list[Acceleration] = Field(
         [0.0, 0.0, -9.81], min_length=3, max_length=3, description="m/s^2, base axes"
+    )
+    inertia: Literal["centred", "full"] | dict[str, Literal["centred", "full"]] = Field(
+        "centred",
+        description="full: bodies have ten inertial parameters instead of four; for all bodies, or "
+        'a table by body or kind of body, such as { platform = "full", link3 = "full" }',
     )
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
         description="a table for each leg; with a family also a single table, in which each key "
@@ -212,22 +157,6 @@ def _plural(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class ParameterSet:
-    """Named parameter set.
-
-    `dynamic` (p,) is in the order of `Robot.parameter_names`, and `joint_pid` (3,) has lp, li, ld.
-    """
-
-    dynamic: np.ndarray
-    joint_pid: np.ndarray
-
-    @property
-    def vector(self) -> np.ndarray:
-        """All values: the dynamic parameters, then lp, li, ld."""
-        return np.concatenate([self.dynamic, self.joint_pid])
-
-
-@dataclass(frozen=True)
 class RobotDescription:
     """Content of a robot file: name, geometry and parameter sets."""
 
@@ -289,9 +218,8 @@ def parsed_robot(text: str, source: str) -> RobotDescription:
         raise RobotFileError(f"{source}: {_one_line(error)}") from error
     try:
         geometry = _geometry(content)
-        layout = parameter_layout(geometry.legs)
         sets = {
-            name: _parameter_set(name, values, layout)
+            name: parameter_set(name, values, geometry.layout)
             for name, values in content.parameters.items()
         }
     except DynamicsError as error:
@@ -309,8 +237,10 @@ def _geometry(content: RobotFile) -> RobotGeometry:
     if content.chart not in FREEDOMS:
         raise RobotFileError(f"unknown chart `{content.chart}`; valid: {', '.join(FREEDOMS)}")
     chart = Chart(content.chart, tuple(content.home_pose))
+    forms = {"all": content.inertia} if isinstance(content.inertia, str) else content.inertia
+    full = tuple(name for name, form in forms.items() if form == "full")
     return RobotGeometry(
-        tuple(content.legs), chart, content.travel_limit, np.array(content.gravity)
+        tuple(content.legs), chart, content.travel_limit, np.array(content.gravity), full
     )
 
 
@@ -351,47 +281,3 @@ def _one_line(error: ValidationError) -> str:
     lines = [": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items()]
     more = len(found) - MOST_COMPLAINTS
     return "; ".join(lines + ([f"and {more} more"] if more > 0 else []))
-
-
-def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
-
-    def per_leg(key: str, value: float | list[float], count: int) -> list[float]:
-        expanded = value if isinstance(value, list) else [value] * count
-        if len(expanded) != count:
-            raise RobotFileError(
-                f"parameters.{name}.{key} needs one value or {count} values, got {len(expanded)}"
-            )
-        return expanded
-
-    kinds = [kind.name for kind in layout.kinds]
-    given = {"platform": values.platform, **(values.model_extra or {})}
-    if set(given) != set(kinds):
-        wrong = sorted(set(given) ^ set(kinds))
-        valid = ", ".join([*dict.fromkeys(kinds), "joint", "joint_pid"])
-        raise RobotFileError(
-            f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}"
-        )
-    rigid = np.empty((len(kinds), len(INERTIAL)))
-    for kind, inertia in given.items():
-        rows = [row for row, name_of in enumerate(kinds) if name_of == kind]
-        rigid[rows] = np.transpose(
-            [per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()]
-        )
-    friction = [
-        per_leg(f"joint.{key}", value, layout.joints)
-        for key, value in values.joint.model_dump().items()
-    ]
-    dynamic = layout.check(np.concatenate([rigid.ravel(), *friction]))
-    stated = values.joint_pid.unit
-    unit = layout.unit("joint_pid.lp")
-    if stated != unit and (stated or layout.prismatic):
-        raise RobotFileError(
-            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} "
-            f"{f'is in {stated}' if stated else 'has no unit'}, but the actuators "
-            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which is "
-            f'stated by unit = "{unit}" in joint_pid'
-        )
-    joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
-    for array in (dynamic, joint_pid):
-        array.setflags(write=False)
-    return ParameterSet(dynamic, joint_pid)

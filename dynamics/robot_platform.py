@@ -16,8 +16,8 @@ from dynamics.errors import (
 )
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import POSE_NAMES
-from dynamics.parameters import parameter_layout
-from dynamics.robot_file import ParameterSet, RobotDescription
+from dynamics.parameter_set import ParameterSet
+from dynamics.robot_file import RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions
 
 # With a larger condition number, all digits are lost. Usual robots have about 1e2.
@@ -42,7 +42,7 @@ class RobotPlatform:
         # robots made by `moved` share the functions of the nominal geometry
         self.functions_of = nominal or description.geometry
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
-        self.layout = parameter_layout(self.geometry.legs)
+        self.layout = self.geometry.layout
         self.parameter_names = self.layout.dynamic_names
         self.nominal_parameters = description.parameter_sets["initial"].dynamic
 

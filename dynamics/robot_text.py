@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dynamics.legs.leg import INERTIAL, Leg
-from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
-from dynamics.robot_file import ParameterSet, RobotDescription
+from dynamics.legs.leg import Leg
+from dynamics.parameter_set import ParameterSet
+from dynamics.parameters import JOINT_PID, ParameterLayout
+from dynamics.robot_file import RobotDescription
+from dynamics.spatial_inertia import FULL_INERTIAL, INERTIAL
 
 
 def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
@@ -17,7 +19,7 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     Reading it gives the same robot, to the last digit.
     """
     geometry = robot.geometry
-    layout = parameter_layout(robot.geometry.legs)
+    layout = robot.geometry.layout
     turning = "m and N" if layout.prismatic else "rad and N m"
     lines = [f"# {' '.join(comment.split())}" for comment in comments]
     lines += [
@@ -30,6 +32,9 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
         f"travel_limit = {_value(geometry.travel_limit)}",
     ]
     lines += [f"gravity = {_value(geometry.gravity)}"]
+    if any(layout.full):
+        table = ", ".join(f'{body} = "full"' for body in layout.full_bodies)
+        lines += ['inertia = "full"' if all(layout.full) else f"inertia = {{ {table} }}"]
     for number, leg in enumerate(geometry.legs, 1):
         lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
     for name, values in robot.parameter_sets.items():
@@ -50,8 +55,10 @@ def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
     kinds = [kind.name for kind in layout.kinds]
     lines = []
     for kind in dict.fromkeys(kinds):
-        rows = bodies[[row for row, name in enumerate(kinds) if name == kind]]
-        lines.append(_table(kind, {name: rows[:, entry] for entry, name in enumerate(INERTIAL)}))
+        own = [row for row, name in enumerate(kinds) if name == kind]
+        names = FULL_INERTIAL if any(layout.full[row] for row in own) else INERTIAL
+        columns = {name: bodies[own, FULL_INERTIAL.index(name)] for name in names}
+        lines.append(_table(kind, columns))
     friction = {
         "coulomb": values.dynamic[layout.coulomb],
         "viscous": values.dynamic[layout.viscous],

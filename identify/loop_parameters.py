@@ -94,6 +94,33 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
     return getattr(section, own)
 
 
+def in_form(robot: Robot, side: Plant | Model) -> Robot:
+    """Return the robot with the full and centred bodies that the plant or the model states.
+
+    Bodies that it does not name stay as they are. Raises ScenarioError, with the valid names, for a
+    body that the robot does not have.
+    """
+    if side.inertia is None:
+        return robot
+    layout = robot.layout
+    kinds = [kind.name for kind in layout.kinds]
+    stated = dict.fromkeys(kinds, side.inertia) if isinstance(side.inertia, str) else side.inertia
+    for name in stated:
+        if name not in (*kinds, *layout.bodies):
+            valid = ", ".join(dict.fromkeys(kinds))
+            raise ScenarioError(
+                f"{type(side).__name__.lower()}.inertia names {name!r}; {robot.name} has {valid}, "
+                f"or single bodies such as {layout.bodies[-1]}"
+            )
+    forms = [
+        stated.get(body, stated.get(kind, "full" if full else "centred"))
+        for body, kind, full in zip(layout.bodies, kinds, layout.full, strict=True)
+    ]
+    return robot.with_full_bodies(
+        [body for body, form in zip(layout.bodies, forms, strict=True) if form == "full"]
+    )
+
+
 @dataclass(frozen=True)
 class ParameterChoice:
     """Dynamic parameters (p,) [SI], and a text that names their source."""

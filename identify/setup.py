@@ -25,19 +25,13 @@ from identify.estimation.result import IdentificationResult
 from identify.excitation.constraints import MotionConstraints
 from identify.excitation.criteria import criterion_of
 from identify.excitation.design import Design, design_trajectories
-from identify.experiment.plant import (
-    KnownLoop,
-    Plant,
-    RunSettings,
-    true_parameters,
-    true_robot,
-    with_springs,
-)
+from identify.experiment.plant import KnownLoop, Plant, RunSettings, with_springs
 from identify.experiment.run import excitation_run
 from identify.experiment.sensor_in_loop import SensorPlan, teach
+from identify.experiment.true_robot import true_parameters, true_robot, with_true_bodies
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
-from identify.loop_parameters import loop_settings
+from identify.loop_parameters import in_form, loop_settings
 from identify.model.from_record import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
@@ -110,8 +104,8 @@ class Setup:
 
     @cached_property
     def nominal(self) -> Robot:
-        """The robot as its file describes it."""
-        return self.loaded or load_robot(self.scenario.robot)
+        """The robot as its file describes it, with full and centred bodies as in the model."""
+        return in_form(self.loaded or load_robot(self.scenario.robot), self.scenario.model)
 
     @cached_property
     def known(self) -> KnownGeometry:
@@ -137,11 +131,13 @@ class Setup:
         control = scenario.control
         settings = loop_settings(self.nominal, scenario.servo, timing, control, switches)
         identification = scenario.identification
+        robot = true_robot(self.nominal, switches, scenario.geometry, self.known, self.seed)
+        robot = with_true_bodies(robot, self.loaded or load_robot(scenario.robot), switches)
         return Plant(
             nominal=self.robot,
             settings=with_springs(settings, self.nominal, switches),
-            robot=true_robot(self.nominal, switches, scenario.geometry, self.known, self.seed),
-            parameters=true_parameters(self.nominal, switches),
+            robot=robot,
+            parameters=true_parameters(robot, switches),
             switches=switches,
             loop=KnownLoop(
                 side=self.side,

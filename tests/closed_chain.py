@@ -103,6 +103,21 @@ PARTS = {
 }
 
 
+def about_joint(point):
+    """Matrix (10, 10) from our inertial parameters about a point to those of Pinocchio about the
+    origin: m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+    """
+    rows = []
+    for mass, *first, xx, yy, zz, xy, xz, yz in np.eye(10):
+        first = np.array(first)
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        tensor += mass * (point @ point * SAME - np.outer(point, point))
+        tensor += 2 * point @ first * SAME - np.outer(point, first) - np.outer(first, point)
+        x, y, z = tensor
+        rows.append([mass, *(first + mass * point), x[0], x[1], y[1], x[2], y[2], z[2]])
+    return np.transpose(rows)
+
+
 def link_motion(axis, link, rate, spins):
     """Axes and angular velocity of a link: x is normal to a standing axis; about this and about x
     it turns, or, where it hangs on a ball, as it does without spin."""
@@ -153,6 +168,7 @@ class ClosedChain:
         self._bodies, layout = robot.layout.bodies_of(values), robot.layout
         platform = self._body(0, pin.JointModelFreeFlyer, pin.SE3.Identity(), self._bodies[0], NONE)
         self.legs, self.loops = [], pin.StdVec_RigidConstraintModel()
+        self._places = [(platform, 0, 1.0, NONE)]
         for leg, own in zip(robot.geometry.legs, layout.of_leg, strict=True):
             self._leg(leg, own, platform)
         self.data, self.loop_data = self.model.createData(), pin.StdVec_RigidConstraintData()
@@ -163,9 +179,10 @@ class ClosedChain:
             pin.computeJointMinimalOrdering(self.model, self.data, self.loops)
 
     def _body(self, parent, joint, place, inertia, centre):
+        """A joint with a body (10,), whose inertial parameters are about a point of its frame."""
         number = self.model.addJoint(parent, joint(), place, f"joint{self.model.njoints}")
         if inertia is not None:
-            inertia = pin.Inertia(inertia[0], centre, np.diag(inertia[1:]))
+            inertia = pin.Inertia.FromDynamicParameters(about_joint(centre) @ inertia)
             self.model.appendBodyToJoint(number, inertia, pin.SE3.Identity())
         return number
 
@@ -179,6 +196,8 @@ class ClosedChain:
                 numbers.append(
                     self._body(parent, kind, place, inertia if last else None, part.centre)
                 )
+                if last:
+                    self._places.append((numbers[-1], own[part.body], part.share, part.centre))
                 parent, place = numbers[-1], pin.SE3.Identity()
             joints.append(numbers)
             if part.end is not None:
@@ -243,6 +262,17 @@ class ClosedChain:
         """Of a generalised acceleration: [h_ddot, omega_dot] (6,), base axes."""
         turn, v = pin.Quaternion(*state.q[[6, 3, 4, 5]]).toRotationMatrix(), state.v
         return np.concatenate([turn @ (a[:3] + np.cross(v[3:6], v[:3])), turn @ a[3:6]])
+
+    def regressor(self, state, a, speeds):
+        """Torque along speeds (nv, m) of the chain for a unit of each inertial parameter (m, bodies,
+        10), at a generalised acceleration.
+        """
+        rows = pin.computeJointTorqueRegressor(self.model, self.data, state.q, state.v, a)
+        found = np.zeros((speeds.shape[1], len(self._bodies), 10))
+        for number, body, share, centre in self._places:
+            own = rows[:, 10 * (number - 1) : 10 * number]
+            found[:, body] += share * speeds.T @ own @ about_joint(centre)
+        return found
 
     def closure(self, state):
         """Largest gap (m) and gap velocity (m/s) of the constraints: proves that the chain is set

@@ -25,7 +25,7 @@ import numpy as np
 
 from dynamics.checks import check_choice, real, shown
 from dynamics.errors import SimulationError
-from dynamics.parameters import INERTIAL, ParameterLayout
+from dynamics.parameters import ParameterLayout
 from dynamics.robot import Robot
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -182,7 +182,8 @@ class JointElasticity:
                     f"joints cannot be elastic: the actuator of leg {leg + 1} drives more than "
                     "one body"
                 )
-            layout.bodies_of(carried)[row[0], INERTIAL.index(body.driven)] -= self.motor_inertia
+            driven = f"{layout.bodies[row[0]]}.{body.driven}"
+            carried[layout.rigid_names.index(driven)] -= self.motor_inertia
         return carried
 
     def steps_needed(

@@ -20,15 +20,24 @@ from typing import Literal, get_args
 from xml.etree import ElementTree as Xml
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dynamics.bodies import Frames, Part, parts_of
 from dynamics.checks import check_choice, check_type, flag, real
+from dynamics.engines.mjcf_looks import (
+    BALL_RADIUS,
+    PLATE_THICKNESS,
+    add_assets,
+    add_ball,
+    add_base_looks,
+    add_rod,
+    disc,
+    numbers_text,
+)
 from dynamics.errors import DynamicsError
-from dynamics.geometry import RobotGeometry
 from dynamics.inertia import BodyInertias, grouped, physical_inertias
 from dynamics.kinematics.platform import base_from_platform
+from dynamics.pseudo_inertia import PAIRS, about_centre, is_centred
 from dynamics.robot import Robot
 
 # MuJoCo lowers larger values to this without a warning.
@@ -116,7 +125,7 @@ def mjcf_text(
     _add_options(root, robot, solver, len(chain.ends))
     custom = Xml.SubElement(root, "custom")
     for name, numbers in (("joint_pid", gains), ("travel_limit", robot.travel_limit)):
-        Xml.SubElement(custom, "numeric", name=name, data=_numbers(numbers))
+        Xml.SubElement(custom, "numeric", name=name, data=numbers_text(numbers))
     add_assets(root, robot.geometry)
     world = Xml.SubElement(root, "worldbody")
     add_base_looks(world, robot.geometry)
@@ -125,14 +134,16 @@ def mjcf_text(
     bodies = {-1: world}
     for number, part in enumerate(chain.parts):
         friction = {
-            "frictionloss": _numbers(dry[part.leg] if coulomb else 0.0),
-            "damping": _numbers(viscous[part.leg]),
+            "frictionloss": numbers_text(dry[part.leg] if coulomb else 0.0),
+            "damping": numbers_text(viscous[part.leg]),
         }
         inertia = part.share * inertias.values[part.body]
         bodies[number], joints = _add_part(bodies[part.before], chain, number, inertia, friction)
         coordinates += joints
     _add_loops_and_motors(root, chain)
-    Xml.SubElement(Xml.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(coordinates))
+    Xml.SubElement(
+        Xml.SubElement(root, "keyframe"), "key", name="home", qpos=numbers_text(coordinates)
+    )
     Xml.indent(root)
     return Xml.tostring(root, encoding="unicode") + "\n"
 
@@ -191,16 +202,16 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
     Xml.SubElement(
         root,
         "option",
-        timestep=_numbers(solver.timestep_s),
+        timestep=numbers_text(solver.timestep_s),
         integrator=solver.integrator,
         solver="Newton",
         tolerance="1e-14",
         iterations="50",
-        gravity=_numbers(robot.geometry.gravity),
+        gravity=numbers_text(robot.geometry.gravity),
     )
     stiff = {
-        "solref": _numbers([solver.time_constant_steps * solver.timestep_s, 1.0]),
-        "solimp": _numbers([solver.impedance, solver.impedance, 1e-3, 0.5, 2.0]),
+        "solref": numbers_text([solver.time_constant_steps * solver.timestep_s, 1.0]),
+        "solimp": numbers_text([solver.impedance, solver.impedance, 1e-3, 0.5, 2.0]),
     }
     default = Xml.SubElement(root, "default")
     _add_comment(
@@ -221,19 +232,19 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
 def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> None:
     pose = chain.robot.home_pose
     joints = chain.robot.geometry.platform_joints
-    turned = _numbers(quaternion(base_from_platform(pose)))
-    body = Xml.SubElement(world, "body", name="platform", pos=_numbers(pose[:3]), quat=turned)
+    turned = numbers_text(quaternion(base_from_platform(pose)))
+    body = Xml.SubElement(world, "body", name="platform", pos=numbers_text(pose[:3]), quat=turned)
     Xml.SubElement(body, "freejoint", name="platform")
     _add_inertia(body, np.zeros(3), inertia)
     for number, end in chain.ends.items():
         Xml.SubElement(
-            body, "site", name=end_names(chain.parts[number])["site2"], pos=_numbers(end)
+            body, "site", name=end_names(chain.parts[number])["site2"], pos=numbers_text(end)
         )
-    centre, radius = _disc(joints)
+    centre, radius = disc(joints)
     half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
-    _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
+    add_rod(body, "cylinder", centre - half, centre + half, radius, "plate")
     for end in chain.ends.values():
-        _ball(body, end, BALL_RADIUS)
+        add_ball(body, end, BALL_RADIUS)
 
 
 def _add_part(
@@ -249,8 +260,8 @@ def _add_part(
     before = part.before
     turn = home.axes[before].T
     place = {
-        "pos": _numbers(_cleaned(turn @ (home.origin[number] - home.origin[before]))),
-        "quat": _numbers(_cleaned(quaternion(turn @ home.axes[number]))),
+        "pos": numbers_text(_cleaned(turn @ (home.origin[number] - home.origin[before]))),
+        "quat": numbers_text(_cleaned(quaternion(turn @ home.axes[number]))),
     }
     body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
     coordinates = _add_joint(
@@ -258,11 +269,11 @@ def _add_part(
     )
     _add_inertia(body, segment.centre, inertia)
     start, end = segment.rod
-    _rod(body, "capsule", start, end, segment.radius, "crank" if segment.actuated else "link")
+    add_rod(body, "capsule", start, end, segment.radius, "crank" if segment.actuated else "link")
     if segment.joint in ("ball", "universal"):
-        _ball(body, np.zeros(3), 1.5 * segment.radius)
+        add_ball(body, np.zeros(3), 1.5 * segment.radius)
     if segment.end is not None:
-        Xml.SubElement(body, "site", name=end_names(part)["site1"], pos=_numbers(segment.end))
+        Xml.SubElement(body, "site", name=end_names(part)["site1"], pos=numbers_text(segment.end))
     return body, coordinates
 
 
@@ -277,14 +288,14 @@ def _add_joint(
         Xml.SubElement(body, "joint", name=part.name, type="ball")
         return [1.0, 0.0, 0.0, 0.0]
     if part.segment.joint == "universal":
-        Xml.SubElement(body, "joint", name=part.name, type="hinge", axis=_numbers(axis))
+        Xml.SubElement(body, "joint", name=part.name, type="hinge", axis=numbers_text(axis))
         Xml.SubElement(body, "joint", name=f"{part.name}_x", type="hinge", axis="1 0 0")
         return [0.0, 0.0]
-    form = {"type": part.segment.joint, "axis": _numbers(axis)}
+    form = {"type": part.segment.joint, "axis": numbers_text(axis)}
     if not part.segment.actuated:
         Xml.SubElement(body, "joint", name=part.name, attrib=form)
         return [0.0]
-    form |= {"ref": _numbers(coordinate)} | friction
+    form |= {"ref": numbers_text(coordinate)} | friction
     Xml.SubElement(body, "joint", name=f"joint{part.leg + 1}", attrib=form)
     return [coordinate]
 
@@ -302,14 +313,17 @@ def _cleaned(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) < 2e-15, 0.0, values)
 
 
-def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
-    Xml.SubElement(
-        body,
-        "inertial",
-        pos=_numbers(centre),
-        mass=_numbers(inertia[0]),
-        diaginertia=_numbers(inertia[1:]),
-    )
+def _add_inertia(body: Xml.Element, reference: np.ndarray, inertia: np.ndarray) -> None:
+    """Add the inertia of a full body (10,) with a reference point (3,) in the axes of the body."""
+    form = {"pos": numbers_text(reference), "mass": numbers_text(inertia[0])}
+    if is_centred(inertia):
+        form["diaginertia"] = numbers_text(inertia[4:7])
+    else:
+        centre, about = about_centre(inertia)
+        form["pos"] = numbers_text(reference + centre)
+        products = [about[row, column] for row, column in PAIRS]
+        form["fullinertia"] = numbers_text([*np.diagonal(about), *products])
+    Xml.SubElement(body, "inertial", attrib=form)
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
@@ -327,74 +341,3 @@ def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
 def _add_comment(parent: Xml.Element, text: str) -> None:
     """Add a comment, without two hyphens side by side and characters that XML does not allow."""
     parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))
-
-
-def _numbers(values: ArrayLike) -> str:
-    """Numbers as MJCF writes them, with all their digits."""
-    return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))
-
-
-# Appearance of the exported robot in a viewer: geoms without mass and contact.
-BALL_RADIUS = 0.009
-PLATE_THICKNESS = 0.012
-COLOURS = {
-    "base": "0.35 0.37 0.40 1",
-    "crank": "0.85 0.45 0.15 1",
-    "link": "0.75 0.77 0.80 1",
-    "plate": "0.2 0.45 0.7 1",
-}
-
-
-def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
-    """Add sky, light and view, and the colours of the bodies."""
-    points = np.concatenate([geometry.base_joints, geometry.joints_at(geometry.home_pose)])
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    extent = 1.6 * np.linalg.norm(points - centre, axis=1).max()
-    visual = Xml.SubElement(root, "visual")
-    Xml.SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.5 0.5 0.5")
-    Xml.SubElement(root, "statistic", center=_numbers(centre), extent=_numbers(extent))
-    asset = Xml.SubElement(root, "asset")
-    sky = {"type": "skybox", "builtin": "gradient", "rgb1": "0.9 0.93 0.97", "rgb2": "0.5 0.55 0.6"}
-    Xml.SubElement(asset, "texture", sky, width="64", height="384")
-    for name, colour in COLOURS.items():
-        Xml.SubElement(asset, "material", name=name, rgba=colour)
-
-
-def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
-    """Add geoms that show the base.
-
-    They are a plate behind the legs, as seen from the platform, a motor on each hinge of the base,
-    and a rail below each slide.
-    """
-    centre, radius = _disc(geometry.base_joints)
-    behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])
-    _rod(world, "cylinder", centre + 0.05 * behind, centre + 0.06 * behind, radius + 0.04, "base")
-    for leg in geometry.legs:
-        foot = leg.base_joint
-        segment = leg.segments()[0]
-        if segment.joint == "universal":
-            _ball(world, foot, 0.022)
-            continue
-        sliding = segment.joint == "slide"
-        low, high = (geometry.travel_limit,) * 2 if sliding else (0.04, 0.012)
-        ends = foot - low * segment.axis, foot + high * segment.axis
-        _rod(world, "cylinder", *ends, segment.radius if sliding else 0.022, "base")
-
-
-def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of a disc that covers points."""
-    centre = points.mean(axis=0)
-    return centre, float(np.linalg.norm(points - centre, axis=1).max())
-
-
-def _rod(
-    parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str
-) -> None:
-    ends = _numbers(np.concatenate([start, end]))
-    Xml.SubElement(parent, "geom", type=kind, fromto=ends, size=_numbers(radius), material=material)
-
-
-def _ball(parent: Xml.Element, centre: np.ndarray, radius: float) -> None:
-    Xml.SubElement(
-        parent, "geom", type="sphere", pos=_numbers(centre), size=_numbers(radius), material="link"
-    )

@@ -6,6 +6,7 @@ angles of a pose, they are reordered to be as near as possible to the axes of th
 """
 
 from collections import Counter
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -22,15 +23,16 @@ from dynamics.engines.mechanism import (
 )
 from dynamics.errors import RobotFileError
 from dynamics.geometry import RobotGeometry
-from dynamics.inertia import MOMENTS
 from dynamics.kinematics.platform import Chart
 from dynamics.legs.chain import SAME, leg_of
 from dynamics.legs.leg import Body, Leg, Placement
-from dynamics.parameters import parameter_layout
+from dynamics.parameter_set import ParameterSet
+from dynamics.pseudo_inertia import full_body, is_centred
 from dynamics.rigid_body.jacobians import joint_jacobian
 from dynamics.rigid_body.virtual_work import mass_matrix
-from dynamics.robot_file import ParameterSet, RobotDescription, parsed_robot
+from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
+from dynamics.spatial_inertia import MOMENTS
 
 DIAGONAL = 1e-9
 """Share of the largest moment below which products of inertia count as rounding errors."""
@@ -86,21 +88,18 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
         chart = _upright(axes, legs, home)
     travel = plain.travel_limit or _travel(plain, found, legs, notes)
     geometry = RobotGeometry(tuple(legs), chart, travel, plain.gravity)
-    layout = parameter_layout(geometry.legs)
-    dynamic = np.zeros(len(layout.dynamic_names))
-    rigid = layout.bodies_of(dynamic)
-    rigid[0] = [platform.mass, *moments]
-    for k, (one, leg) in enumerate(zip(found, geometry.legs, strict=True)):
-        places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
-        for body, place, bars, row in zip(
-            leg.bodies, places, one.bodies, layout.of_leg[k], strict=True
-        ):
-            try:
-                rigid[row] = _inertia(body, place, bars, chart.basis[:3])
-            except RobotFileError as error:
-                raise RobotFileError(f"leg {k + 1}: {error}") from None
-        dynamic[layout.coulomb][k], dynamic[layout.viscous][k] = one.actuated.friction
-    layout.check(dynamic)
+    of_platform = full_body(platform.mass, np.zeros(3), np.diag(moments))
+    bodies = _bodies(geometry, found, of_platform)
+    full = [
+        body
+        for body, row in zip(geometry.layout.bodies, bodies, strict=True)
+        if not is_centred(row)
+    ]
+    geometry = replace(geometry, full_bodies=tuple(full))
+    layout = geometry.layout
+    notes += _spinning(geometry, found)
+    friction = np.transpose([one.actuated.friction for one in found])
+    dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
         notes.append(
@@ -121,6 +120,42 @@ def _leg(one: MechanismLeg, number: int) -> Leg:
         raise RobotFileError(f"leg {number} ({names}): {error}") from None
 
 
+def _bodies(geometry: RobotGeometry, found: list[MechanismLeg], platform: np.ndarray) -> np.ndarray:
+    """Full bodies (bodies, 10) of a robot: the platform (10,), and the bodies of the legs.
+
+    Raises the RobotFileError of `_inertia` with the number of the leg.
+    """
+    layout = geometry.layout
+    bodies = np.empty((len(layout.bodies), len(platform)))
+    bodies[0] = platform
+    for k, (one, leg) in enumerate(zip(found, geometry.legs, strict=True)):
+        places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
+        for body, place, bars, row in zip(
+            leg.bodies, places, one.bodies, layout.of_leg[k], strict=True
+        ):
+            try:
+                bodies[row] = _inertia(body, place, bars, geometry.chart.basis[:3])
+            except RobotFileError as error:
+                raise RobotFileError(f"leg {k + 1}: {error}") from None
+    return bodies
+
+
+def _spinning(geometry: RobotGeometry, found: list[MechanismLeg]) -> list[str]:
+    """Remark on full links that can spin about their length between two ball joints."""
+    layout = geometry.layout
+    names = [
+        layout.bodies[of[-1]]
+        for one, of in zip(found, layout.of_leg, strict=True)
+        if layout.full[of[-1]] and one.chain.joints[-2:] == ("ball", "ball")
+    ]
+    if not names:
+        return []
+    return [
+        f"{', '.join(names)} can spin about their length between two ball joints, about which "
+        "their mass is not symmetric; a robot here has no such spin (eq. 12)"
+    ]
+
+
 def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
     """Centre and axes of a body as arrays of numbers."""
     return np.array(ca.evalf(place.centre)).ravel(), np.array(ca.evalf(place.axes))
@@ -128,13 +163,13 @@ def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
 
 def _inertia(
     body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray
-) -> list[float]:
-    """Mass and moments of inertia of a leg's body, in the axes that its kind of leg defines.
+) -> np.ndarray:
+    """Full body (10,) of a leg, in the axes that its kind of leg defines.
 
-    The body may consist of several equal bars. The centre of mass is checked only if the body
-    turns, and only along `ways` (3, n), the directions in which the platform can move, because it
-    has no effect otherwise. Raises RobotFileError for a wrong centre of mass, and for products of
-    inertia that would do work.
+    The body may consist of several equal bars. First moments and products of inertia are zero if
+    they have no effect. The centre of mass has an effect only if the body turns, and only along
+    `ways` (3, n), the directions in which the platform can move. Raises RobotFileError for bars of
+    different mass.
     """
     centre, axes = place
     name = " and ".join(bar.name for bar in bars)
@@ -143,24 +178,16 @@ def _inertia(
         raise RobotFileError(
             f"the bars {name} differ: {', '.join(f'{bar.mass:g} kg' for bar in bars)}"
         )
-    off = float(np.linalg.norm((np.mean([bar.centre for bar in bars], axis=0) - centre) @ ways))
-    if body.moments and off > SAME:
-        raise RobotFileError(
-            f"the centre of mass of {name} is {off:.4g} m from its place in a {body.name}, "
-            f"{np.array2string(centre, precision=6)} at home"
-        )
+    shift = np.mean([bar.centre for bar in bars], axis=0) - centre
+    off = float(np.linalg.norm(shift @ ways)) if body.moments else 0.0
     inertia = sum(axes.T @ bar.inertia @ axes for bar in bars)
     moments = np.diagonal(inertia)
     working = np.array([MOMENTS.index(moment) for moment in body.moments], dtype=int)
     block = inertia[np.ix_(working, working)]
     products = np.abs(block - np.diag(np.diagonal(block))).max(initial=0.0)
-    if products > SAME * moments.max():
-        raise RobotFileError(
-            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of a "
-            f"{body.name}, must have only moments "
-            f"({', '.join(f'{moment:.3g}' for moment in moments)})"
-        )
-    return [mass, *moments]
+    if off <= SAME and products <= SAME * moments.max():
+        return full_body(mass, np.zeros(3), np.diag(moments))
+    return full_body(mass, axes.T @ shift, inertia)
 
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:

@@ -26,9 +26,7 @@ from dynamics.checks import Length as Length
 from dynamics.checks import Place, shown, within
 from dynamics.errors import RobotFileError
 from dynamics.expressions import symmetric_from_lower
-
-INERTIAL = ("mass", "Ixx", "Iyy", "Izz")
-"""Inertial parameters of a body: kg, and kg m^2 about its own axes through its centre of mass."""
+from dynamics.spatial_inertia import SpatialInertia, spatial_inertia
 
 
 def _vector(value: object) -> np.ndarray:
@@ -245,9 +243,9 @@ class Leg(BaseModel, ABC):
     def driven_inertia(self, body: np.ndarray) -> float:
         """Inertia of the driven body at its actuator. NaN if no body is driven alone.
 
-        `body` (4,) has mass, Ixx, Iyy, Izz.
+        `body` (10,) has the inertial parameters of a full body.
         """
-        return float(body[0]) if self.bodies[0].driven == "mass" else float("nan")
+        return float(body[0]) if self.bodies[0].driven == "mass" else np.nan
 
     @abstractmethod
     def segments(self) -> list[Segment]:
@@ -276,39 +274,41 @@ class Leg(BaseModel, ABC):
         return ca.dot(self.gradient(position), acceleration) + bend
 
     def force(
-        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
+        self,
+        position: ca.SX,
+        velocity: ca.SX,
+        acceleration: ca.SX,
+        bodies: Sequence[ca.SX],
+        gravity: ca.DM,
     ) -> ca.SX:
         """Force at A (3,), N, that is needed for the motion of the bodies.
 
-        `rigid` (4 n,) has the inertial parameters of the bodies, one body after the other.
+        `bodies` has the inertial parameters of each body, 4 if it is centred or 10 if it is full.
         """
-        at, moving, gaining, own = (
-            ca.SX.sym(name, n) for name, n in zip("pvai", (3, 3, 3, rigid.numel()), strict=True)
-        )
+        at, moving, gaining = (ca.SX.sym(name, 3) for name in "pva")
+        own = _alike(bodies)
         total = ca.SX.zeros(3)
-        for body, centre_map, spin_map, spin in self._maps(at, moving, own):
-            centre_rate = centre_map @ moving
-            mass = body[0]
-            inertia = body[1]
-            centre_gain = centre_map @ gaining + ca.jtimes(centre_rate, at, moving)
+        for inertia, centre_map, spin_map, spin in self._maps(at, moving, own):
+            centre_gain = centre_map @ gaining + ca.jtimes(centre_map @ moving, at, moving)
             spin_gain = spin_map @ gaining + ca.jtimes(spin, at, moving)
-            total += centre_map.T @ (mass * (centre_gain - gravity))
-            total += spin_map.T @ (inertia @ spin_gain + ca.cross(spin, inertia @ spin))
+            push, moment = inertia.load(centre_gain - gravity, spin, spin_gain)
+            total += centre_map.T @ push
+            total += spin_map.T @ moment
         return _replaced(
-            total, (at, moving, gaining, own), (position, velocity, acceleration, rigid)
+            total, (at, moving, gaining, *own), (position, velocity, acceleration, *bodies)
         )
 
-    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
-        """Mass matrix (3, 3) of the leg at A."""
+    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+        """Mass matrix (3, 3) of the leg at A. For `bodies` see `force`."""
         at = ca.SX.sym("p", 3)
         moving = ca.SX.sym("v", 3)
-        own = ca.SX.sym("i", rigid.numel())
+        own = _alike(bodies)
         total = ca.SX.zeros(3, 3)
-        for (mass, inertia), centre_map, spin_map, _ in self._maps(at, moving, own):
-            total += mass * (centre_map.T @ centre_map) + spin_map.T @ inertia @ spin_map
-        return symmetric_from_lower(_replaced(total, (at, own), (position, rigid)))
+        for inertia, centre_map, spin_map, _ in self._maps(at, moving, own):
+            total += inertia.mass_matrix(centre_map, spin_map)
+        return symmetric_from_lower(_replaced(total, (at, *own), (position, *bodies)))
 
-    def coriolis(self, position: ca.SX, velocity: ca.SX, rigid: ca.SX) -> ca.SX:
+    def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
         """Matrix C (3, 3), whose product with the velocity is the Coriolis and centrifugal force at
         A.
 
@@ -316,38 +316,39 @@ class Leg(BaseModel, ABC):
         """
         at = ca.SX.sym("p", 3)
         moving = ca.SX.sym("v", 3)
-        own = ca.SX.sym("i", rigid.numel())
+        own = _alike(bodies)
         total = ca.SX.zeros(3, 3)
-        for (mass, inertia), centre_map, spin_map, spin in self._maps(at, moving, own):
-            centre_gain, spin_gain = (
+        for inertia, centre_map, spin_map, spin in self._maps(at, moving, own):
+            map_rates = [
                 ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), at, moving), 3, 3)
                 for m in (centre_map, spin_map)
-            )
-            total += mass * (centre_map.T @ centre_gain)
-            total += spin_map.T @ (inertia @ spin_gain + ca.skew(spin) @ inertia @ spin_map)
-        return _replaced(total, (at, moving, own), (position, velocity, rigid))
+            ]
+            maps = (centre_map, spin_map)
+            for part in inertia.coriolis_parts(maps, map_rates, centre_map @ moving, spin):
+                total += part
+        return _replaced(total, (at, moving, *own), (position, velocity, *bodies))
 
     def _maps(
-        self, position: ca.SX, velocity: ca.SX, rigid: ca.SX
-    ) -> list[tuple[tuple[ca.SX, ca.SX], ca.SX, ca.SX, ca.SX]]:
-        """Mass, inertia (3, 3), two maps and angular velocity of every body.
+        self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]
+    ) -> list[tuple[SpatialInertia, ca.SX, ca.SX, ca.SX]]:
+        """Inertia, two maps and angular velocity of every body.
 
-        The maps (3, 3) give the velocity of the centre of mass and the angular velocity from the
+        The maps (3, 3) give the velocity of the reference point and the angular velocity from the
         velocity of A.
         """
         found = []
         spins = self.angular_velocities(position, velocity)
-        for body, (place, spin) in enumerate(zip(self.placements(position), spins, strict=True)):
-            own = rigid[4 * body : 4 * body + 4]
-            # moments that do no work would only add rounding errors
-            working = [
-                own[k] if name in self.bodies[body].moments else 0
-                for k, name in enumerate(INERTIAL)
-            ]
-            inertia = place.axes @ ca.diag(ca.vertcat(*working[1:])) @ place.axes.T
+        for kind, own, place, spin in zip(
+            self.bodies, bodies, self.placements(position), spins, strict=True
+        ):
             maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
-            found.append(((own[0], inertia), *maps, spin))
+            found.append((spatial_inertia(own, place.axes, kind.moments), *maps, spin))
         return found
+
+
+def _alike(bodies: Sequence[ca.SX]) -> list[ca.SX]:
+    """Symbols for the inertial parameters of bodies."""
+    return [ca.SX.sym(f"i{k}", own.numel()) for k, own in enumerate(bodies)]
 
 
 def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:

@@ -15,6 +15,7 @@ three of its moments of inertia do work.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
@@ -35,6 +36,7 @@ from dynamics.legs.leg import (
     link_axes,
     universal_spin,
 )
+from dynamics.spatial_inertia import INERTIAL
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -211,7 +213,8 @@ class RssLeg(Leg):
 
     def driven_inertia(self, body: np.ndarray) -> float:
         """Inertia of the crank about its axis."""
-        return float(body[3] + body[0] * self.crank_length**2 / 4)
+        mass, along, izz = body[0], body[1], body[6]
+        return float(izz + along * self.crank_length + mass * self.crank_length**2 / 4)
 
     def segments(self) -> list[Segment]:
         origin = np.zeros(3)
@@ -234,11 +237,17 @@ class RssLeg(Leg):
         ]
 
     def force(
-        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
+        self,
+        position: ca.SX,
+        velocity: ca.SX,
+        acceleration: ca.SX,
+        bodies: Sequence[ca.SX],
+        gravity: ca.DM,
     ) -> ca.SX:
+        if not self._in_closed_form(bodies):
+            return super().force(position, velocity, acceleration, bodies, gravity)
         leg = self.vectors(position)
-        crank = rigid[0:4]
-        link = rigid[4:8]
+        crank, link = bodies
         motion = leg_motion(leg, velocity, acceleration)
         gradient = angle_gradient(leg)
         tangent = ca.cross(leg.axis, leg.crank)
@@ -256,10 +265,11 @@ class RssLeg(Leg):
         turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
         return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
-    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
+    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+        if not self._in_closed_form(bodies):
+            return super().mass(position, bodies)
         leg = self.vectors(position)
-        crank = rigid[0:4]
-        link = rigid[4:8]
+        crank, link = bodies
         gradient = angle_gradient(leg)
         tangent = ca.cross(leg.axis, leg.crank)
         reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
@@ -272,6 +282,12 @@ class RssLeg(Leg):
             row = direction - gradient * ca.dot(tangent, direction)
             total += (inertia * weight * (1 / leg.link_length**2)) * (row @ row.T)
         return symmetric_from_lower(total)
+
+    def _in_closed_form(self, bodies: Sequence[ca.SX]) -> bool:
+        """Return True if all bodies are centred and the link does not spin."""
+        return "Izz" not in self.bodies[1].moments and all(
+            own.numel() == len(INERTIAL) for own in bodies
+        )
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Components of the vector from B to A along and across the zero direction, and the chord.
@@ -374,13 +390,3 @@ class RusLeg(RssLeg):
         link_rate = velocity - rate * ca.cross(leg.axis, leg.crank)
         spin = universal_spin(leg.axis, leg.link / leg.link_length, link_rate / leg.link_length)
         return [rate * leg.axis, spin]
-
-    # the closed forms of RSS hold only for a link that does not spin
-
-    def force(
-        self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM
-    ) -> ca.SX:
-        return Leg.force(self, position, velocity, acceleration, rigid, gravity)
-
-    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
-        return Leg.mass(self, position, rigid)

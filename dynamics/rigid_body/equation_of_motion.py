@@ -24,7 +24,7 @@ from dynamics.kinematics.platform import (
     twist_bias,
 )
 from dynamics.legs.leg import Leg
-from dynamics.parameters import LANES, parameter_layout
+from dynamics.parameters import LANES
 from dynamics.rigid_body.accelerations import (
     STAGES,
     acceleration_in_lanes,
@@ -40,7 +40,7 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """Functions that the integrator of the closed loop needs."""
     size = len(geometry.chart.freedoms)
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
     motion = equation_of_motion(geometry)
     free = free_acceleration(size, layout.joints)
     responding = response(size)
@@ -66,7 +66,7 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     It returns M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
     and the factor of M (m, m) (see `factored`).
     """
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
     q, rate = _coordinates(geometry, "q", "rate")
     pose, pose_rate, _ = _poses(geometry, q, rate, 0 * rate)
     free = freedoms(geometry)
@@ -79,17 +79,18 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     legs, sides = _legs(geometry)
     parts = []
     for number, (leg, arm) in enumerate(zip(legs, platform_arms(geometry, pose), strict=True)):
-        own = rigid[layout.leg_rows(number)]
+        bodies = [rigid[own] for own in layout.leg_slices(number)]
         position = pose[0:3] + arm
         moving = joint_motion(arm, twist, twist_dot)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
-        mass = symmetric_from_lower(to_joint.T @ leg.mass(position, own) @ to_joint)
-        force = leg.force(position, *moving, own, gravity)
+        mass = symmetric_from_lower(to_joint.T @ leg.mass(position, bodies) @ to_joint)
+        force = leg.force(position, *moving, bodies, gravity)
         row = leg.gradient(position).T @ to_joint @ freely
         joint = [leg.acceleration(position, *moving), leg.coordinate(position), row @ rate]
         parts.append([mass, ca.vertcat(force, ca.cross(arm, force)), row, *joint])
-    mass = platform_mass(pose, rigid[0:4])
-    bias = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
+    platform = rigid[layout.body_slices[0]]
+    mass = platform_mass(pose, platform)
+    bias = platform_columns(pose, twist, twist_dot, gravity, layout.full[0]) @ platform
 
     def end(
         masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]
@@ -175,7 +176,7 @@ def _derivatives(
 
     `motion` are pose, rate and acceleration as expressions of `coordinates`.
     """
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
     free = freedoms(geometry)
     torque = ca.SX.sym("torque", layout.joints)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
@@ -183,7 +184,7 @@ def _derivatives(
     legs, sides = _legs(geometry)
     parts = []
     for number, leg in enumerate(legs):
-        own = rigid[layout.leg_rows(number)]
+        own = [rigid[one] for one in layout.leg_slices(number)]
         gradient = joints.gradient[number]
         local, net_force, force, joint = _leg_derivatives(
             leg, joints.of(number), torque[number], own, gravity
@@ -198,9 +199,11 @@ def _derivatives(
             *of_joint,
         ]
         parts.append(of_leg[:count])
-    platform = _platform_columns(joints, gravity)
+    platform = _platform_columns(joints, gravity, layout.full[0])
+    of_platform = layout.body_slices[0]
     alone = [
-        free.T @ ca.jacobian(platform @ rigid[0:4], of) @ free for of in (joints.pose, joints.rate)
+        free.T @ ca.jacobian(platform @ rigid[of_platform], of) @ free
+        for of in (joints.pose, joints.rate)
     ]
 
     def end(
@@ -210,9 +213,12 @@ def _derivatives(
         *of_joints: Sequence[ca.SX],
     ) -> list[ca.SX]:
         columns = ca.SX.zeros(free.shape[1], layout.rigid.stop)
-        columns[:, 0:4] = free.T @ platform
-        for number, own in enumerate(local):
-            columns[:, layout.leg_rows(number)] = own
+        columns[:, of_platform] = free.T @ platform
+        for number, of_leg in enumerate(local):
+            slices = layout.leg_slices(number)
+            ends = np.cumsum([0, *(own.stop - own.start for own in slices)]).tolist()
+            for own, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
+                columns[:, own] = part
         return [
             sum(by_pose, alone[0]),
             sum(by_rate, alone[1]),
@@ -319,7 +325,11 @@ def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> li
 
 
 def _leg_derivatives(
-    leg: Leg, motion: tuple[ca.SX, ca.SX, ca.SX], torque: ca.SX, own: ca.SX, gravity: ca.DM
+    leg: Leg,
+    motion: tuple[ca.SX, ca.SX, ca.SX],
+    torque: ca.SX,
+    bodies: list[ca.SX],
+    gravity: ca.DM,
 ) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
     """Columns (3, p) of a leg's own parameters, net force (3,), and derivatives.
 
@@ -329,11 +339,12 @@ def _leg_derivatives(
     position, velocity, acceleration = (
         ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")
     )
-    moving = leg.force(position, velocity, acceleration, own, gravity)
-    unit = ca.SX.sym("parameters", own.numel())
-    columns = ca.jacobian(leg.force(position, velocity, acceleration, unit, gravity), unit)
+    moving = leg.force(position, velocity, acceleration, bodies, gravity)
+    units = [ca.SX.sym("parameters", own.numel()) for own in bodies]
+    linear = leg.force(position, velocity, acceleration, units, gravity)
+    columns = ca.jacobian(linear, ca.vertcat(*units))
     force = moving - leg.gradient(position) * torque
-    by_acceleration = leg.mass(position, own)
+    by_acceleration = leg.mass(position, bodies)
     joint = leg.acceleration(position, velocity, acceleration)
     expressions = [
         columns,
@@ -366,8 +377,9 @@ def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
     return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
 
 
-def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM) -> ca.SX:
+def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM, full: bool) -> ca.SX:
     """Columns of the platform's own parameters."""
     to_twist = pose_rate_to_twist(joints.pose)
     twist_dot = to_twist @ joints.gain + twist_bias(joints.pose, joints.rate)
-    return to_twist.T @ platform_columns(joints.pose, to_twist @ joints.rate, twist_dot, gravity)
+    twist = to_twist @ joints.rate
+    return to_twist.T @ platform_columns(joints.pose, twist, twist_dot, gravity, full)

@@ -8,6 +8,7 @@ twist_dot + C twist + G + tau_f as in eq. 17.
 """
 
 import casadi as ca
+import numpy as np
 
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
@@ -17,7 +18,6 @@ from dynamics.kinematics.platform import (
     rotation_matrix,
     twist_bias,
 )
-from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import (
     freedoms,
     joint_coordinates,
@@ -29,6 +29,7 @@ from dynamics.rigid_body.jacobians import (
     reach_margin,
     singularity_measures,
 )
+from dynamics.spatial_inertia import FULL_INERTIAL, spatial_inertia
 
 
 def rigid_body_regressor(
@@ -36,26 +37,38 @@ def rigid_body_regressor(
 ) -> ca.SX:
     """Columns of Gamma (6, p) for the inertial parameters of platform and legs (eq. 25)."""
     gravity = ca.DM(geometry.gravity)
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
     columns = ca.SX.zeros(6, layout.rigid.stop)
-    columns[:, 0:4] = platform_columns(pose, twist, twist_dot, gravity)
+    columns[:, layout.body_slices[0]] = platform_columns(
+        pose, twist, twist_dot, gravity, layout.full[0]
+    )
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
-        rows = layout.leg_rows(number)
-        own = ca.SX.sym("parameters", len(rows))
-        force = leg.force(pose[0:3] + arm, *joint_motion(arm, twist, twist_dot), own, gravity)
+        slices = layout.leg_slices(number)
+        bodies = [ca.SX.sym("parameters", own.stop - own.start) for own in slices]
+        force = leg.force(pose[0:3] + arm, *joint_motion(arm, twist, twist_dot), bodies, gravity)
         # the force is linear in the parameters
-        forces = ca.jacobian(force, own)
-        columns[:, rows] = ca.vertcat(forces, ca.skew(arm) @ forces)
+        forces = ca.jacobian(force, ca.vertcat(*bodies))
+        wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
+        ends = np.cumsum([0, *(body.numel() for body in bodies)]).tolist()
+        for own, wrench in zip(slices, ca.horzsplit(wrenches, ends), strict=True):
+            columns[:, own] = wrench
     return columns
 
 
-def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM) -> ca.SX:
-    """Wrench (6, 4) of the platform alone for unit mass, Ixx, Iyy, Izz about its own axes."""
+def platform_columns(
+    pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM, full: bool
+) -> ca.SX:
+    """Wrench (6, 4) or (6, 10) of the platform alone for a unit of each inertial parameter."""
     frame = rotation_matrix(pose[3:6])
     omega = twist[3:6]
     omega_dot = twist_dot[3:6]
+    if full:
+        parameters = ca.SX.sym("parameters", len(FULL_INERTIAL))
+        inertia = spatial_inertia(parameters, frame)
+        wrench = ca.vertcat(*inertia.load(twist_dot[0:3] - gravity, omega, omega_dot))
+        return ca.jacobian(wrench, parameters)
     moments = []
     for axis in range(3):
         direction = frame[:, axis]
@@ -73,25 +86,28 @@ def inertial_wrench(
     It equals the product of the regressor and the parameters, but the regressor is not computed.
     """
     gravity = ca.DM(geometry.gravity)
-    layout = parameter_layout(geometry.legs)
-    total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
+    layout = geometry.layout
+    columns = platform_columns(pose, twist, twist_dot, gravity, layout.full[0])
+    total = columns @ rigid[layout.body_slices[0]]
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
         motion = joint_motion(arm, twist, twist_dot)
-        force = leg.force(pose[0:3] + arm, *motion, rigid[layout.leg_rows(number)], gravity)
+        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        force = leg.force(pose[0:3] + arm, *motion, bodies, gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
     return total
 
 
 def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """Matrix M (6, 6) of eq. 23, symmetric and positive definite for positive parameters."""
-    total = platform_mass(pose, rigid[0:4])
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
+    total = platform_mass(pose, rigid[layout.body_slices[0]])
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
-        at_joint = leg.mass(pose[0:3] + arm, rigid[layout.leg_rows(number)])
+        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        at_joint = leg.mass(pose[0:3] + arm, bodies)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
     return symmetric_from_lower(total)
@@ -99,26 +115,37 @@ def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
 
 def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
     """Matrix C (6, 6) of eq. 23. C twist is the Coriolis and centrifugal wrench."""
-    frame = rotation_matrix(pose[3:6])
     omega = twist[3:6]
-    layout = parameter_layout(geometry.legs)
-    total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
+    layout = geometry.layout
+    frame = rotation_matrix(pose[3:6])
+    if layout.full[0]:
+        platform = spatial_inertia(rigid[layout.body_slices[0]], frame)
+        maps = ca.vertsplit(ca.SX.eye(6), 3)
+        forces, moments = platform.coriolis_parts(maps, 2 * [ca.SX(3, 6)], twist[0:3], omega)
+        total = forces + moments
+    else:
+        gyroscopic = ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T
+        total = ca.diagcat(ca.SX.zeros(3, 3), gyroscopic)
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
-        own = rigid[layout.leg_rows(number)]
+        bodies = [rigid[own] for own in layout.leg_slices(number)]
         position = pose[0:3] + arm
-        coriolis = leg.coriolis(position, twist[0:3] + ca.cross(omega, arm), own)
+        coriolis = leg.coriolis(position, twist[0:3] + ca.cross(omega, arm), bodies)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         to_joint_rate = ca.horzcat(ca.SX.zeros(3, 3), -ca.skew(ca.cross(omega, arm)))
-        total += to_joint.T @ (coriolis @ to_joint + leg.mass(position, own) @ to_joint_rate)
+        total += to_joint.T @ (coriolis @ to_joint + leg.mass(position, bodies) @ to_joint_rate)
     return total
 
 
 def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
-    """Mass matrix (6, 6) of the platform alone for its mass, Ixx, Iyy, Izz (4,)."""
-    frame = rotation_matrix(pose[3:6])
-    return ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
+    """Mass matrix (6, 6) of the platform alone for its inertial parameters (4,) or (10,)."""
+    own = spatial_inertia(platform, rotation_matrix(pose[3:6]))
+    linear = own.mass * ca.SX.eye(3)
+    if own.first_moment is None:
+        return ca.diagcat(linear, own.inertia)
+    first = ca.skew(own.first_moment)
+    return ca.vertcat(ca.horzcat(linear, -first), ca.horzcat(first, own.inertia))
 
 
 def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
@@ -167,7 +194,7 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     Wrenches have six entries. The legs balance the entries that the chart forbids, and these have
     no effect on the torques.
     """
-    layout = parameter_layout(geometry.legs)
+    layout = geometry.layout
     pose = ca.SX.sym("pose", 6)
     twist = ca.SX.sym("twist", 6)
     twist_dot = ca.SX.sym("twist_dot", 6)

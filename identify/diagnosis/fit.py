@@ -109,7 +109,9 @@ class WithCauses:
         """Return cost and linearisation at coordinates (p + k,)."""
         residual, slopes = parameter_columns(self.at(coordinates), self.parameters(coordinates))
         rows = triangular_factor(
-            slopes @ self.problem.bounds.matrix, self.columns * self.steps, residual
+            slopes @ self.problem.bounds.slope(coordinates[: slopes.shape[1]]),
+            self.columns * self.steps,
+            residual,
         )
         count = len(coordinates)
         return float(residual @ residual), rows[:count, :count], rows[:count, count]
@@ -134,7 +136,8 @@ def linearised(
     """
     there = with_causes(problem, causes, sizes)
     residual, slopes = parameter_columns(there, parameters)
-    free = (slopes @ problem.bounds.matrix)[:, ~at_bound]
+    bounds = problem.bounds
+    free = (slopes @ bounds.slope(bounds.coordinates(parameters)))[:, ~at_bound]
     # a cause is changed from its size while all others stay
     columns = cause_columns(problem, parameters, causes, sizes)
     return Point(parameters, sizes, residual, OrthogonalComplement.of(free), columns)
@@ -162,7 +165,7 @@ def fit(
     for _ in range(REFRESHES):
         whole = WithCauses(problem, causes, columns)
         coordinates = np.concatenate([bounds.coordinates(parameters), sizes / steps])
-        spread = np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std
+        spread = bounds.spread(coordinates[: len(parameters)], problem.guess.std)
         far = np.maximum(2 * np.abs(sizes / steps), 10.0)
         found = minimise(
             whole,

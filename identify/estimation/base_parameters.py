@@ -18,8 +18,8 @@ from scipy.linalg import orth, qr, subspace_angles
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.legs.leg import INERTIAL
 from dynamics.parameters import ParameterLayout, RigidGroups
+from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL
 from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
@@ -81,7 +81,7 @@ class BaseParameters:
 
         Friction is left out, because friction parameters are in no group with other parameters.
         """
-        inertial = np.flatnonzero([name.split(".")[1] in INERTIAL for name in self.names])
+        inertial = np.flatnonzero([name.split(".")[1] in FULL_INERTIAL for name in self.names])
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 
@@ -112,9 +112,9 @@ class BaseParameters:
 def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     """Return the base parameters of a regression matrix (rows, p), by pivoted QR.
 
-    Columns that are long enough become pivots in this order: friction, platform, moments of inertia
-    of the legs' bodies, then their masses, beginning next to the platform. Raises EstimationError
-    if the matrix is zero.
+    Columns that are long enough become pivots in this order: friction, platform, moments and
+    products of inertia of the legs' bodies, their masses, beginning next to the platform, and their
+    first moments. Raises EstimationError if the matrix is zero.
     """
     names = layout.dynamic_names
     lengths = np.linalg.norm(matrix, axis=0)
@@ -243,13 +243,15 @@ def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:
     """Return the rank (p,) of each dynamic parameter in the order of pivots."""
     friction, platform, moment, mass = range(4)
     kinds = np.full(len(layout.dynamic_names), friction)
-    rigid = layout.bodies_of(kinds)
-    rigid[:] = moment
     places = {body: place for bodies in layout.of_leg for place, body in enumerate(bodies)}
     last = max(places.values())
-    # Masses of bodies near the platform come first.
-    rigid[:, 0] = [mass + last - places.get(body, last) for body in range(len(rigid))]
-    rigid[0] = platform
+    for body, own in enumerate(layout.body_slices):
+        names = [name.split(".")[1] for name in layout.rigid_names[own]]
+        # Masses of bodies near the platform come first.
+        kinds[own] = moment
+        kinds[own.start] = mass + last - places.get(body, last)
+        kinds[own][np.isin(names, FIRST_MOMENTS)] = mass + last + 1
+    kinds[layout.body_slices[0]] = platform
     return np.asarray(kinds * len(kinds) + np.arange(len(kinds)))
 
 

@@ -1,6 +1,7 @@
 """Bounds of a search, and the 95 % intervals of estimates within bounds.
 
-No parameter is negative. As an option, bodies must be physically possible: a rigid body has a
+No parameter is negative, except the first moments and products of inertia of full bodies, which
+have no bounds. As an option, bodies must be physically possible: a rigid body has a
 positive mass, and none of its principal moments of inertia exceeds the sum of the other two. With
 the second moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
@@ -8,7 +9,9 @@ the second moments of its mass along its axes, J_x = integral of x^2 dm and so o
 
 and the triangle inequality of the moments is equivalent to J >= 0. A search in J instead of I
 therefore needs only bounds, see Traversaro et al., "Identification of fully physical consistent
-inertial parameters" (IROS 2016).
+inertial parameters" (IROS 2016). A full body is possible if its pseudo-inertia is positive
+definite. The search then uses log-Cholesky coordinates of the body, which need no bounds (see
+`dynamics.pseudo_inertia`).
 
 The covariance of an estimate is computed without bounds. Active bounds move the whole estimate away
 from the estimate without bounds, the unheld estimate. Linearised about the estimate, it is
@@ -30,8 +33,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
+from dynamics.inertia import SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
+from dynamics.pseudo_inertia import from_log_cholesky, log_cholesky, log_cholesky_slope
+from dynamics.spatial_inertia import MOMENTS
 from identify.arrays import Array
 from identify.estimation.prior import StartingGuess
 
@@ -58,9 +63,9 @@ MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 class ParameterBounds:
     """Coordinates (p,) of a search, and their lower bounds.
 
-    matrix (p, p): parameters = matrix @ coordinates. lower (p,): bounds of the coordinates.
-    statements: text of each bound in terms of parameters. physical: whether bodies must be
-    physically possible.
+    matrix (p, p): parameters = matrix @ coordinates, except for full bodies that must be physically
+    possible. lower (p,): bounds of the coordinates, -inf without a bound. statements: text of each
+    bound in terms of parameters. physical: whether bodies must be physically possible.
     """
 
     layout: ParameterLayout
@@ -75,25 +80,66 @@ class ParameterBounds:
         Negative parameters are raised. Impossible bodies are changed, if possible without an effect
         on the motion.
         """
-        allowed = np.maximum(parameters, 0.0)
+        allowed = np.where(self._signed, parameters, np.maximum(parameters, 0.0))
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
-            allowed[: bodies.size] = bodies.ravel()
+            allowed[self.layout.rigid] = self.layout.rigid_of(bodies)
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
     def coordinates(self, parameters: Array) -> Array:
-        """Return the coordinates (p,) of parameters (p,)."""
-        return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
+        """Return the coordinates (p,) of parameters (p,) within the bounds."""
+        found = self.linear_coordinates(parameters)
+        for own in self._log_cholesky:
+            found[own] = log_cholesky(parameters[own])
+        return found
 
     def parameters(self, coordinates: Array) -> Array:
         """Return the parameters (p,) of coordinates (p,)."""
-        return np.asarray(self.matrix @ coordinates, dtype=float)
+        found = np.asarray(self.matrix @ coordinates, dtype=float)
+        for own in self._log_cholesky:
+            found[own] = from_log_cholesky(coordinates[own])
+        return found
+
+    def slope(self, coordinates: Array) -> Array:
+        """Return the derivatives (p, p) of the parameters with respect to the coordinates (p,)."""
+        if not self._log_cholesky:
+            return self.matrix
+        found = self.matrix.copy()
+        for own in self._log_cholesky:
+            found[own, own] = log_cholesky_slope(coordinates[own])
+        return found
+
+    def spread(self, coordinates: Array, std: Array) -> Array:
+        """Return the size (p,) of a change of each coordinate, at coordinates (p,).
+
+        std (p,): size of a change of each parameter.
+        """
+        return np.asarray(np.abs(np.linalg.inv(self.slope(coordinates))) @ std, dtype=float)
+
+    def linear_coordinates(self, parameters: Array) -> Array:
+        """Return the coordinates (p,) of parameters (p,), with full bodies as they are."""
+        return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
+
+    @property
+    def _signed(self) -> NDArray[np.bool_]:
+        """Which parameters (p,) may be negative."""
+        gains = len(self.layout.names) - len(self.layout.signed)
+        return np.append(self.layout.signed, np.zeros(gains, dtype=bool))
+
+    @property
+    def _log_cholesky(self) -> tuple[slice, ...]:
+        """Slices of the full bodies that have log-Cholesky coordinates."""
+        pairs = zip(self.layout.body_slices, self.layout.full, strict=True)
+        return tuple(own for own, full in pairs if full and self.physical)
 
     def least(self, rows: Array) -> Array:
         """Return the smallest allowed values (n,) of rows (n, p) @ parameters, or -inf."""
         weights = rows @ self.matrix
         # With a negative weight the value has no lower limit, because there are no upper bounds.
-        return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
+        bounded = np.isfinite(self.lower)
+        free = (weights < 0) | ((weights != 0) & ~bounded)
+        least = weights[:, bounded] @ self.lower[bounded]
+        return np.where(free.any(axis=1), -np.inf, least)
 
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
         """Return the part (p,) of a cost's gradient (p,) that active bounds balance.
@@ -116,10 +162,14 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
     lower[guess.fixed] = -1.0  # the prior fixes them at zero, so their bounds must not be active
+    lower[layout.dynamic][layout.signed] = -np.inf
     if physical:
         lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
+        for own, full in zip(layout.body_slices, layout.full, strict=True):
+            lower[own] = -np.inf if full else lower[own]
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
-    for body in layout.bodies if physical else ():
+    centred = [body for body, full in zip(layout.bodies, layout.full, strict=True) if not full]
+    for body in centred if physical else ():
         first = names.index(f"{body}.Ixx")
         matrix[first : first + 3, first : first + 3] = MOMENTS_FROM_SECOND
         for axis, moment in enumerate(MOMENTS):
@@ -166,7 +216,7 @@ class BoundedEstimate:
         """Return a warning if bounds are active, with the distance of the unheld estimate."""
         if not self.at_bound.any():
             return ()
-        beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
+        beyond = self.bounds.lower - self.bounds.linear_coordinates(self.unheld)
         to_coordinates = np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float)
         std = combined_std(to_coordinates, self.covariance)
         said = ", ".join(

@@ -8,9 +8,10 @@ A quantity counts as identified if the record
 The size follows from the initial guess and not from the noisy estimate. A criterion with the
 estimate would select quantities that chance made large, and their intervals would miss the truth
 too often. The size of a parameter is its initial guess. For friction with a guess of zero, the size
-is a tenth of the torque that the joints hold at home. The size of a group is the root of the sum of
-squares of the contributions of its members. A difference of large masses thus has the size of these
-masses, even if the guess of the difference is zero.
+is a tenth of the torque that the joints hold at home. For a first moment or a product of inertia
+with a guess of zero, it is a tenth of what a very uneven body has. The size of a group is the root
+of the sum of squares of the contributions of its members. A difference of large masses thus has the
+size of these masses, even if the guess of the difference is zero.
 
 Groups are the base parameters, the combinations that a record can identify. The uncertainty of a
 group follows from its members by linear propagation. A group is often known well although none of
@@ -52,7 +53,13 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import ScaleAnchor, StartingGuess, friction, holding_torque
+from identify.estimation.prior import (
+    ScaleAnchor,
+    StartingGuess,
+    asymmetry,
+    friction,
+    holding_torque,
+)
 
 IDENTIFIABLE_SHARE = 0.5
 """Largest standard deviation of an identified quantity, as a share of its prior and of its size.
@@ -68,6 +75,10 @@ FRICTION_SHARE = 0.1
 
 It is Coulomb friction, or viscous friction at 1 rad/s or 1 m/s.
 """
+
+
+ASYMMETRY_SHARE = 0.1
+"""Ordinary first moments and products of inertia, as a share of `asymmetry`."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +110,14 @@ def identifiability(
 ) -> Identifiability:
     """Return the criterion that follows from an initial guess.
 
-    Parameters with a guess of zero, except friction, have the size 1.
+    Parameters with a guess of zero, except friction, first moments and products of inertia, have
+    the size 1.
     """
+    layout = robot.layout
     held = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
-    unsaid = np.where(friction(robot.layout), held, 1.0)
+    unsaid = np.where(friction(layout), held, 1.0)
+    uneven = ASYMMETRY_SHARE * asymmetry(robot, guess.values)
+    unsaid[layout.rigid] = np.where(layout.signed[layout.rigid], uneven, 1.0)
     sizes = np.where(guess.values != 0, np.abs(guess.values), unsaid)
     return Identifiability(guess.std, sizes, model_holds)
 

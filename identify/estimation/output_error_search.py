@@ -117,7 +117,7 @@ class InCoordinates:
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
         """Return cost and linearisation at coordinates (p,)."""
         cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
-        return cost, factor @ self.bounds.matrix, residual
+        return cost, factor @ self.bounds.slope(parameters), residual
 
 
 def search(
@@ -132,11 +132,12 @@ def search(
     `advance` has been called for all iterations that the problem allows.
     """
     bounds = problem.bounds
+    coordinates = bounds.coordinates(start)
     found = minimise(
         InCoordinates(shooting or problem, bounds),
-        bounds.coordinates(start),
+        coordinates,
         bounds.lower,
-        np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
+        bounds.spread(coordinates, problem.guess.std),
         problem.stop,
         lambda i, cost: advance(),
         ahead=shooting is None,  # the states of shooting must follow only accepted steps

@@ -27,7 +27,7 @@ from dynamics import Robot
 from dynamics.closed_loop.drives import ABOVE_ZERO, READS, DriveName
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
-from identify.errors import RecordError
+from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import as_number, shown
 from identify.loop_parameters import check_parameter_set
 from identify.scenario import Model, PriorValue
@@ -86,8 +86,13 @@ def starting_guess(
     chosen = robot.parameter_sets[set_name]
     torque = holding_torque(robot, chosen.dynamic)
     values = chosen.vector.copy()
-    std = relative_std * typical_sizes(robot.layout, chosen.vector, torque)
+    std = relative_std * typical_sizes(robot, chosen.vector, torque)
     for name, prior in known.items():
+        if name not in robot.layout.names:
+            raise ScenarioError(
+                f"identification.prior: {name} is a parameter of a full body, but this body of the "
+                f"model of {robot.name} is centred; see model.inertia"
+            )
         place = robot.layout.names.index(name)
         values[place] = prior.value
         std[place] = prior.std
@@ -132,13 +137,34 @@ def holding_torque(robot: Robot, dynamic: Array) -> float:
     return mean if mean > WEIGHTLESS * accelerating else accelerating
 
 
-def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:
+def typical_sizes(robot: Robot, values: Array, torque: float) -> Array:
     """Return the size (p,) of each parameter: its own value or, for friction, the holding torque.
 
     The torque is in N m, or N. Data sheets rarely state friction, but friction above the holding
-    torque would mean a broken joint.
+    torque would mean a broken joint. First moments and products of inertia have the sizes of
+    `asymmetry`.
     """
-    return np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
+    layout = robot.layout
+    sizes = np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
+    sizes[layout.rigid] = np.where(
+        layout.signed[layout.rigid], asymmetry(robot, values), sizes[layout.rigid]
+    )
+    return sizes
+
+
+def asymmetry(robot: Robot, values: Array) -> Array:
+    """Return sizes (r,) of the first moments and products of inertia of a robot's bodies.
+
+    A first moment is that of the mass of the body at half its length. A product is the mean of the
+    moments of inertia. The sizes of all other inertial parameters are zero. values (p,): parameters
+    of the robot.
+    """
+    layout = robot.layout
+    bodies = layout.bodies_of(values[layout.rigid])
+    found = np.zeros_like(bodies)
+    found[:, 1:4] = (bodies[:, 0] * robot.geometry.body_lengths / 2)[:, None]
+    found[:, 7:] = bodies[:, 4:7].mean(axis=1, keepdims=True)
+    return layout.rigid_of(found)
 
 
 def friction(layout: ParameterLayout) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.closed_loop.drives import READS, cascade_gains
-from dynamics.parameters import JOINT_PID, ParameterLayout
+from dynamics.parameters import JOINT_PID, SIGNED, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.common_error_estimates import CommonErrorEstimates
@@ -203,10 +203,13 @@ class IdentificationResult:
         if isinstance(truth, xr.Dataset):
             pairs = zip(truth["parameter"].values, truth["parameter_value"].values, strict=True)
             truth = {str(name): float(value) for name, value in pairs}
-        missing = [name for name in self.names if name not in truth]
+        # A first moment or product of inertia that the plant does not state is zero.
+        zero = {name: 0.0 for name in self.names if name.rsplit(".", 1)[1] in SIGNED}
+        known = zero | dict(truth)
+        missing = [name for name in self.names if name not in known]
         if missing:
             raise EstimationError(f"the truth has no {missing[0]}; {len(missing)} are missing")
-        return np.array([float(truth[name]) for name in self.names])
+        return np.array([float(known[name]) for name in self.names])
 
     def _repr_html_(self) -> str:
         return result_html(self)

@@ -65,7 +65,9 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
     drives = problem.runs[0].settings.drives
     law = drives.joint_law(guess.values[pid])
     matrix, right, common = _stacked(problem, law)
-    lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
+    signed = np.append(guess.layout.signed, np.zeros(3, dtype=bool))
+    least = np.where(signed, -np.inf, 0.0)
+    lower = np.concatenate([least, np.full(matrix.shape[1] - count, -np.inf)])
     rows = _condensed(matrix, right, common)
     for _ in range(REWEIGHTINGS):
         whitened = rows / noise
@@ -78,7 +80,7 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
             law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
             matrix, right, common = _stacked(problem, law)
             rows = _condensed(matrix, right, common)
-    return np.maximum(solution[:count], 0.0)
+    return np.maximum(solution[:count], least)
 
 
 def _condensed(matrix: Array, right: Array, common: Array) -> Array:

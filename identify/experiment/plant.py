@@ -29,18 +29,14 @@ from dynamics.control.law import LawInLoop
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
 from identify.model.from_record import ModelSide
-from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
 from identify.record.conditions import payload_vector
-from identify.record.known_geometry import KnownGeometry
-from identify.record.run_error_covariance import factor
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing
 from identify.scenario.plant_sections import Control
-from identify.scenario.sections import Geometry, Payload, Rig
+from identify.scenario.sections import Payload, Rig
 
 
 @dataclass(frozen=True)
@@ -123,6 +119,15 @@ class Plant:
     loop: KnownLoop
     runs: RunSettings
     geometry_covariance: Array | None = None
+
+    def parameters_of(self, layout: ParameterLayout) -> Array:
+        """Return the true parameters (p,) in the layout of a model.
+
+        First moments and products of inertia that the plant has and the model lacks are left out.
+        """
+        own = self.robot.layout
+        dynamic = own.converted(self.parameters[own.dynamic], layout)
+        return np.concatenate([dynamic, self.parameters[own.joint_pid]])
 
     def check(self) -> None:
         """Check that the plant can be simulated and stand still at home.
@@ -207,7 +212,7 @@ class Plant:
             # The linearised loop describes only the servo.
             if law.controller is not None and not law.by_servo:
                 raise
-            said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
+            said = stability.verdict(self.robot, parameters, settings, reference.poses[0])
             raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
 
     def without_latency(self) -> Plant:
@@ -240,8 +245,9 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        # The drive gains are already among the parameters.
-        switches = self.switches.model_dump(exclude_none=True, exclude={"drive_gains"})
+        # These are already among the parameters.
+        among = {"drive_gains", "values", "inertia"}
+        switches = self.switches.model_dump(exclude_none=True, exclude=among)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
@@ -274,66 +280,6 @@ def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches
     inertia = of_actuators(nominal, switches, "motor_inertia")
     damping = of_actuators(nominal, switches, "joint_damping")
     return replace(settings, elasticity=JointElasticity(stiffness, inertia, damping))
-
-
-def true_parameters(nominal: Robot, switches: PlantSwitches) -> Array:
-    """Return the true parameters (p,): a named set with the drive gains of the plant."""
-    # Only the values of this guess are used, so its standard deviation is arbitrary.
-    values = starting_guess(nominal, switches.parameters, 1.0, drive=switches.drive).values
-    layout = nominal.layout
-    for name, gain in switches.drive_gains.items():
-        values[layout.names.index(f"joint_pid.{name}")] = gain
-    return values
-
-
-def true_robot(
-    nominal: Robot, switches: PlantSwitches, calibration: Geometry, known: KnownGeometry, seed: int
-) -> Robot:
-    """Return the robot with its true geometry.
-
-    Without a calibration the geometry has the errors that the plant states. If this run calibrates
-    the geometry, the offsets of the encoders are added. With an earlier calibration, the true
-    geometry is drawn at random about the calibrated geometry, with its covariance.
-
-    Raises ScenarioError if the plant states errors and there is an earlier calibration.
-    """
-    if known.covariance is None:
-        return misplaced(nominal, switches)
-    if calibration.known == "calibrated":
-        return nominal.moved(true_deviations(nominal, switches, calibration, seed))
-    for name in ("geometry_error_m", "length_error_m", "axis_error_rad"):
-        if getattr(switches, name):
-            raise ScenarioError(
-                f"plant.{name} = {getattr(switches, name):g} with geometry.known = "
-                f"{calibration.known!r}: the true geometry is drawn from the covariance of "
-                "that calibration; set only one of the two"
-            )
-    drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
-    return known.robot.moved(factor(known.covariance) @ drawn)
-
-
-def true_deviations(
-    robot: Robot, switches: PlantSwitches, calibration: Geometry, seed: int
-) -> Array:
-    """Return the deviations (g,) of the true from the nominal geometric numbers, m and rad.
-
-    They include the offsets of the encoders, which are drawn with the seed.
-    """
-    drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
-    true = misplaced(robot, switches).geometry
-    offset = of_actuators(robot, calibration, "encoder_offset")
-    # An offset of an encoder is the opposite shift of its joint.
-    return true.shifted(-offset * drawn).deviations_from(robot.geometry)
-
-
-def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
-    """Return the robot with the geometric errors that a scenario's plant states."""
-    # The geometry has a separate seed, so that runs with other noise have the same robot.
-    rng = np.random.default_rng(plant.geometry_seed)
-    geometry = nominal.geometry.with_errors(
-        plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad
-    )
-    return nominal.with_geometry(geometry)
 
 
 @dataclass(frozen=True)

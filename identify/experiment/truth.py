@@ -1,12 +1,13 @@
 """Truth of a simulated run, in its own netCDF group. Only validation and reports read it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from dynamics.parameters import SIGNED
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import (
@@ -130,6 +131,20 @@ def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
 def true_poses(truth: xr.Dataset) -> Array:
     """Return the true poses (N, 6) [m, rad] at the frames."""
     return np.hstack([truth["position"].values, truth["orientation"].values])
+
+
+def true_values(truth: Mapping[str, float], names: Iterable[str]) -> list[float]:
+    """Return the true values of parameters by name.
+
+    A first moment or product of inertia that the plant does not state is zero. Raises RecordError
+    if another parameter is missing.
+    """
+    found = []
+    for name in names:
+        if name not in truth and name.rsplit(".", 1)[-1] not in SIGNED:
+            raise RecordError(f"the truth has no {name}")
+        found.append(float(truth.get(name, 0.0)))
+    return found
 
 
 def true_parameters(truth: xr.Dataset) -> dict[str, float]:

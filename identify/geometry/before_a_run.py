@@ -5,7 +5,7 @@ import numpy as np
 from cmmsim.visibility import SightLines
 from dynamics import Robot
 from identify.arrays import Array
-from identify.experiment.plant import true_deviations
+from identify.experiment.true_robot import true_deviations
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate
 from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough

@@ -10,7 +10,7 @@ import xarray as xr
 
 from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
-from identify.loop_parameters import drives_of, loop_settings
+from identify.loop_parameters import drives_of, in_form, loop_settings
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
@@ -76,8 +76,12 @@ class ModelSide:
 
 
 def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
-    """Return the model's side of a scenario. Raises the ScenarioError of `loop_settings`."""
+    """Return the model's side of a scenario.
+
+    Raises the ScenarioErrors of `in_form` and `loop_settings`.
+    """
     model = scenario.model
+    robot = in_form(robot, model)
     timing = scenario.timing
     return ModelSide(
         robot=robot,

@@ -9,7 +9,7 @@ from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.experiment.truth import true_poses
+from identify.experiment.truth import true_poses, true_values
 from identify.files.run_folder import rms_figures
 from identify.loop_parameters import parameter_column, parameter_entries, settled_drive
 from identify.record import recording
@@ -18,11 +18,13 @@ from identify.validation.unseen import PosePrediction
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
     """Add the true values of parameters and of their groups to an identification entry."""
-    for name, value in truth.items():
-        identification["parameters"][name]["true"] = value
+    entries = identification["parameters"]
+    known = dict(zip(entries, true_values(truth, entries), strict=True))
+    for name, value in known.items():
+        entries[name]["true"] = value
     # The true value of a group follows from those of its members.
     for group in identification.get("groups", {}).values():
-        group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
+        group["true"] = sum(weight * known[name] for name, weight in group["coefficients"].items())
 
 
 def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:

@@ -20,7 +20,8 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
     from dynamics.robot_file import read_robot_file
 
     try:
-        layout = parameter_layout(read_robot_file(robot).geometry.legs)
+        # The model can have full bodies where the robot file has none.
+        layout = parameter_layout(read_robot_file(robot).geometry.legs, ("all",))
     except RobotFileError as error:
         raise ValueError(f"robot: {error}") from None
     for name in known:
@@ -42,7 +43,8 @@ def in_words(layout: "ParameterLayout") -> str:
     bodies = " or ".join(_range(names) for names in kinds.values())
     gains = ", ".join(f".{name.split('.')[1]}" for name in layout.joint_pid_names[1:])
     return (
-        f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), coulomb or viscous of "
+        f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), for a full body also mcx, mcy, mcz, "
+        "Ixy, Ixz or Iyz, coulomb or viscous of "
         f"{_range(layout.joint_names)}, and {layout.joint_pid_names[0]}, {gains}"
     )
 

@@ -29,6 +29,8 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
 A law has no other constants.
 """
 
+InertiaForm = Literal["centred", "full"]
+
 DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
 """Laws by which drives turn joint commands into torques, see `closed_loop.drives`.
 
@@ -107,7 +109,14 @@ class Control(Section):
         return law
 
 
-class _Friction(Section):
+class _Side(Section):
+    """Settings that the plant and its model both have."""
+
+    inertia: InertiaForm | dict[str, InertiaForm] | None = Field(
+        None,
+        description="full: bodies have ten inertial parameters; centred: four; or a table by body "
+        'or kind of body, as { platform = "full" }; by default as the robot file says',
+    )
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(
         None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
@@ -126,7 +135,7 @@ class _Friction(Section):
     )
 
     @model_validator(mode="after")
-    def _constants_fit_the_law(self) -> "_Friction":
+    def _constants_fit_the_law(self) -> "_Side":
         for law, constants in FRICTION_CONSTANTS.items():
             for keys in constants:
                 # Keys of turning and of sliding actuators exclude each other.
@@ -143,7 +152,7 @@ class _Friction(Section):
         return self
 
 
-class Plant(_Friction):
+class Plant(_Side):
     """Simulated real robot. Each possible difference from the estimator's model is a setting.
 
     With the largest geometry error, all of 100 robots reach the whole box of +-10 mm and +-0.04
@@ -153,6 +162,12 @@ class Plant(_Friction):
 
     parameters: str = Field(
         "identified", description="parameter set of the robot file that is the truth"
+    )
+    values: dict[str, float] = Field(
+        {},
+        description="true values of single parameters, instead of those of the parameter set, SI; "
+        "a body with a first moment or a product of inertia is a full body; "
+        '{ "platform.mcz" = 0.7 }',
     )
     drive: DriveName = Field(
         "pid", description="law of the drives; pid is the paper's, cascade is P-PI"
@@ -234,7 +249,7 @@ class Plant(_Friction):
         return self
 
 
-class Model(_Friction):
+class Model(_Side):
     """Estimator's model of the robot."""
 
     start_parameters: str = Field(

@@ -24,7 +24,7 @@ def check_moments(moments: Mapping[str, float]) -> None:
     Raises ValueError if one exceeds the sum of the other two, which no distribution of mass has.
     """
     # A late import: dynamics loads CasADi, which the help of the command line does not need.
-    from dynamics.inertia import moments_fault
+    from dynamics.pseudo_inertia import moments_fault
 
     fault = moments_fault(moments, ROUNDING)
     if fault:

@@ -130,7 +130,8 @@ def track(
 def known_model(plant: Plant, model: str) -> KnownModel:
     """Return the model of a plant with the name "initial" or "true"."""
     if model == "true":
-        return KnownModel(plant.parameters, plant.switches.drive, FITTED)
+        known = plant.parameters_of(plant.nominal.layout)
+        return KnownModel(known, plant.switches.drive, FITTED)
     start = plant.loop.side.model
     law = start.drive_law
     guess = starting_guess(plant.nominal, start.start_parameters, 1.0, drive=law)

@@ -33,7 +33,13 @@ from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estima
 from identify.estimation.identification import output_error_problem
 from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
-from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
+from identify.experiment.truth import (
+    read_truth,
+    read_truth_runs,
+    true_parameters,
+    true_poses,
+    true_values,
+)
 from identify.files.run_folder import load_result, rms_figures, rms_row
 from identify.loop_parameters import settled_drive
 from identify.model.from_record import ModelSide, model_side
@@ -215,7 +221,7 @@ def compare_on_record(
     record, truth = experiment
     known = true_parameters(truth)
     layout = side.robot.layout
-    true = np.array([known[name] for name in layout.names])
+    true = np.array(true_values(known, layout.names))
     problem = output_error_problem([record], side, settings)
     evidence = Evidence(problem, joint_channels(channels, record), true[layout.joint_pid])
     return compare(evidence, examination(evidence, side, true, unseen), estimators, progress)

@@ -258,19 +258,19 @@ def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind):
     robot, rng = dynamics.load_robot(name), np.random.default_rng(4)
     leg, at_home = robot.geometry.legs[1], robot.geometry.joints_at(robot.home_pose)[1]
     symbols = [ca.SX.sym(label, 3) for label in ("position", "velocity", "acceleration")]
-    own, gravity = ca.SX.sym("rigid", 8), ca.DM([0.4, -0.3, -9.81])
+    own, gravity = [ca.SX.sym("rigid", 4), ca.SX.sym("rigid", 4)], ca.DM([0.4, -0.3, -9.81])
     at, moving, _ = symbols
     outputs = [
         *(leg.force(*symbols, own, gravity), Leg.force(leg, *symbols, own, gravity)),
         *(leg.mass(at, own), Leg.mass(leg, at, own), leg.coriolis(at, moving, own)),
         leg.force(at, 0 * moving, 0 * moving, own, gravity),
     ]
-    function = ca.Function("leg", [*symbols, own], outputs)
+    function = ca.Function("leg", [*symbols, *own], outputs)
     planar = np.array([1, 1, leg.chart != "planar"])
     for _ in range(50):
         position = at_home + 0.02 * planar * rng.standard_normal(3)
         velocity, acceleration = planar * rng.standard_normal((2, 3))
-        found = function(position, velocity, acceleration, rng.uniform(0.1, 1, 8))
+        found = function(position, velocity, acceleration, *rng.uniform(0.1, 1, (2, 4)))
         force, by_work, mass, mass_by_work, coriolis, holding = (np.array(value) for value in found)
         grown = holding[:, 0] + mass @ acceleration + coriolis @ velocity
         ours, other, of_parts = (planar * part for part in (force[:, 0], by_work[:, 0], grown))

@@ -28,16 +28,15 @@ def exported(robot, parameters=None, **options):
 def as_exported(robot, values):
     """Parameters (p,) with the inertias that the export writes."""
     changed = values.copy()
-    changed[robot.layout.rigid] = physical_inertias(
-        robot.layout, values, allow_changes=True
-    ).values.ravel()
+    bodies = physical_inertias(robot.layout, values, allow_changes=True).values
+    changed[robot.layout.rigid] = robot.layout.rigid_of(bodies)
     return changed
 
 
 def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot, identified):
     """Those of Table 2 with other numbers in every body, all of which rigid bodies can have."""
     physical = identified[:64].copy()
-    bodies = robot.layout.bodies_of(physical)
+    bodies = physical[robot.layout.rigid].reshape(13, 4)
     bodies[:, 1:] = bodies[:, 3:] * np.random.default_rng(2).uniform(0.6, 1.0, (13, 3))
     engine = MujocoRobot(robot, mjcf_text(robot, physical))
     model = engine.model

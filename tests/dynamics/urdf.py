@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dynamics.bodies import parts_of
+from dynamics.pseudo_inertia import about_centre
 
 
 def urdf_of(robot, values, platform_on_a_leg):
@@ -79,12 +80,12 @@ def urdf_of(robot, values, platform_on_a_leg):
 def link(name, inertia=None, centre=(0, 0, 0)):
     if inertia is None:
         return f'<link name="{name}"/>'
-    mass, x, y, z = inertia.tolist()
-    tensor = f'<inertia ixx="{x!r}" iyy="{y!r}" izz="{z!r}" ixy="0" ixz="0" iyz="0"/>'
-    place = f'<origin xyz="{numbers(centre)}"/>'
-    return (
-        f'<link name="{name}"><inertial>{place}<mass value="{mass!r}"/>{tensor}</inertial></link>'
-    )
+    off, tensor = about_centre(inertia)
+    mass, (xx, xy, xz), (yy, yz), (zz,) = inertia[0], tensor[0], tensor[1, 1:], tensor[2, 2:]
+    moments = f'ixx="{xx}" iyy="{yy}" izz="{zz}"'
+    tensor = f'<inertia {moments} ixy="{xy}" ixz="{xz}" iyz="{yz}"/>'
+    place = f'<origin xyz="{numbers(np.array(centre) + off)}"/>'
+    return f'<link name="{name}"><inertial>{place}<mass value="{mass}"/>{tensor}</inertial></link>'
 
 
 def joint(name, kind, parent, child, places, axis=(1, 0, 0), turned=0.0, more=""):

@@ -7,7 +7,7 @@ import numpy as np
 
 from cmmsim.visibility import sight_lines
 from dynamics import load_robot
-from identify.experiment.plant import misplaced
+from identify.experiment.true_robot import misplaced
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate, seen_between
 from identify.geometry.selection import Designer, Limits
 from identify.geometry.static_experiment import encoders_of, true_poses

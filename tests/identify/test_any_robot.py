@@ -15,7 +15,8 @@ from dynamics.closed_loop import (
 from dynamics.closed_loop.drives import joint_law
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import Chart
-from dynamics.robot_file import ParameterSet, RobotDescription
+from dynamics.parameter_set import ParameterSet
+from dynamics.robot_file import RobotDescription
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import (
     angle_to_singular_vectors,

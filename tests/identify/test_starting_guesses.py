@@ -74,7 +74,7 @@ def drawn_guess(spread, seed):
     while np.any(low := factors < SMALLEST_FACTOR):
         factors[low] = 1 + spread * rng.standard_normal(low.sum())
     values = truth() * factors
-    return guess_of(values, typical_sizes(LAYOUT, values, holding_torque(rss6(), values[:64])))
+    return guess_of(values, typical_sizes(rss6(), values, holding_torque(rss6(), values[:64])))
 
 
 def distance(problem, parameters, others):

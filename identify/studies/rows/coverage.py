@@ -41,7 +41,11 @@ def coverage(
         truth, share of true coordinates on the validation trajectories within their predicted
         interval, and rms error of the predicted positions.
     """
-    held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
+    held = [
+        inside
+        for *_, identified, inside in quantities(result, plant.parameters_of(result.layout))
+        if identified
+    ]
     errors = np.concatenate(
         [true_poses(one.truth) - of.poses for one, of in zip(unseen, predicted, strict=True)]
     )

@@ -260,8 +260,9 @@ def compute(
             result.common_errors.learned,
         )
         if not prefix:
-            row |= _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
-            row |= _unseen_figures(result, side, plant.parameters, made.unseen, predicted)
+            true = plant.parameters_of(result.layout)
+            row |= _record_figures(made.excitation) | _parameter_figures(result, true)
+            row |= _unseen_figures(result, side, true, made.unseen, predicted)
         covered = coverage(result, plant, made.unseen, predicted)
         row |= {f"{prefix}{name}": value for name, value in covered.items()}
     return row

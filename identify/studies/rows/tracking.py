@@ -142,7 +142,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     sensor = setup.sensor
     teach(sensor, SilentProgress())
     signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice(
-        [-1.0, 1.0], len(plant.parameters)
+        [-1.0, 1.0], len(setup.robot.layout.names)
     )
     model = _model(setup, options)
     if options.off:

@@ -1,0 +1,162 @@
+"""Parameter sets of a robot file: bodies, joint friction and gains of the joint PID."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from dynamics.checks import Damping, FirstMoment, Force, Gain, Inertia, Mass, Product
+from dynamics.errors import RobotFileError
+from dynamics.parameters import JOINT_PID, ParameterLayout
+from dynamics.pseudo_inertia import body_fault
+from dynamics.spatial_inertia import FULL_INERTIAL, INERTIAL
+
+
+class Strict(BaseModel):
+    """Section of a robot file, in which every key must be known."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _know_every_key(cls, values: object) -> object:
+        unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
+        if unknown:
+            raise ValueError(
+                f"unknown key {', '.join(unknown)}; valid: {', '.join(cls.model_fields)}"
+            )
+        return values
+
+
+class BodyInertia(Strict):
+    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2.
+
+    A full body also has the first moments of its mass, kg m, and products of inertia, kg m^2. All
+    its moments and products are about the reference point of the body. Each is one value, or a list
+    with one value per leg.
+    """
+
+    mass: Mass | list[Mass]
+    mcx: FirstMoment | list[FirstMoment] = 0.0
+    mcy: FirstMoment | list[FirstMoment] = 0.0
+    mcz: FirstMoment | list[FirstMoment] = 0.0
+    Ixx: Inertia | list[Inertia]
+    Iyy: Inertia | list[Inertia]
+    Izz: Inertia | list[Inertia]
+    Ixy: Product | list[Product] = 0.0
+    Ixz: Product | list[Product] = 0.0
+    Iyz: Product | list[Product] = 0.0
+
+
+class Friction(Strict):
+    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints.
+
+    Each is one value, or a list with one value per leg.
+    """
+
+    coulomb: Force | list[Force]
+    viscous: Damping | list[Damping]
+
+
+class JointPid(Strict):
+    """Gains of the joint PID, which all joints share.
+
+    `unit` is the unit of lp. It must be stated if the actuators slide.
+    """
+
+    lp: Gain
+    li: Gain
+    ld: Gain
+    unit: Literal["N m/rad", "N/m"] | None = None
+
+
+class Parameters(BaseModel):
+    """Set of parameters: platform, joints, gains, and a table for each kind of leg body."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    __pydantic_extra__: dict[str, BodyInertia] = Field(init=False)
+
+    platform: BodyInertia
+    joint: Friction
+    joint_pid: JointPid
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Named parameter set.
+
+    `dynamic` (p,) is in the order of `Robot.parameter_names`, and `joint_pid` (3,) has lp, li, ld.
+    """
+
+    dynamic: np.ndarray
+    joint_pid: np.ndarray
+
+    @property
+    def vector(self) -> np.ndarray:
+        """All values: the dynamic parameters, then lp, li, ld."""
+        return np.concatenate([self.dynamic, self.joint_pid])
+
+
+def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
+    """Parameter set from its section of a robot file.
+
+    Raises RobotFileError, with the entry, for bodies that the robot does not have, for lists of a
+    wrong length, for bodies that cannot exist, and for gains in a wrong unit.
+    """
+
+    def per_leg(key: str, value: float | list[float], count: int) -> list[float]:
+        expanded = value if isinstance(value, list) else [value] * count
+        if len(expanded) != count:
+            raise RobotFileError(
+                f"parameters.{name}.{key} needs one value or {count} values, got {len(expanded)}"
+            )
+        return expanded
+
+    kinds = [kind.name for kind in layout.kinds]
+    given = {"platform": values.platform, **(values.model_extra or {})}
+    if set(given) != set(kinds):
+        wrong = sorted(set(given) ^ set(kinds))
+        valid = ", ".join([*dict.fromkeys(kinds), "joint", "joint_pid"])
+        raise RobotFileError(
+            f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}"
+        )
+    bodies = np.empty((len(kinds), len(FULL_INERTIAL)))
+    for kind, inertia in given.items():
+        rows = [row for row, name_of in enumerate(kinds) if name_of == kind]
+        bodies[rows] = np.transpose(
+            [per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()]
+        )
+    _check_bodies(name, bodies, layout)
+    friction = [
+        per_leg(f"joint.{key}", value, layout.joints)
+        for key, value in values.joint.model_dump().items()
+    ]
+    dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
+    stated = values.joint_pid.unit
+    unit = layout.unit("joint_pid.lp")
+    if stated != unit and (stated or layout.prismatic):
+        raise RobotFileError(
+            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} "
+            f"{f'is in {stated}' if stated else 'has no unit'}, but the actuators "
+            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which is "
+            f'stated by unit = "{unit}" in joint_pid'
+        )
+    joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
+    for array in (dynamic, joint_pid):
+        array.setflags(write=False)
+    return ParameterSet(dynamic, joint_pid)
+
+
+def _check_bodies(set_name: str, bodies: np.ndarray, layout: ParameterLayout) -> None:
+    """Raise RobotFileError for full bodies (bodies, 10) that cannot exist, or that are centred."""
+    for body, full, row in zip(layout.bodies, layout.full, bodies, strict=True):
+        where = f"parameters.{set_name}: {body}"
+        if full and (fault := body_fault(row)):
+            raise RobotFileError(f"{where} cannot exist: {fault} (kg, m, kg m^2)")
+        for name, value in zip(FULL_INERTIAL, row, strict=True):
+            if not full and value and name not in INERTIAL:
+                raise RobotFileError(
+                    f"{where}.{name} = {value:g}, but {body} is centred; a full body has "
+                    f'{name}: inertia = "full", or inertia = {{ {body} = "full" }}'
+                )

@@ -1,0 +1,117 @@
+"""True robot of a scenario: its geometry, its bodies and its parameters."""
+
+import numpy as np
+
+from dynamics import Robot
+from dynamics.errors import ParameterError
+from dynamics.parameters import SIGNED, parameter_layout
+from dynamics.pseudo_inertia import body_fault
+from dynamics.spatial_inertia import FULL_INERTIAL
+from identify.arrays import Array
+from identify.errors import ScenarioError
+from identify.estimation.prior import starting_guess
+from identify.loop_parameters import in_form, of_actuators
+from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
+from identify.record.known_geometry import KnownGeometry
+from identify.record.run_error_covariance import factor
+from identify.scenario import Plant as PlantSwitches
+from identify.scenario.sections import Geometry
+
+
+def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> Robot:
+    """Return the true robot with the full bodies of the plant.
+
+    They are those of the robot file, unless the plant states others, and all bodies with a true
+    first moment or product of inertia. Raises ScenarioError, with the valid names, for a true value
+    of a parameter that the robot does not have.
+    """
+    stated = in_form(in_file, switches).layout
+    full = set(stated.full_bodies)
+    known = parameter_layout(in_file.geometry.legs, ("all",)).names
+    for name in switches.values:
+        if name not in known:
+            raise ScenarioError(
+                f"plant.values names {name!r}; {robot.name} has {', '.join(stated.bodies)}, each "
+                f"with {', '.join(FULL_INERTIAL)} (such as platform.mcz), "
+                f"{', '.join(stated.joint_names)} with coulomb and viscous, and joint_pid"
+            )
+        body, entry = name.split(".")
+        if entry in SIGNED:
+            full.add(body)
+    if full == set(robot.layout.full_bodies):
+        return robot
+    return in_file.with_geometry(robot.geometry).with_full_bodies(sorted(full))
+
+
+def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
+    """Return the true parameters (p,): a named set with the drive gains and values of the plant.
+
+    Raises ScenarioError for a body that cannot exist, or a value that is not allowed.
+    """
+    # Only the values of this guess are used, so its standard deviation is arbitrary.
+    values = starting_guess(robot, switches.parameters, 1.0, drive=switches.drive).values
+    layout = robot.layout
+    for name, gain in switches.drive_gains.items():
+        values[layout.names.index(f"joint_pid.{name}")] = gain
+    for name, value in switches.values.items():
+        values[layout.names.index(name)] = value
+    changed = {name.split(".")[0] for name in switches.values}
+    bodies = layout.bodies_of(values[layout.rigid])
+    for body, full, row in zip(layout.bodies, layout.full, bodies, strict=True):
+        if full and body in changed and (fault := body_fault(row)):
+            raise ScenarioError(f"plant.values: {body} cannot exist: {fault} (kg, m, kg m^2)")
+    try:
+        layout.check(values[layout.dynamic])
+    except ParameterError as error:
+        raise ScenarioError(f"plant.values: {error}") from None
+    return values
+
+
+def true_robot(
+    nominal: Robot, switches: PlantSwitches, calibration: Geometry, known: KnownGeometry, seed: int
+) -> Robot:
+    """Return the robot with its true geometry.
+
+    Without a calibration the geometry has the errors that the plant states. If this run calibrates
+    the geometry, the offsets of the encoders are added. With an earlier calibration, the true
+    geometry is drawn at random about the calibrated geometry, with its covariance.
+
+    Raises ScenarioError if the plant states errors and there is an earlier calibration.
+    """
+    if known.covariance is None:
+        return misplaced(nominal, switches)
+    if calibration.known == "calibrated":
+        return nominal.moved(true_deviations(nominal, switches, calibration, seed))
+    for name in ("geometry_error_m", "length_error_m", "axis_error_rad"):
+        if getattr(switches, name):
+            raise ScenarioError(
+                f"plant.{name} = {getattr(switches, name):g} with geometry.known = "
+                f"{calibration.known!r}: the true geometry is drawn from the covariance of "
+                "that calibration; set only one of the two"
+            )
+    drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
+    return known.robot.moved(factor(known.covariance) @ drawn)
+
+
+def true_deviations(
+    robot: Robot, switches: PlantSwitches, calibration: Geometry, seed: int
+) -> Array:
+    """Return the deviations (g,) of the true from the nominal geometric numbers, m and rad.
+
+    They include the offsets of the encoders, which are drawn with the seed.
+    """
+    drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
+    true = misplaced(robot, switches).geometry
+    offset = of_actuators(robot, calibration, "encoder_offset")
+    # An offset of an encoder is the opposite shift of its joint.
+    return true.shifted(-offset * drawn).deviations_from(robot.geometry)
+
+
+def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
+    """Return the robot with the geometric errors that a scenario's plant states."""
+    # The geometry has a separate seed, so that runs with other noise have the same robot.
+    rng = np.random.default_rng(plant.geometry_seed)
+    geometry = nominal.geometry.with_errors(
+        plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad
+    )
+    return nominal.with_geometry(geometry)
