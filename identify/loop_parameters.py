@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -116,9 +117,14 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
         stated.get(body, stated.get(kind, "full" if full else "centred"))
         for body, kind, full in zip(layout.bodies, kinds, layout.full, strict=True)
     ]
-    return robot.with_full_bodies(
-        [body for body, form in zip(layout.bodies, forms, strict=True) if form == "full"]
-    )
+    names = [body for body, form in zip(layout.bodies, forms, strict=True) if form == "full"]
+    return _with_full_bodies(robot, tuple(names))
+
+
+@lru_cache(maxsize=16)
+def _with_full_bodies(robot: Robot, names: tuple[str, ...]) -> Robot:
+    """Return `Robot.with_full_bodies`, from a cache, because base parameters are kept by robot."""
+    return robot.with_full_bodies(names)
 
 
 @dataclass(frozen=True)

@@ -374,6 +374,7 @@ ALONE = {
         "friction", "smoothing_velocity_rad_s", "smoothing_velocity_m_s", "static_ratio", "stribeck_velocity_rad_s",
         "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
+    "scenario.plant.inertia", "scenario.model.inertia", "scenario.plant.values",
     "scenario.rig.known", "scenario.rig.errors", "scenario.rig.drift",
     "scenario.identification.nuisances", "scenario.control.law", "scenario.excitation.law",
     "scenario.plant.drive_gains", "scenario.plant.derivative_filter_s", "scenario.model.derivative_filter_s",

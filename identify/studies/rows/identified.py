@@ -14,7 +14,6 @@ import numpy as np
 import xarray as xr
 from pydantic import Field
 
-from dynamics import Robot, load_robot
 from dynamics.closed_loop import differentiate_servo
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
@@ -44,6 +43,7 @@ from identify.studies.rows.kind import (
     KeysRead,
     Kind,
     Row,
+    robot_named,
     timing,
 )
 from identify.studies.rows.row_sensor import DrawnSensor, rms_um, stated_um
@@ -259,8 +259,8 @@ def compute(
             SilentProgress(),
             result.common_errors.learned,
         )
+        true = plant.parameters_of(result.layout)
         if not prefix:
-            true = plant.parameters_of(result.layout)
             row |= _record_figures(made.excitation) | _parameter_figures(result, true)
             row |= _unseen_figures(result, side, true, made.unseen, predicted)
         covered = coverage(result, plant, made.unseen, predicted)
@@ -342,24 +342,19 @@ def prediction_figures(
 
     `models` holds, for each trajectory, the poses (N, 6) of the estimated model and their
     derivatives (N, 6, p) with respect to the parameters. `true` holds the poses of the true model.
-    Errors of positions scatter less from row to row than errors of single parameters.
+    Positions scatter less from row to row than single parameters.
     """
     squares = []
     stated = []
     for (poses, slopes), true_ones in zip(models, true, strict=True):
         shown = slopes[:, :3]
-        squares.append(np.mean((poses - true_ones)[:, :3] ** 2))
-        stated.append(np.mean(np.einsum("nip,pq,niq->ni", shown, covariance, shown, optimize=True)))
+        squares.append(float(np.mean((poses - true_ones)[:, :3] ** 2)))
+        spread = np.einsum("nip,pq,niq->ni", shown, covariance, shown, optimize=True)
+        stated.append(float(np.mean(spread)))
     return {
         "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
         "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
     }
-
-
-@lru_cache(maxsize=4)
-def robot_named(name: str) -> Robot:
-    """Load a robot, once per process."""
-    return load_robot(name)
 
 
 def designed_trajectories(setup: Setup, seed: int) -> TrajectorySet:

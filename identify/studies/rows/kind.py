@@ -4,13 +4,14 @@ figure is a number that the function computes, such as an rms error.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from cmmsim.files import read_sensor_file
+from dynamics import Robot, load_robot
 from identify.errors import StudyError
 from identify.scenario import Scenario
 from identify.scenario.section import Section
@@ -319,3 +320,9 @@ class Kind:
             return self.options.model_validate(dict(options))
         except ValidationError as error:
             raise StudyError(f"options of {self.name}: {one_line(error, self.options)}") from error
+
+
+@lru_cache(maxsize=4)
+def robot_named(name: str) -> Robot:
+    """Load a robot, once per process."""
+    return load_robot(name)
