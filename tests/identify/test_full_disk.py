@@ -672,7 +672,11 @@ def keep_code(*_):
 
 @pytest.fixture
 def quick_warm_up(disk, monkeypatch):
-    """The module of a warm-up that keeps code on the disk; its processes find it replaced."""
+    """The module of a warm-up that keeps code on the disk; its processes find it replaced.
+
+    This process has its robot's code before, and warns of none.
+    """
+    _ = load_robot("rss6").functions
     monkeypatch.setenv("CMMSIM_CACHE", str(disk.path / "new" / "code"))
     monkeypatch.setattr(warm_up, "get_context", lambda _: get_context("fork"))
     monkeypatch.setattr(warm_up, "_compile_plant", keep_code)
