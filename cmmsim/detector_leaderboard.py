@@ -49,10 +49,10 @@ LIMITS = FitLimits(largest_misfit=np.inf)
 class Condition:
     """Conditions under which a disc is seen.
 
-    ``radius_px`` is the long half axis of the disc's image. ``tilt`` is the angle between the
-    disc's normal and the line of sight, rad. ``noise`` is the standard deviation of a grey value
-    half-way up the edge, as a share of the contrast. ``psf_px`` is the sigma of the Gaussian point
-    spread function.
+    radius_px  long half axis of the disc's image
+    tilt       angle between the disc's normal and the line of sight, rad
+    noise      standard deviation of a grey value half-way up the edge, as a share of the contrast
+    psf_px     sigma of the Gaussian point spread
     """
 
     radius_px: float
@@ -223,10 +223,12 @@ def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
 class Score:
     """Score of one detector under one condition, in px and per axis.
 
-    ``rms_px`` is the rms error over the windows in which the detector found a disc. ``ratio`` is
-    ``rms_px`` divided by the Cramer-Rao bound of these windows, with a 95 % interval from
-    ``ratio_low`` to ``ratio_high``. ``bound_px`` is the bound over all windows. ``bias_px`` is the
-    rms error without noise, and ``lost`` is the share of windows without a found disc.
+    bound_px               Cramer-Rao bound over all windows
+    rms_px                 rms error over the windows in which the detector found a disc
+    ratio                  ``rms_px`` divided by the Cramer-Rao bound of these windows
+    ratio_low, ratio_high  ends of the 95 % interval of ``ratio``
+    bias_px                rms error without noise
+    lost                   share of windows without a found disc
     """
 
     detector: str

@@ -102,12 +102,14 @@ class PlateMark:
 
 @dataclass(frozen=True)
 class GlintMark:
-    """Added light: a Gaussian core and a straight tail.
+    """Added light: a Gaussian core, and a straight tail as wide as the core.
 
-    ``peak`` is the core's largest radiance; radiance above 1 saturates. ``core`` is the standard
-    deviation of the core in px. The tail lies along the direction ``angle``, rad, on both sides of
-    the centre. Its radiance is ``tail_peak`` at the centre and falls by the factor e over ``tail``
-    px. The tail is as wide as the core.
+    centre     (2,), px
+    peak       largest radiance of the core; radiance above 1 saturates
+    core       standard deviation of the core, px
+    tail_peak  radiance of the tail at the centre
+    tail       distance over which the tail's radiance falls by the factor e, px
+    angle      direction of the tail, which lies on both sides of the centre, rad
     """
 
     side: int

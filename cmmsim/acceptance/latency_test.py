@@ -154,7 +154,7 @@ def latency_test(
     def motion(times: Array) -> Array:
         return apply(volume.base_from_volume, _circle(times))
 
-    # If the body cannot be found, the error is raised here, before the frames are tracked.
+    # If the body cannot be found, the exception is raised here, before the frames are tracked.
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
     taken = np.arange(frames) / sensor.timing.frame_rate

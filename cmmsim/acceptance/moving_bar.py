@@ -137,13 +137,15 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
 class BarRun:
     """One run of the bar, which begins to move at time 0.
 
-    ``time`` (n,) are the times of the measured frames, s. ``errors`` (n, 6) are the errors of the
-    relative pose as shift and rotation vector, in axes of the first end, m and rad.
-    ``distance_errors`` (n,) are the errors of the distance between the ends, m. ``variance_ratios``
-    (n,) are squared errors in units of the stated covariance, divided by 6. ``lost`` is the number
-    of frames in which an end was not measured. If GIVEN_UP consecutive frames are lost, the run
-    ends, and its remaining frames count as lost. ``given_up`` is then the reason, and otherwise
-    empty.
+    time             (n,), times of the measured frames, s
+    errors           (n, 6), errors of the relative pose as shift and rotation vector, in axes of
+                     the first end, m and rad
+    distance_errors  (n,), errors of the distance between the ends, m
+    variance_ratios  (n,), squared errors in units of the stated covariance, divided by 6
+    lost             number of frames in which an end was not measured
+    given_up         reason if the run has ended early, otherwise empty
+
+    If GIVEN_UP consecutive frames are lost, the run ends, and its remaining frames count as lost.
     """
 
     name: str
@@ -231,7 +233,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     """Measure the bar at ``times`` (n,) s of a path. Before time 0, the bar stands still."""
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
-        # If an end cannot be found, the error is raised here, before the frames are tracked.
+        # If an end cannot be found, the exception is raised here, before the frames are tracked.
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
     rows = []

@@ -119,13 +119,16 @@ def _moved(transform: Array, change: Array) -> Array:
 class Adjustment:
     """Result of an adjustment.
 
-    ``residuals`` (m, 2) of each camera are measured minus computed pixels, and ``sigma_px`` is the
-    estimated standard deviation of a pixel coordinate. ``covariance`` (24, 24) belongs to the 9
-    left intrinsics, the 9 right intrinsics and the small error [dt, dphi] of right_from_left.
-    ``independent_covariance`` is the same matrix under the assumption that all points have
-    independent errors. ``condition`` is the condition number of N scaled to a unit diagonal.
-    ``steps`` is the number of iterations. ``freedom`` is the number of observations minus the
-    number of unknowns, and ``shared`` describes the common errors of the points of a view.
+    state                   adjusted rig and board poses
+    residuals               (m, 2) for each camera, measured minus computed pixels
+    sigma_px                estimated standard deviation of a pixel coordinate
+    covariance              (24, 24), of the 9 left intrinsics, the 9 right intrinsics and the small
+                            error [dt, dphi] of right_from_left
+    independent_covariance  the same matrix if all points had independent errors
+    condition               condition number of N scaled to a unit diagonal
+    steps                   number of iterations
+    freedom                 number of observations minus number of unknowns
+    shared                  common errors of the points of a view
     """
 
     state: RigState

@@ -31,13 +31,15 @@ class FitLimits:
 
 @dataclass(frozen=True)
 class DetectedCentres:
-    """Ellipse centres in n windows, in px of the whole image.
+    """Ellipse centres in n windows.
 
-    ``centres`` (n, 2) have ``covariances`` (n, 2, 2) px², which are the effect of pixel noise to
-    first order. ``good`` (n,) is True if a window contains one whole bright spot. The values of
-    other windows are finite but meaningless. A detector can also state ``shapes`` (n, 2, 2) px,
-    ``shape_covariances`` (n, 3, 3) px² of A_xx, A_xy, A_yy, and ``misfits`` (n,), the reduced
-    chi-square of the grey values.
+    centres            (n, 2), px of the whole image
+    covariances        (n, 2, 2), effect of pixel noise on the centres to first order, px²
+    good               (n,), True if a window contains one whole bright spot; the values of other
+                       windows are finite but meaningless
+    shapes             (n, 2, 2), symmetric matrices A of the ellipses, px; optional
+    shape_covariances  (n, 3, 3), of A_xx, A_xy, A_yy, px²; optional
+    misfits            (n,), reduced chi-square of the grey values; optional
     """
 
     centres: Array
@@ -73,11 +75,15 @@ def no_centres() -> DetectedCentres:
 class SpotWindows:
     """Windows that contain one bright spot each, and the known properties of their images.
 
-    ``windows`` (n, h, h) are grey values, and ``corners`` (n, 2) are the pixels (x, y) of the whole
-    image at which they begin. ``fit_size`` is the side in px of the part around the bright spot
-    that is used. ``psf_px`` is the standard deviation of the Gaussian point spread. ``smears`` (n,
-    2) px are the movements of the spots during the exposure. The centres to be found are those at
-    the middle of the exposure.
+    windows   (n, h, h), grey values
+    corners   (n, 2), pixels (x, y) of the whole image at which the windows begin
+    noise     noise of the camera
+    fit_size  side of the part around the bright spot that is used, px
+    limits    limits for accepting a spot
+    psf_px    standard deviation of the Gaussian point spread
+    smears    (n, 2), movements of the spots during the exposure, px; None for spots at rest
+
+    The centres to be found are those at the middle of the exposure.
     """
 
     windows: NDArray

@@ -22,12 +22,17 @@ UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 class FitSettings(NamedTuple):
     """Settings of a fit.
 
-    Pixels within ``ring_reach`` radii of the ellipse are fitted, and no radius is below
-    ``smallest`` px. Steps are limited to ``largest_step`` (7,). ``iterations`` is the largest
-    number of steps; a step below ``converged`` px ends the fit. ``psf_px`` is the standard
-    deviation of the point spread, or 0. The light of a moving ellipse is a sum over positions that
-    are ``smear_step`` px apart. ``variances`` is a table of noise variances that begins at the grey
-    value ``first_grey`` and has ``entries_a_grey`` entries per grey value.
+    ring_reach      pixels within this number of radii of the ellipse are fitted
+    smallest        smallest radius, px
+    largest_step    (7,), largest step of each parameter
+    iterations      largest number of steps
+    converged       length below which a step ends the fit, px
+    psf_px          standard deviation of the point spread, or 0
+    smear_step      distance between the positions over which the light of a moving ellipse is
+                    summed, px
+    variances       table of noise variances by mean grey value
+    first_grey      grey value at which the table begins
+    entries_a_grey  number of table entries per grey value
     """
 
     ring_reach: float

@@ -30,10 +30,13 @@ CORE_THRESHOLD = 0.4
 class BrightSpots:
     """Windows cut down to the surroundings of their bright spots.
 
-    ``windows`` (n, h, h) begin at pixels ``corners`` (n, 2) of the whole image. ``contrast`` (n,)
-    is in grey values. ``weights`` (n, h, h) are the weights of the pixels in the centroid, and
-    ``within`` (n, h, h) is True for pixels that count. ``centroids`` (n, 2) are relative to the
-    window, px, and ``spreads`` (n, 2, 2) are the second moments of the spot's core, px².
+    windows    (n, h, h), grey values
+    corners    (n, 2), pixels of the whole image at which the windows begin
+    contrast   (n,), grey values
+    weights    (n, h, h), weights of the pixels in the centroid
+    within     (n, h, h), True for pixels that count
+    centroids  (n, 2), relative to the window, px
+    spreads    (n, 2, 2), second moments of the spot's core, px²
     """
 
     windows: Array

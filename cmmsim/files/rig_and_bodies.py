@@ -100,10 +100,12 @@ def _right_from_left(section: RightFromLeft) -> Array:
 class MarkedBody:
     """Body with planes and nominal sticker places, in body axes.
 
-    Planes A, B, C fulfil n . p = d. The rows of ``normals`` (3, 3) are n, and ``offsets`` (3,) are
-    d, m. ``sticker_ids`` (n,) are the names of the stickers, such as "A1". ``plane_index`` (n,) is
-    the plane of each sticker, 0 to 2. ``nominal`` (n, 3) are the nominal places, m. ``in_plane``
-    (n, 3, 2) are the u and v axes of each sticker's plane.
+    normals      (3, 3), unit normals n of the planes A, B, C, which fulfil n . p = d
+    offsets      (3,), offsets d of the planes, m
+    sticker_ids  (n,), names of the stickers, such as "A1"
+    plane_index  (n,), plane of each sticker, 0 to 2
+    nominal      (n, 3), nominal places, m
+    in_plane     (n, 3, 2), u and v axes of each sticker's plane
     """
 
     name: str

@@ -21,11 +21,12 @@ SHORT_ARC = 0.2
 class Cover(NamedTuple):
     """Contributions of arcs to the covered areas of a window.
 
-    ``shares`` (h, w) are the areas between the left side of a pixel and the arcs inside it.
-    ``past`` (h, w + 1) is the total rise dy of the arcs in a pixel, which contributes to all pixels
-    to the left. ``touched`` (h, w) is True for pixels with arcs. ``derivatives`` (h, w, 5) of the
-    shares are with respect to [c_x, c_y, A_xx, A_xy, A_yy]; with the shape (0, 0, 5) they are not
-    computed.
+    shares       (h, w), areas between the left side of a pixel and the arcs inside it
+    past         (h, w + 1), total rise dy of the arcs in a pixel, which contributes to all pixels
+                 to the left
+    touched      (h, w), True for pixels with arcs
+    derivatives  (h, w, 5), of the shares by [c_x, c_y, A_xx, A_xy, A_yy]; not computed if the shape
+                 is (0, 0, 5)
     """
 
     shares: Array

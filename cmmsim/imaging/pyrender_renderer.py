@@ -86,7 +86,7 @@ def _shared_atlas() -> "_Atlas":
         import pyrender
 
         return _Atlas(pyrender)
-    except Exception as error:  # PyOpenGL's platform plugins raise errors of many types
+    except Exception as error:  # PyOpenGL's platform plugins raise exceptions of many types
         raise OpenGLMissingError(error) from error
 
 

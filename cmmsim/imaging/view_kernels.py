@@ -20,9 +20,15 @@ NEAREST = 1e-3
 class Scene(NamedTuple):
     """Discs and convex solids, in the axes of their bodies.
 
-    Discs have places and normals (m, 3), radii (m,), levels (m,) and bodies ``owners`` (m,). Solids
-    have bodies (s,), levels (s,) and middles (s, 3). The vertices (v, 3) of solid k begin at
-    vertex_starts[k]. Its faces, normal . x + offset <= 0, begin at face_starts[k].
+    places, normals             (m, 3), of the discs
+    radii, disc_levels          (m,), of the discs
+    owners                      (m,), bodies of the discs
+    bodies, levels              (s,), bodies and levels of the solids
+    middles                     (s, 3), of the solids
+    vertices                    (v, 3), of all solids
+    vertex_starts               vertices of solid k begin at vertex_starts[k]
+    face_normals, face_offsets  faces of all solids: normal . x + offset <= 0
+    face_starts                 faces of solid k begin at face_starts[k]
     """
 
     places: Array

@@ -61,11 +61,14 @@ STEP_TOLERANCE = 1e-8
 class SolvedFrames:
     """Poses of a body in f frames, and the stickers from which they were computed.
 
-    ``moves`` (f,4,4) are camera_from_body, whose small errors [dt, dphi] have the ``covariances``
-    (f,6,6). ``stickers`` are the k stickers of all frames; their covariances are enlarged if
-    residuals are larger than noise. ``used`` (k,) is False for rejected stickers. The stickers of
-    frame j begin at ``starts[j]`` and end at ``starts[j + 1]``. ``verdicts`` (f, COLUMNS) states
-    why frames are lost. ``places`` (n, 3) are the taught places on ``body``.
+    moves        (f, 4, 4), camera_from_body
+    covariances  (f, 6, 6), of the small errors [dt, dphi] of camera_from_body
+    stickers     the k stickers of all frames, with enlarged covariances if residuals are larger
+                 than noise
+    used         (k,), False for rejected stickers
+    starts       (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
+    verdicts     (f, COLUMNS), reasons why frames are lost
+    places       (n, 3), taught places on ``body``
     """
 
     moves: Array

@@ -46,14 +46,19 @@ GRAZING = 0.15
 class DetectionSettings:
     """Settings of the search for stickers.
 
-    ``window_size`` and ``fit_size`` are the sides of windows and of fitted parts, px. ``radius`` is
-    the radius of a sticker, m. ``largest_ray_gap`` limits the squared distance between the two rays
-    of a sticker, in units of the distance's variance; 25 means five sigma. ``centre_error_px`` is
-    the rms of systematic errors of a centre, such as errors of the image formation. The squares of
-    this error and of the detector's bias are added to the variances of a centre. Errors of the rig
-    move images off their epipolar lines. ``line_error_px`` is the standard deviation of this
-    distance, and increases the allowed distance between two rays. ``exposed_share`` is the ratio of
-    exposure time to frame period.
+    window_size      side of a window, px
+    fit_size         side of the part of a window that is fitted, px
+    radius           radius of a sticker, m
+    limits           limits for accepting a fit
+    largest_ray_gap  largest squared distance between the two rays of a sticker, in units of the
+                     distance's variance; 25 means five sigma
+    centre_error_px  rms of systematic errors of a centre; the squares of this error and of the
+                     detector's bias are added to the variances of a centre
+    detector         name of the detector
+    optics           point spread and vignetting of the lenses
+    exposed_share    ratio of exposure time to frame period
+    line_error_px    standard deviation of an image's distance from its epipolar line that errors of
+                     the rig cause; it increases the allowed distance between two rays
     """
 
     window_size: int = 16
@@ -88,11 +93,11 @@ class Outlines:
 class StickerObservation:
     """Stickers seen by both cameras, k of them.
 
-    ``index`` (k,) refers to the body's stickers. Pixels (k, 2) are the sticker centres in the
-    distorted images; the eccentricity is removed. ``points`` (k, 3) and ``covariances`` (k, 3, 3)
-    are in the camera frame, m. ``pixel_variances`` (k,) are the variances of pixel coordinates,
-    px², mean over both images and axes. ``outlines`` are the ellipses of the stickers, or None if
-    the detector states no ellipses.
+    index                      (k,), indices of the stickers among the body's stickers
+    left_pixels, right_pixels  (k, 2), sticker centres in the distorted images, without eccentricity
+    points, covariances        (k, 3) and (k, 3, 3), in the camera frame, m
+    pixel_variances            (k,), of pixel coordinates, mean over both images and axes, px²
+    outlines                   ellipses of the stickers; None if the detector states no ellipses
     """
 
     index: NDArray[np.int_]
@@ -232,13 +237,14 @@ class Observer:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    ``index`` (k,) refers to the body's stickers. ``exposures`` (k,) are the numbers of the
-    exposures that show them, in rising order, and 0 for a single exposure. Stickers have places
-    (k, 3) m and normals (k, 3) in body axes, and the body is expected at ``camera_from_body`` (4,
-    4) or (N, 4, 4). ``windows`` (2, k, h, h), without vignetting, have first pixels ``corners`` (2,
-    k, 2). ``offsets`` (2, k, 2) px lead from the images of the stickers' centres to the centres of
-    their ellipses (eccentricity). For exposures without images, ``found`` is the detector's result,
-    and the windows are empty.
+    index             (k,), indices of the stickers among the body's stickers
+    exposures         (k,), number of the exposure that shows each sticker, in rising order
+    camera_from_body  (4, 4) or (N, 4, 4), expected place of the body in each exposure
+    places, normals   (k, 3), of the stickers, in body axes, m
+    corners           (2, k, 2), first pixels of the windows
+    windows           (2, k, h, h), grey values without vignetting; empty without images
+    offsets           (2, k, 2), eccentricities of the ellipses, px
+    found             result of the detector for exposures without images, otherwise None
     """
 
     observer: Observer

@@ -47,9 +47,11 @@ COLUMNS = 7
 class ObservedStickers(NamedTuple):
     """Stickers of one frame or of several frames.
 
-    ``used`` (n,) is False for rejected stickers. ``points`` (n,3) are in the camera frame, m, and
-    have ``informations`` and ``covariances`` (n,3,3). ``rigid_kernels`` explains ``arms`` and
-    ``gaps`` (n,3), which are overwritten.
+    used          (n,), False for rejected stickers
+    points        (n, 3), in the camera frame, m
+    informations  (n, 3, 3), inverse covariances of the points
+    covariances   (n, 3, 3), covariances of the points
+    arms, gaps    (n, 3), overwritten; ``rigid_kernels`` explains them
     """
 
     used: Array
@@ -78,12 +80,14 @@ class Outlines(NamedTuple):
 class SolverLimits(NamedTuple):
     """Limits for the stickers of a frame.
 
-    ``largest_misfit`` limits the squared misfit of one sticker, and ``largest_excess`` the mean
-    square of all residuals. ``fewest`` is the smallest number of stickers. ``smallest_share`` is
-    the smallest share of a sticker's noise that must appear in its residual. ``smallest_width`` is
-    the smallest extent of the stickers across a line through them, m. A fit ends after a step with
-    a rotation below ``step_tolerance``, rad. ``totals`` (f,) are the largest sums of squared
-    residuals that noise explains, by the number of degrees of freedom.
+    largest_misfit  squared misfit of one sticker
+    largest_excess  mean square of all residuals
+    fewest          smallest number of stickers
+    smallest_share  smallest share of a sticker's noise that must appear in its residual
+    smallest_width  smallest extent of the stickers across a line through them, m
+    step_tolerance  rotation below which a step ends a fit, rad
+    totals          (d,), largest sums of squared residuals that noise explains, by the number of
+                    degrees of freedom
     """
 
     largest_misfit: float

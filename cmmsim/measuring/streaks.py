@@ -62,11 +62,13 @@ class Streaks:
 
 @dataclass(frozen=True)
 class _Ellipses:
-    """Ellipses fitted as if they moved by ``smears`` (k, 2) px during the exposure.
+    """Ellipses fitted as if they moved by ``smears`` during the exposure.
 
-    ``excess`` (k, 3) px² are xx, xy, yy of A A - A_0 A_0 + d d' / 3. The matrices ``whiten`` (k, 3,
-    3) transform their covariances into unit matrices. ``bright`` (k,) ellipses have enough
-    contrast. ``good`` (k,) ellipses are bright and lie wholly inside their windows.
+    smears  (k, 2), px
+    excess  (k, 3), entries xx, xy, yy of A A - A_0 A_0 + d d' / 3, px²
+    whiten  (k, 3, 3), matrices that transform the covariances of ``excess`` into unit matrices
+    bright  (k,), True for ellipses with enough contrast
+    good    (k,), True for bright ellipses that lie wholly inside their windows
     """
 
     smears: Array

@@ -207,10 +207,11 @@ class MeasuringGeometry:
 class _View:
     """Stickers that are seen at the N poses of a run.
 
-    ``frames`` (N, 4, 4) are base_from_platform. ``seen`` (n,) are the indices of the stickers.
-    ``arms`` (N, n, 3) lead from the platform's origin to the stickers, in camera axes. ``slopes``
-    (2, N, n, 2, 3) are the derivatives of the stickers' pixels by their points, and ``by_rig`` (2,
-    N, n, 2, 24) their derivatives by the rig's parameters.
+    frames  (N, 4, 4), base_from_platform
+    seen    (n,), indices of the stickers
+    arms    (N, n, 3), from the platform's origin to the stickers, in camera axes
+    slopes  (2, N, n, 2, 3), derivatives of the stickers' pixels by the stickers' points
+    by_rig  (2, N, n, 2, 24), derivatives of the stickers' pixels by the rig's parameters
     """
 
     camera_from_base: Array

@@ -24,14 +24,20 @@ from cmmsim.geometry.matrix_kernels import factor, invert_factored
 
 
 class CentreNoise(NamedTuple):
-    """Table of the inverse covariance of a centre.
+    """Table of the inverse covariance of an ellipse's centre.
 
-    ``table`` (a, b, c, 3) contains the entries xx, xy, yy of the inverse covariance, divided by the
-    ellipse's mean half axis m. The axes of the table are m and the ovalness p and q, which
-    ``statistical_tracker`` explains. The axes begin at ``first`` (3,) and have ``steps`` (3,). At
-    the share ``light`` of full light, the covariance is larger by the factor by_light[0] / light² +
-    by_light[1] / light + by_light[2]. ``contrast``, ``ring`` and ``black`` are grey values at full
-    light; ``ring`` is relative to ``black``. ``fit_size`` px and ``settings`` are those of the fit.
+    table     (a, b, c, 3), entries xx, xy, yy of the inverse covariance, divided by the ellipse's
+              mean half axis m; the axes of the table are m and the ovalness p and q, which
+              ``statistical_tracker`` explains
+    first     (3,), values of m, p and q at which the axes begin
+    steps     (3,), steps of the axes
+    by_light  (3,); at the share ``light`` of full light, the covariance is larger by the factor
+              by_light[0] / light² + by_light[1] / light + by_light[2]
+    contrast  contrast at full light, grey values
+    ring      grey value of the ring at full light, relative to ``black``
+    black     grey value without light
+    fit_size  side of the fitted part, px
+    settings  settings of the fit
     """
 
     table: Array
@@ -166,10 +172,14 @@ def contains(centre: float, reach: float, size: int) -> bool:
 class Ellipses(NamedTuple):
     """Ellipses of m stickers in both images.
 
-    Their centres are (2, m, 2), shapes (2, m, 2, 2) and smears (2, m, 2), px. ``seen`` (2, m) is
-    True for wholly visible ellipses. ``noise`` (2, m, 6) are unit normal numbers: two for the
-    centre, three for the shape, and one for the limit of thin ellipses. Contrasts and grounds (2,
-    m) are grey values.
+    centres    (2, m, 2), px
+    shapes     (2, m, 2, 2), px
+    smears     (2, m, 2), movements during the exposure, px
+    seen       (2, m), True for wholly visible ellipses
+    noise      (2, m, 6), unit normal numbers: two for the centre, three for the shape, and one
+               for the limit of thin ellipses
+    contrasts  (2, m), grey values
+    grounds    (2, m), grey values
     """
 
     centres: Array
@@ -214,9 +224,10 @@ class Fits(NamedTuple):
 class DetectionLimits(NamedTuple):
     """Limits for an ellipse that can be fitted.
 
-    ``radius`` is the smallest half width, px. Half of the fits of ellipses with the half width
-    ``thin_px`` fail, because they are too thin; ``thin_std_px`` is the standard deviation of this
-    limit between fits. ``contrast`` is the smallest contrast in grey values.
+    radius       smallest half width, px
+    thin_px      half width at which half of the fits fail, because the ellipse is too thin
+    thin_std_px  standard deviation of this half width between fits
+    contrast     smallest contrast, grey values
     """
 
     radius: float

@@ -40,10 +40,11 @@ STEP_TOLERANCE = 2e-4
 class Frame(NamedTuple):
     """Stickers found by two cameras in one frame.
 
-    ``stickers`` states which stickers are used, with their triangulated places. ``pixels`` (n, 2,
-    2) have covariances ``spreads`` (n, 2, 2, 2), px². ``variances`` (n,) are the variances of a
-    pixel coordinate, averaged over both images. ``longest`` (1,) is the longest path of a sticker
-    during the exposure, px.
+    stickers   mask of the used stickers, and triangulated places
+    pixels     (n, 2, 2), centres in both images
+    spreads    (n, 2, 2, 2), covariances of the pixels, px²
+    variances  (n,), variance of a pixel coordinate, mean over both images, px²
+    longest    (1,), longest path of a sticker during the exposure, px
     """
 
     stickers: ObservedStickers
@@ -68,12 +69,13 @@ class Stickers(NamedTuple):
 class Limits(NamedTuple):
     """Limits for finding a sticker, and properties of the images.
 
-    The cosine between the normal of a sticker and the direction to each camera exceeds ``grazing``.
-    ``thin_px`` and ``thin_std_px`` are mean and standard deviation of the smallest half width of an
-    ellipse. ``largest_gap`` is the largest squared distance of the two rays. No body may hide a
-    point of the sticker's plane within ``clear`` m of its centre. ``vignetting`` is that of the
-    lens.
-    ``line_variance`` px² is the variance of the rays' distance that is due to errors of the rig.
+    grazing        smallest cosine between the normal of a sticker and the direction to a camera
+    thin_px        mean of the smallest half width of an ellipse
+    thin_std_px    standard deviation of the smallest half width
+    largest_gap    largest squared distance of the two rays
+    clear          radius around a sticker, in its plane, within which no body may hide a point, m
+    vignetting     vignetting of the lens
+    line_variance  variance of the rays' distance that is due to errors of the rig, px²
     """
 
     grazing: float
@@ -86,11 +88,17 @@ class Limits(NamedTuple):
 
 
 class StereoScene(NamedTuple):
-    """Cameras, and the scene in front of them.
+    """Two cameras, and the scene in front of them.
 
-    ``true_cameras`` are the true cameras, and ``assumed_cameras`` the cameras that the estimator
-    assumes. ``owners`` (n,) are the bodies of the stickers, here all 0 for the platform. The taught
-    base_from_camera and camera_from_base are (4, 4).
+    true_cameras                        cameras that form the images
+    assumed_cameras                     cameras that the estimator assumes
+    stickers                            stickers of the platform
+    owners                              (n,), bodies of the stickers, here all 0 for the platform
+    solids                              solids that can hide stickers
+    noise                               noise of a sticker's centre
+    limits                              limits for finding a sticker
+    solver_limits                       limits of the solver of poses
+    base_from_camera, camera_from_base  (4, 4), taught transforms
     """
 
     true_cameras: Cameras

@@ -83,7 +83,7 @@ def write_files(
     """Write several files: all of them, or none.
 
     ``parents`` is as in `write_bytes`. ``check`` is called with the temporary path of the first
-    file before any file is in place, and can refuse it by an exception.
+    file before any file is in place, and can refuse the files by an exception.
 
     Raises WriteError.
     """

@@ -254,7 +254,7 @@ def _deviations(group: Entry) -> str:
 
 
 def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
-    """Return the sum of the absolute values of the terms of a sum at the initial guess."""
+    """Return the sum of the absolute values of a group's terms at the initial guess."""
     return sum(
         abs(weight * (parameters[name]["initial"] or 0.0))
         for name, weight in group["coefficients"].items()

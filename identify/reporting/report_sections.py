@@ -30,8 +30,16 @@ class FoldedText:
 class Section:
     """Section of the report.
 
-    It has paragraphs of text, names of pictures, names of folded pictures by title, tables, and
-    folded texts.
+    Attributes
+    ----------
+    text
+        Paragraphs.
+    pictures
+        Names of pictures.
+    folded
+        Names of folded pictures, by title.
+    tables, folds
+        Tables, and folded texts.
     """
 
     title: str

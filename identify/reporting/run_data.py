@@ -34,10 +34,24 @@ from identify.trajectory import TrajectorySet, load_trajectories
 class RunData:
     """Data of a run.
 
-    The covariance (p, p) belongs to the parameters with the given names (p,). ``validation`` has
-    the records of the validation runs, ``validation_truth`` the truth of the first one, and
-    ``models`` the poses of the models in all runs. For a record of a real robot, truth and
-    trajectories are None, and there are no validation runs.
+    For a record of a real robot, truth and trajectories are None, and there are no validation runs.
+
+    Attributes
+    ----------
+    result
+        Content of `result.json`.
+    experiment, truth
+        Record of the excitation run, and its truth.
+    validation
+        Records of the validation runs.
+    validation_truth
+        Truth of the first validation run.
+    models
+        Poses of the models, by the name of the run.
+    covariance, names
+        Covariance (p, p) of the estimates, and the names (p,) of the parameters.
+    trajectories
+        Trajectories of excitation and validation.
     """
 
     result: dict[str, Any]

@@ -1,6 +1,6 @@
 """Bodies of a workcell as one binary glTF file.
 
-three.js on the replay page, Blender and other programs can open it. Its nodes have the names of
+three.js on the replay page, Blender and other programs can open the file. Nodes have the names of
 bodies and legs. Lengths are in m, in the base frame with z up.
 """
 

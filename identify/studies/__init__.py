@@ -1,1 +1,1 @@
-"""Noise studies: a scenario varied over factors, in many rows, on one machine or many."""
+"""Studies of a scenario that is varied over factors. A row is one computation at one setting."""

@@ -255,7 +255,7 @@ class Suspects:
 
 
 def compute(shared: Shared, cases: list[Case]) -> list[Finished]:
-    """Compute rows one after the other. An error in a row does not affect the other rows.
+    """Compute rows one after the other. An exception in a row does not affect the other rows.
 
     Only this function runs in other processes and on other machines.
     """

@@ -67,12 +67,20 @@ TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 
 @dataclass(frozen=True)
 class Fit:
-    """Measured and modelled poses (N, 6) [m, rad] of a run over its time (N,) [s].
+    """Measured and modelled poses (N, 6) of a run, m and rad.
 
-    They are NaN if a measurement was lost or a model has diverged. ``initial`` are the poses of the
-    initial model. ``std`` (N, 6) is the predicted standard deviation of the truth from the
-    identified model. ``noise`` (6,) is the standard deviation of one measured pose according to the
-    sensor.
+    Poses are NaN if a measurement was lost or a model has diverged.
+
+    Attributes
+    ----------
+    time
+        Times (N,), s.
+    measured, identified, initial, truth
+        Measured poses, poses of the identified and of the initial model, and true poses.
+    std
+        Predicted standard deviation (N, 6) of the truth from the identified model.
+    noise
+        Standard deviation (6,) of one measured pose according to the sensor.
     """
 
     time: Array
