@@ -1,8 +1,8 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
 The discs are drawn exactly, at known random positions within a pixel, and the camera's noise is
-added. An error is the distance between the detected centre and the centre of the ellipse. The
-disc's own centre is imaged beside the ellipse's centre (eccentricity); errors do not include this
+added. An error is the distance between the detected centre and the centre of the ellipse. The image
+of the disc's centre lies beside the ellipse's centre (eccentricity). Errors do not include this
 distance. Two methods of OpenCV are compared as well.
 """
 
@@ -198,7 +198,7 @@ def random_ellipses(
     sine = np.sin(condition.tilt)
     cosine = np.cos(condition.tilt)
     normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
-    # The discs lie at depth 1: only ratios of lengths matter.
+    # The discs lie at depth 1, because only ratios of lengths matter.
     places = np.column_stack([away / focal_px, np.ones(count)])
     return project_discs(camera, places, normals, np.full(count, condition.radius_px / focal_px))
 

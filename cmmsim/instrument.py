@@ -292,7 +292,8 @@ class Instrument:
         self.true_cameras.drift(changes, frames)
 
     def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
-        """Return the errors of the rig and of the taught frames, which all poses have in common.
+        """Return the errors that all poses have in common: those of the rig and of the taught
+        frames.
 
         Parameters
         ----------
@@ -302,7 +303,7 @@ class Instrument:
         Returns
         -------
         CommonErrors
-            Errors, and the changes of these poses that they cause.
+            The errors, and the changes of the poses that the errors cause.
 
         Raises
         ------
@@ -331,7 +332,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class StickerView:
-    """Stickers of both bodies as a rig sees them, with the platform at home.
+    """Stickers of platform and base in front of a rig, with the platform at home.
 
     ``known`` states how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is
     the transform that the sensor file states.

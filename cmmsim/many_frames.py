@@ -56,7 +56,7 @@ class Frames:
 
 
 def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[MeasuredExposures]:
-    """Measure frames block by block. The movement during each exposure is assumed to be known.
+    """Measure frames block by block. The estimator is given the true movement during each exposure.
 
     The result does not depend on the number of threads.
     """
@@ -66,7 +66,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
     rngs = frames.rngs
     expected = frames.expected
     half = 0.5 * camera.exposure * rates
-    # The true movement during the exposure is applied to the expected pose.
+    # The platform is assumed to move from the expected pose as it truly moves during the exposure.
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)

@@ -6,8 +6,8 @@ each other. The planes are fitted to the mean constellation. Because the sticker
 sub-pixel positions at different poses, errors of the image formation are averaged out as well.
 
 The centres always come from the maximum-likelihood fit, whichever detector the sensor measures
-with. The base is seen at one pose only, so the bias of another detector would stay in every
-measured pose.
+with. The base is seen at one pose only. Every measured pose would therefore contain the bias of
+another detector.
 
 The search windows are made for the largest image of a sticker. This is the larger of two images:
 the image at the nearest working distance, assumed a fifth nearer than the rig's target, and the
@@ -50,9 +50,10 @@ CYCLES = np.array([1, 2, 3, 3, 1, 2])
 # m: in averaged exposures, an unhidden sticker is seen within a few micrometres of its place.
 LARGEST_GAP = 1e-4
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
-# Ratio of half the side of the fitted part to a sticker's radius at the rig's target.
+# Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
+# a sticker's radius at the rig's target.
 ROOM = 1.35
-# px of free margin around the largest sticker at teaching. Rounding can take half a pixel.
+# px: smallest free margin around the largest sticker at teaching. Rounding can use up half a pixel.
 SMALLEST_ROOM_PX = 0.7
 SMALLEST_FIT = 12
 SMALLEST_BLURRED_FIT = 14
@@ -120,7 +121,7 @@ class Teacher:
                 for body in (self.base, self.platform)
             ]
             report(1, steps)
-            # The error of this single view stays in every measured pose, so it is averaged longest.
+            # Every measured pose contains the error of this single view, so it is averaged longest.
             base = self._look_at(
                 self.base,
                 start[0],
@@ -131,7 +132,7 @@ class Teacher:
                 self.plan.base_window,
             )
             camera_from_base, base_covariance, base = by_planes(
-                base, self.base, _towards(self.base, start[0])
+                base, self.base, _plane_normals(self.base, start[0])
             )
             report(2, steps)
             seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
@@ -213,7 +214,7 @@ class Teacher:
             )
             if k == 0:
                 body_from_camera = invert(
-                    by_planes(seen[0], self.platform, _towards(self.platform, rough))[0]
+                    by_planes(seen[0], self.platform, _plane_normals(self.platform, rough))[0]
                 )
                 places = apply(body_from_camera, seen[0].points)
             now = register(places, seen[-1].points, seen[-1].covariances).transform
@@ -251,9 +252,11 @@ def platform_frame(
     """
     views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
     mean, covariances = mean_constellation(*views)
-    towards = _towards(platform, register(platform.nominal, mean, covariances).transform)
+    rough_normals = _plane_normals(
+        platform, register(platform.nominal, mean, covariances).transform
+    )
     whole = replace(seen[0], points=mean, covariances=covariances)
-    mean_from_body, frame_covariance, _ = by_planes(whole, platform, towards)
+    mean_from_body, frame_covariance, _ = by_planes(whole, platform, rough_normals)
     body_from_mean = invert(mean_from_body)
     turn = body_from_mean[:3, :3]
     return (
@@ -264,14 +267,16 @@ def platform_frame(
 
 
 def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
-    """Return the sticker places (c, n, 3) of c teachings, as ``platform_frame`` does for one.
+    """Return the sticker places (c, n, 3) of c teachings; ``platform_frame`` does so for one.
 
     Each teaching has v views of the stickers, at points (c, v, n, 3) with covariances (c, v, n, 3,
     3).
     """
     mean, covariances = mean_constellation(points, covariances)
-    towards = _towards(platform, register_sets(platform.nominal, mean, covariances).transform)
-    return apply_each(invert(frames_by_planes(platform, mean, covariances, towards)), mean)
+    rough_normals = _plane_normals(
+        platform, register_sets(platform.nominal, mean, covariances).transform
+    )
+    return apply_each(invert(frames_by_planes(platform, mean, covariances, rough_normals)), mean)
 
 
 def teaching_path(home: Array, count: int) -> Array:
@@ -283,7 +288,7 @@ def teaching_path(home: Array, count: int) -> Array:
     return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
 
 
-def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
+def _plane_normals(body: MarkedBody, camera_from_body: Array) -> Array:
     """Return the normals (..., 3, 3) of a body's planes in the camera frame.
 
     The body stands at camera_from_body (..., 4, 4).

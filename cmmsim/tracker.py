@@ -11,8 +11,8 @@ from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator, require_fitting
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# If the predicted windows show less than this share of the stickers that the last frame showed, the
-# whole images are searched as well. A wrong prediction can lay windows beside their stickers.
+# The whole images are searched as well if the predicted windows show fewer stickers than this share
+# of those in the last frame. A wrong prediction places windows beside the stickers.
 EXPECTED_SHARE = 0.7
 
 

@@ -89,8 +89,8 @@ def expected_covariance(
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
     """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad.
 
-    One exposure is drawn, and its stickers are read at the places that follow from the pose,
-    without teaching or search. Raises the same exceptions as `expected_covariance`.
+    One exposure is drawn. Stickers are measured at the places that follow from the pose, without
+    teaching or search. Raises the same exceptions as `expected_covariance`.
     """
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform

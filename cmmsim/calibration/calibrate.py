@@ -42,7 +42,8 @@ TOLERANCE_PX = 1e-4
 BOARD_SIDES = (0.01, 5.0)
 # Largest share of unused pairs without a warning.
 LARGEST_UNUSED = 1.0 / 3.0
-# Share of the baseline beyond which a right camera on the left of the left camera is reported.
+# A right camera that stands to the left of the left camera by more than this share of the baseline
+# is reported.
 LEFTWARD = 0.5
 # Largest standard deviations without a warning, as shares of the focal length and image width.
 LARGEST_FOCAL_STD = 0.003

@@ -175,7 +175,7 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 class SensorTemplate:
     """Text of a sensor file without the tables of its cameras.
 
-    Relative paths in ``text`` refer to the folder for which it was made. ``size`` is (width,
+    Relative paths in ``text`` refer to the folder for which the text was made. ``size`` is (width,
     height) of the images, px, and ``baseline`` the distance between the cameras, m, both from the
     original file. ``name`` is the built-in name or the path of that file.
     """

@@ -20,9 +20,8 @@ from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, soli
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
-# Constants of the drawn board.
-# Width of the plate beyond its outermost points, in spacings. A chessboard's outer squares fill it,
-# and a bright rim of width RIM surrounds them.
+# Constants of the drawn board. Width of the plate beyond its outermost points, in spacings. A
+# chessboard's outer squares fill this margin, and a bright rim of width RIM surrounds the squares.
 MARGIN = 1.0
 RIM = 0.35
 THICKNESS = 0.008  # m

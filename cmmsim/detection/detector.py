@@ -52,10 +52,10 @@ class DetectedCentres:
     def with_others(
         self, at: NDArray[np.int_], others: DetectedCentres, which: NDArray[np.bool_]
     ) -> Self:
-        """Return the result with windows ``at`` (m,) replaced by the windows ``which`` of another.
+        """Return the result with windows ``at`` (m,) taken from another result.
 
-        ``which`` (k,) is a mask of the other result's k windows. Optional arrays that one of the
-        results lacks are None.
+        ``which`` (k,) is a mask of the windows to take from the k windows of ``others``. An
+        optional array is None if one of the results lacks it.
         """
         changed: dict[str, Any] = {}
         for name, own in vars(self).items():
@@ -103,11 +103,11 @@ Detect = Callable[[SpotWindows], DetectedCentres]
 class Detector:
     """Detector of sticker centres.
 
-    ``bias_px`` is the rms error of a centre without noise, for sharp images of stickers of 3.8 px
-    radius that are tilted by 45 degrees, as in the built-in sensors. The error varies with the
-    position within a pixel, so it acts like additional noise. The covariances of ``detect`` do not
-    include it. ``margin_px`` is the width on each side by which windows must be larger than those
-    of the maximum-likelihood fit.
+    ``bias_px`` is the rms error of a centre in sharp noise-free images of stickers of 3.8 px radius
+    that are tilted by 45 degrees, as in the built-in sensors. The error varies with the position
+    within a pixel, so it acts like additional noise. The covariances of ``detect`` do not include
+    it. ``margin_px`` is the width on each side by which windows must be larger than those of the
+    maximum-likelihood fit.
     """
 
     name: str
@@ -120,9 +120,9 @@ class Detector:
 def find_detector(name: str) -> Detector:
     """Return the detector with a built-in name, or the detector ``module:name``.
 
-    The latter is a Detector, or a ``Detect`` function with optional attributes ``bias_px`` and
-    ``margin_px``. Raises UnknownOptionError with the valid names, and CmmError if ``module:name``
-    cannot be imported or called.
+    ``module:name`` names a Detector, or a ``Detect`` function with optional attributes ``bias_px``
+    and ``margin_px``. Raises UnknownOptionError with the valid names, and CmmError if
+    ``module:name`` cannot be imported or called.
     """
     return find("detector", name, DETECTORS, Detector, _check_centres)
 

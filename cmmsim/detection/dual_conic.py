@@ -8,16 +8,16 @@ residual of each line by |gradient|², so pixels away from the edge need not be 
 J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine
 Vision and Applications 21 (2009).
 
-The noise of a pixel enters the gradients around it. Its effect on the centre follows by the
-implicit function theorem from the normal equations sum of k (k' u + c²) = 0 for the unknowns u =
-(A, B, C, D, E), with k = (a², a b, b², a c, b c).
+With the unknowns u = (A, B, C, D, E) and k = (a², a b, b², a c, b c), the normal equations are: sum
+over lines of k (k' u + c²) = 0. The noise of a pixel changes the gradients around the pixel. The
+implicit function theorem, applied to the normal equations, gives the effect on the centre.
 
 If the rim comes near the edge of the window, lines are missing, and the centre is wrong by up to a
-tenth of a pixel. Such a window is not good. EDGE_PX is the distance from the edge that the lines
-need.
+tenth of a pixel. Such a window is not good. EDGE_PX is the smallest distance of the rim from the
+edge.
 
-Gradients of a sharp edge are not exact. For images without noise of stickers tilted by 45 degrees,
-the error of the centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The
+Gradients of a sharp edge are not exact. In noise-free images of stickers tilted by 45 degrees, the
+error of the centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The
 covariance does not include this bias.
 """
 
@@ -121,7 +121,7 @@ def _filtered(
 
 
 def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
-    """Return the derivative (n, 2, h, h) of the centres by each grey value, px."""
+    """Return the derivative (n, 2, h, h) of the centres, px, by each grey value."""
     a = lines.a
     b = lines.b
     c = lines.c
@@ -143,7 +143,9 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
 
 
 def _squared_shape(dual: Array) -> Array:
-    """Return A A' (n, 2, 2) of the ellipse: centre centre' minus the upper left part of C*."""
+    """Return A A' (n, 2, 2) of the ellipse. It is z z' minus the upper left part of C*, with centre
+    z.
+    """
     centre = 0.5 * dual[:, 3:]
     upper_left = np.stack(
         [dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1

@@ -29,8 +29,8 @@ RING_REACH = 2.4
 SMALLEST_RADIUS_PX = 0.8
 # Number of the parameters c_x, c_y, A_xx, A_xy, A_yy, which come first.
 ELLIPSE_UNKNOWNS = 5
-# The light of a moving ellipse is a sum over positions this far apart, or half a point spread if
-# that is more.
+# Distance between the positions over which the light of a moving ellipse is summed. Half a point
+# spread is used if that is more.
 SMEAR_STEP_PX = 0.2
 # A fit ends with a step shorter than this.
 CONVERGED_PX = 1e-4

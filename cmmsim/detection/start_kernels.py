@@ -81,7 +81,8 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
     found = np.empty((2, window.size + 1))
     count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
-        # Each value is stored without a branch. The next value overwrites it unless it counts.
+        # To avoid a branch, every value is stored, and the index advances only for a value that
+        # counts.
         for column in range(width):
             found[0, count[0]] = found[1, count[1]] = window[row, column]
             count[0] += steps[row, column] == low

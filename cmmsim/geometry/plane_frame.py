@@ -34,12 +34,13 @@ class FittedPlane:
     covariance: Array
 
 
-def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "") -> FittedPlane:
+def fit_plane(
+    points: Array, covariances: Array, rough_normals: Array, name: str = ""
+) -> FittedPlane:
     """Fit a weighted least-squares plane to points (n, 3) with covariances (n, 3, 3).
 
-    For sets of points (..., n, 3) the result is one plane per set. ``towards`` (..., 3) is a rough
-    normal that fixes the sign. Raises LostError for fewer than three points, or if all points lie
-    on one line.
+    For sets of points (..., n, 3) the result is one plane per set. ``rough_normals`` (..., 3) fix
+    the signs. Raises LostError for fewer than three points, or if all points lie on one line.
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
@@ -55,7 +56,7 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
             f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
     normal = axes[..., 2, :]
-    normal = normal * np.where(_dot(normal, towards) > 0.0, 1.0, -1.0)[..., None]
+    normal = normal * np.where(_dot(normal, rough_normals) > 0.0, 1.0, -1.0)[..., None]
     # Shift of the plane from the middle, along the normal.
     shift = np.zeros(normal.shape[:-1])
     # The start is the unweighted plane, so two weighted steps converge to rounding errors.
@@ -93,16 +94,16 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
 
 
 def frame_of_points(
-    points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
+    points: Array, covariances: Array, plane_index: NDArray[np.int_], rough_normals: Array
 ) -> tuple[Array, Array]:
     """Return the frame (4, 4) of planes through measured stickers, and its covariance (6, 6).
 
     The covariance is that of the small error [dt, dphi]. Stickers are points (n, 3) with
-    covariances (n, 3, 3). ``plane_index`` (n,) is 0, 1 or 2 for a sticker on plane A, B or C. The
-    rows of ``towards`` (3, 3) are rough normals. Raises LostError, which names the plane, if a
+    covariances (n, 3, 3). ``plane_index`` (n,) is 0, 1 or 2 for a sticker on plane A, B or C.
+    ``rough_normals`` (3, 3) has one row per plane. Raises LostError, which names the plane, if a
     plane has too few stickers or all of them lie on one line.
     """
-    frame, planes = frames_of_points(points, covariances, plane_index, towards)
+    frame, planes = frames_of_points(points, covariances, plane_index, rough_normals)
     sensitivity = _frame_sensitivity(
         frame, np.stack([p.normal for p in planes]), np.stack([p.tangents for p in planes])
     )
@@ -110,7 +111,7 @@ def frame_of_points(
 
 
 def frames_of_points(
-    points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
+    points: Array, covariances: Array, plane_index: NDArray[np.int_], rough_normals: Array
 ) -> tuple[Array, list[FittedPlane]]:
     """Return the frames (..., 4, 4) of sets of points (..., n, 3), and the planes A, B and C.
 
@@ -120,7 +121,9 @@ def frames_of_points(
     for k, name in enumerate(PLANE_NAMES):
         own = plane_index == k
         planes.append(
-            fit_plane(points[..., own, :], covariances[..., own, :, :], towards[..., k, :], name)
+            fit_plane(
+                points[..., own, :], covariances[..., own, :, :], rough_normals[..., k, :], name
+            )
         )
     normals = np.stack([plane.normal for plane in planes], axis=-2)
     return frame_from_planes(normals, np.stack([plane.offset for plane in planes], axis=-1)), planes

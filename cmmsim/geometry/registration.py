@@ -17,8 +17,9 @@ SMALLEST_SPREAD = 0.005
 class Registration:
     """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
-    ``misfit`` (n,) is the squared residual of each point in units of its noise. Its expected value
-    is 3, reduced by the share of the fit's six degrees of freedom that this point determines.
+    ``misfit`` (n,) is the squared residual of each point in units of its noise. The expected value
+    is 3 minus the number of the fit's six degrees of freedom that this point determines, which can
+    be a fraction.
     """
 
     transform: Array

@@ -8,9 +8,9 @@ needs fewer samples than a sharp rim for the same accuracy.
 **Painter's order.** A window needs no depth test if it shows one solid and at most one stack of
 discs that lies on the solid. The solid is drawn first, then the discs. If the camera stands in
 front of the plane of a disc, it sees the disc, because the whole solid lies behind that plane. If
-the solid fills the window, it shows only one level. The dark ring of a sticker then fills most of
-the window, so the window is cleared to the ring's level, and the solid is drawn as a band around
-the ring. The image is the same, but far fewer pixels are drawn.
+the solid fills the window, the background is not visible. The dark ring of a sticker then fills
+most of the window. The window is therefore cleared to the ring's level, and only a band of the
+solid around the ring is drawn. The image is the same, but far fewer pixels are drawn.
 """
 
 from collections.abc import Sequence
@@ -116,12 +116,12 @@ def _sides(radius: float, sample: float) -> int:
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Return corners (sides, 3) of the regular polygon in a disc's plane with the area of a circle
-    of that radius.
+    """Return corners (sides, 3) of a regular polygon in a disc's plane, as large as a circle of
+    ``radius``.
     """
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
-    # Polygon and circle have the same area, so they have the same total light.
+    # Polygon and circle have the same area and therefore the same total light.
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
     return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
 
@@ -141,7 +141,7 @@ def _band_triangles(sides: int) -> NDArray[np.int_]:
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:
     """Return triangles (sides - 2, 3) of a convex polygon, with large triangles in the middle.
 
-    They are faster to draw than a fan of thin triangles.
+    Large triangles are faster to draw than a fan of thin triangles.
     """
     triangles: list[tuple[int, int, int]] = []
     arcs = [(0, sides - 1)]
@@ -156,11 +156,11 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 
 @dataclass(frozen=True)
 class PaintedWindows:
-    """Windows that need no depth test.
+    """Windows that can be drawn in painter's order, without a depth test.
 
     ``solid`` (n,) is the patch of a window's only solid, or -1 if a depth test is needed.
-    ``filled`` (n,) states whether this solid fills the window. If a window can be cleared to the
-    level of the lowest disc of a stack, ``ringed`` (n,) is this stack, and otherwise -1.
+    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the patch of a
+    stack of discs if the window can be cleared to the level of the lowest disc, and otherwise -1.
     """
 
     solid: NDArray[np.int_]
@@ -199,7 +199,7 @@ class PaintedSolids:
         self._ring_centres = np.array(
             [np.zeros(3) if ring is None else ring.centre for ring in lowest]
         )
-        # Radius, in radii of the ring, of the circle inside the outer polygon of a band.
+        # Radius of the circle that the outer polygon of a band encloses, in radii of the ring.
         inside = BAND_REACH * np.cos(np.pi / GROUND_SIDES)
         self._ring_reach = np.array(
             [0.0 if ring is None else inside * ring.radius for ring in lowest]
@@ -277,7 +277,7 @@ class PaintedSolids:
     def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
         """Tell whether a solid fills windows, given the ``rays`` (n, 4, 3) to their corners.
 
-        The solid is convex, so it fills a window if it is met along the rays to all corners.
+        The solid is convex, so it fills a window if the rays to all corners meet it.
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]

@@ -198,7 +198,9 @@ class _Atlas:
         return frame_buffer.read()
 
     def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """Draw the patches of a cell with depth tests. ``matrices`` are addresses by patch."""
+        """Draw the patches of a cell with depth tests. ``matrices`` are addresses of matrices by
+        patch.
+        """
         gl = self._gl
         triangles, unsigned = self._constants
         gl.glEnable(gl.GL_DEPTH_TEST)
@@ -211,7 +213,7 @@ class _Atlas:
     def _draw_in_order(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
         """Draw the patches of a cell over each other: the solid, then the stack that lies on it.
 
-        ``matrices`` are addresses by patch. All patches belong to one body.
+        ``matrices`` are addresses of matrices by patch. All patches belong to one body.
         """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):

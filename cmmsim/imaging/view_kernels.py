@@ -139,10 +139,10 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 @compiled
 def visible_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
-    """Return the discs that face the camera, from far to near and larger before smaller.
+    """Return the discs that face the camera, from far to near, and larger before smaller.
 
-    The results are their numbers (m,); the centres (m, 2), shapes (m, 2, 2) and extents (m, 2) of
-    their ellipses, px; and points on them (m, k, 3), m, in camera axes.
+    The results are the numbers (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and extents
+    (m, 2) of the ellipses in px, and points (m, k, 3) on the discs in camera axes, m.
     """
     total = len(scene.radii)
     places = np.empty((total, 3))

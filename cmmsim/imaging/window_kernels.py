@@ -88,7 +88,7 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
 def keys_weights(share: float) -> tuple:
     """Return Keys' weights of four pixels in a row, for a place between the second and the third.
 
-    The place lies the share ``share``, 0 to 1, of a pixel after the second.
+    The place lies ``share`` px, 0 to 1, after the second pixel.
     """
     s = min(max(share, 0.0), 1.0)
     return (
@@ -162,7 +162,7 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
 def interpolated(drawn: Array, x: float, y: float, first_x: int, first_y: int) -> float:
     """Return the value of a drawn window (h, w) at a place (x, y) between pixels.
 
-    It is computed from the pixels from one before (first_x, first_y) to two after it.
+    In each direction, the pixels from one before (first_x, first_y) to two after it are used.
     """
     weights_x = keys_weights(x - first_x)
     weights_y = keys_weights(y - first_y)

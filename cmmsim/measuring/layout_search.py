@@ -3,9 +3,8 @@
 Ellipses are fitted to bright spots that are small enough for a window. A spot of the left image and
 a spot of the right image form a pair if they lie on each other's epipolar lines. Each pair is a
 point in space, and false pairs occur. The known layout of the stickers is searched in this cloud of
-points. Three stickers far from each other match three points with the same mutual distances. Each
-match proposes a pose. The best pose is the one at which most stickers of the layout have a point
-close by.
+points. Three stickers match three points that have the same mutual distances. Each match proposes a
+pose. The best pose is the one at which most stickers of the layout have a point close by.
 """
 
 from collections.abc import Iterator
@@ -40,7 +39,8 @@ ROOM_PX = 8
 # Fewest recognised stickers of a platform with taught places.
 FEWEST_TAUGHT = 4
 LINE_TOLERANCE_PX = 0.5
-# Factor on the standard deviation that the rig's errors add to the distance from epipolar lines.
+# Allowed distance from epipolar lines due to errors of the rig, in standard deviations of this
+# distance.
 LINE_STDS = 4.0
 # Limits of a point's distance from the camera, m.
 NEAREST = 0.3
@@ -154,8 +154,8 @@ def find_layout(
     """Find the pose of a layout in a cloud of points.
 
     The layout (n, 3) m is in body axes and the points (m, 3) m in the camera frame. Each place in
-    the layout has the ``tolerance`` in m. The results are camera_from_body (4, 4), the indices of
-    the found stickers (k,) and of their points (k,). Raises LostError if fewer than ``fewest``
+    the layout can be off by ``tolerance`` m. The results are camera_from_body (4, 4), the indices
+    of the found stickers (k,) and of their points (k,). Raises LostError if fewer than ``fewest``
     stickers are found, or if two different poses explain the points about equally well. ``name`` is
     the body's name in messages.
     """
@@ -166,7 +166,7 @@ def find_layout(
     for triples in _blocks(_triangles(layout)):
         proposer, poses, counts = _proposed(layout, triples, points, gaps, tree, tolerance)
         ended = len(triples)
-        # Poses with smaller counts change neither the best nor its rival.
+        # Poses with smaller counts replace neither the best pose nor the rival.
         for k in np.flatnonzero(counts > min(count, rival)).tolist():
             if proposer[k] > ended:
                 break

@@ -1,4 +1,4 @@
-"""Measurement of one stereo frame (paper eq. 27 and 28), without use of the true pose."""
+"""Measurement of one stereo frame (paper eq. 27 and 28). The true pose is not used."""
 
 from __future__ import annotations
 
@@ -42,14 +42,17 @@ def by_registration(observation: StickerObservation, places: Array) -> Solution:
     return result.transform, result.covariance, observation
 
 
-def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:
+def by_planes(observation: StickerObservation, body: MarkedBody, rough_normals: Array) -> Solution:
     """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by three planes.
 
-    ``towards`` (3, 3) are rough normals of planes A, B, C in the camera frame. Raises LostError,
+    ``rough_normals`` (3, 3) are those of planes A, B, C in the camera frame. Raises LostError,
     which names the plane, if a plane has too few stickers.
     """
     frame, covariance = frame_of_points(
-        observation.points, observation.covariances, body.plane_index[observation.index], towards
+        observation.points,
+        observation.covariances,
+        body.plane_index[observation.index],
+        rough_normals,
     )
     planes_from_body = _planes_from(body)
     return (
@@ -59,13 +62,17 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
     )
 
 
-def frames_by_planes(body: MarkedBody, points: Array, covariances: Array, towards: Array) -> Array:
+def frames_by_planes(
+    body: MarkedBody, points: Array, covariances: Array, rough_normals: Array
+) -> Array:
     """Return camera_from_body (..., 4, 4) as ``by_planes`` does, for many frames.
 
-    All n stickers must be seen, at points (..., n, 3) with covariances (..., n, 3, 3). ``towards``
-    is (..., 3, 3).
+    All n stickers must be seen, at points (..., n, 3) with covariances (..., n, 3, 3).
+    ``rough_normals`` is (..., 3, 3).
     """
-    return frames_of_points(points, covariances, body.plane_index, towards)[0] @ _planes_from(body)
+    return frames_of_points(points, covariances, body.plane_index, rough_normals)[0] @ _planes_from(
+        body
+    )
 
 
 def _planes_from(body: MarkedBody) -> Array:
@@ -138,8 +145,8 @@ class PoseEstimator(Observer):
     def locate(self, images: StereoImages) -> Array:
         """Return a rough camera_from_platform (4, 4) from whole images, without a prior pose.
 
-        If the exposure takes time and stickers are missing, streaks are searched as well. Raises
-        LostError.
+        If stickers are missing and the exposure time is not zero, streaks are searched as well.
+        Raises LostError.
         """
         ellipses = bright_ellipses(images, self)
         limits = self.settings.limits
@@ -233,8 +240,8 @@ class PoseEstimator(Observer):
         self, used: StickerObservation, move: Array, covariance: Array
     ) -> tuple[Measurement, Array]:
         if self.method == "planes":
-            towards = self.platform.normals @ move[:3, :3].T
-            move, covariance, used = by_planes(used, self.platform, towards)
+            rough_normals = self.platform.normals @ move[:3, :3].T
+            move, covariance, used = by_planes(used, self.platform, rough_normals)
         pose, spread = self.in_base(move, covariance)
         return self.measurement(pose, spread, used), move
 

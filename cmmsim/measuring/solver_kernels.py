@@ -104,7 +104,7 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
     """Tell whether the used places (n,3) lie within ``width`` m of one line.
 
     The middle eigenvalue of their scatter matrix is compared with ``width`` squared. A lower bound
-    of the eigenvalue is tested first, because it is faster to compute.
+    of the eigenvalue is compared first, because the bound is faster to compute.
     """
     first = np.argmax(used)
     count = 0
@@ -151,9 +151,9 @@ def fit(
 ) -> float:
     """Fit ``place`` (4,4) to the used stickers and return the sum of their squared residuals.
 
-    ``place`` is changed, and its ``covariance`` (6,6) is filled. The arms and gaps of the stickers
-    must belong to ``place`` on entry, and they do so again at the end. ``normal`` (6,6) is working
-    memory.
+    ``place`` is changed, and its ``covariance`` (6,6) is filled. On entry, the arms and gaps of the
+    stickers must belong to ``place``. At the end, they belong to the new ``place``. ``normal``
+    (6,6) is working memory.
     """
     change = np.empty(6)
     total = 0.0

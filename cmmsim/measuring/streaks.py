@@ -29,7 +29,7 @@ from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.measuring.observation import LONGEST_SMEAR_PX, StickerWindows
 
-# Probability that a movement is found although the stickers are at rest.
+# Probability that a movement is found if the stickers are at rest.
 CHANCE = 1e-4
 # Fewest ellipses in both images together: four stickers.
 FEWEST = 8
@@ -42,7 +42,8 @@ TOLERANCE_PX = 0.05
 # Number of times that the weights of the start are updated.
 REWEIGHTED = 5
 TINY_PX2 = 1e-6
-# Relative limit on singular values: the start omits combinations of movements below it.
+# Relative limit on singular values. The start values omit combinations of movements with smaller
+# ones.
 SMALLEST_SHARE = 1e-2
 # Step of numerical derivatives by a movement, m or rad.
 UNIT = 1e-4
@@ -62,7 +63,7 @@ class Streaks:
 
 @dataclass(frozen=True)
 class _Ellipses:
-    """Ellipses fitted as if they moved by ``smears`` during the exposure.
+    """Ellipses fitted under the assumption that they move by ``smears`` during the exposure.
 
     smears  (k, 2), px
     excess  (k, 3), entries xx, xy, yy of A A - A_0 A_0 + d d' / 3, px²
@@ -269,8 +270,8 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
 def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
     """Return three movements (6,) from which to search: general, without rotation, without shift.
 
-    A single start can have wrong relative signs of the stickers' movements. A search from it can
-    then end in a local minimum.
+    In a single start value, the stickers' movements can have wrong relative signs. A search from
+    there can end in a local minimum.
     """
     starts = []
     for free in (slice(0, 6), slice(0, 3), slice(3, 6)):

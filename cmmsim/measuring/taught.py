@@ -153,7 +153,7 @@ class Taught:
 
 def setup_of(file: SensorFile) -> str:
     """Return the entries of a sensor file that teaching depends on, as JSON with sorted keys."""
-    # The position contains the distance already.
+    # The position already accounts for the distance.
     rig = file.rig.model_dump(exclude={"distance"})
     bodies = {
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")

@@ -135,7 +135,7 @@ class CameraNoise:
         return constant + electrons * (linear + electrons * quadratic)
 
     def rounding_excess(self, mean_grey: Array) -> Array:
-        """Return the largest variance of grey values near a mean over their average variance.
+        """Return the ratio of the largest to the average variance of grey values near a mean.
 
         The ratio is 1 if the noise is at least one grey value, and up to 3 with less noise. With
         little noise, the variance of rounded values depends on the mean. It is largest half-way

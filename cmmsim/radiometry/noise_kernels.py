@@ -98,8 +98,9 @@ def moments_above(height: float, deviation: float, most: float) -> tuple[float, 
     number.
 
     The whole number lies ``height`` above the mean of the normal variable. The excess is 0 below
-    the whole number, and it is limited to ``most``. It contains each step from one whole number to
-    the next with the probability that the normal variable lies beyond the middle of this step.
+    the whole number, and it is limited to ``most``. The excess is a sum over the steps from one
+    whole number to the next. Each step counts with the probability that the normal variable lies
+    beyond the middle of the step.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

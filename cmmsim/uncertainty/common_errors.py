@@ -179,9 +179,9 @@ class MeasuringGeometry:
         points, covariances = self._observed(true, np.concatenate([base, views.reshape(-1, 3)]))
         split = len(base)
         of_views = (len(true), *views.shape)
-        towards = self.base.normals @ self.camera_from_base[:3, :3].T
+        rough_normals = self.base.normals @ self.camera_from_base[:3, :3].T
         camera_from_base = frames_by_planes(
-            self.base, points[:, :split], covariances[:, :split], towards
+            self.base, points[:, :split], covariances[:, :split], rough_normals
         )
         return invert(camera_from_base), platform_places(
             self.platform,

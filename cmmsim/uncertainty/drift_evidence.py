@@ -40,11 +40,12 @@ They stand for drifts within hours, minutes and seconds.
 
 WALK_FRAMES = 1000
 NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
-# Explained share of the evidence for a drift at which no further parameter is named.
+# If the named parameters explain this share of the evidence for a drift, no further one is named.
 EXPLAINED = 0.97
 # Largest number of parameters that a finding names.
 MOST_NAMED = 3
-# Smallest component of a direction, in units of SIZES, whose parameter is part of its name.
+# A direction is named by the parameters whose components, in units of SIZES, are at least this
+# large.
 LARGE_PART = 0.3
 ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
@@ -82,7 +83,8 @@ class Filter:
             self.precision[range(w), range(w)] = 1.0 / walked
             self._constant -= 0.5 * float(np.log(walked).sum())
             return
-        # The unknowns before the step are integrated out. The unknowns after the step replace them.
+        # The unknowns before the step are integrated out and replaced by the unknowns after the
+        # step.
         both = np.column_stack([self.precision[:w], self.right[:w]])
         lower, part = _factored(self.precision[:w, :w] + np.diag(1.0 / walked), both)
         self.precision -= part[:, :-1].T @ part[:, :-1]
@@ -309,8 +311,8 @@ class Finding:
 def movements(drift_information: DriftInformation) -> tuple[tuple[Movement, ...], float]:
     """Return a few parameters whose movement explains the residuals, and the explained share.
 
-    They are chosen one after the other. Each is the parameter that, together with the parameters
-    before, explains most.
+    Parameters are chosen one after the other. Each next one explains most, together with those
+    chosen before.
     """
     information = drift_information.information
     score = drift_information.score

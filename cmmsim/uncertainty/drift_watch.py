@@ -26,7 +26,7 @@ BLOCK = 6
 TOGETHER = 64
 # Fewest stickers of a frame that is used.
 FEWEST = 4
-# Standard deviation of a centre's error from teaching and image formation. This error is constant
+# Standard deviation of a centre's error from teaching and image formation. The error is constant
 # while the sticker stands still.
 TAUGHT_OFFSET_PX = 3e-4
 

@@ -1,4 +1,4 @@
-"""Stereo rig with the parameters that a calibration found, and their covariance."""
+"""Stereo rig with calibrated parameters and their covariance."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
     else:
         return
     needed = "" if size is None else _needed(Path(path), size)
-    # A file in `atomic_contents` is named by its final place.
+    # A message names a file in `atomic_contents` by its final place.
     place = Path(*(part for part in Path(path).parts if not part.startswith(TEMPORARY)))
     raise WriteError(f"cannot write {place}: {reason}{needed}; name another place")
 

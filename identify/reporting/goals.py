@@ -35,7 +35,8 @@ FAR_OFF = "friction and gains far off"
 class Goal:
     """Goal of a run: a value that must keep a limit, both in ``unit``.
 
-    ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that follow its name.
+    ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that follow the name of
+    the goal.
     """
 
     name: str

@@ -8,10 +8,10 @@ import math
 import re
 
 ROUNDING = 1e-9
-"""Share of the size of its terms below which a sum counts as a rounding error."""
+"""A sum that is smaller than this share of its terms counts as a rounding error."""
 
 LONG = 6
-"""Power of ten from which on a number is written with a power of ten."""
+"""Numbers from this power of ten on are written with a power of ten."""
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

@@ -25,7 +25,7 @@ from identify.reporting.number_format import number, share
 CAMERAS_MISS = 1.5
 """Limit of the mean squared error of the measured poses, relative to the stated covariance.
 
-Beyond it, the cameras can be the cause.
+Beyond the limit, the cameras can be the cause of the model's residuals.
 """
 
 

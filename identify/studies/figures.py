@@ -58,7 +58,9 @@ LETTERS_PER_INCH = 14.0
 BESIDE = 1.02
 """Ratio between the abscissae of two neighbouring curves with the same levels."""
 MOST_CURVES = 6
-"""Largest number of separate curves. For more settings of the other factors, all are one curve."""
+"""Largest number of separate curves. If the other factors have more settings, all rows form one
+curve.
+"""
 NEAREST_TICKS = 0.09
 """Smallest distance of two ticks of a vertical axis, as a share of the axis."""
 LETTER = 0.034

@@ -85,7 +85,7 @@ def number(value: object) -> str:
 
 
 def _words(name: str, study: Study) -> str:
-    """Return the first part of a column's description, or without a description its name."""
+    """Return the first part of a column's description, or the column's name if it has none."""
     columns = KINDS[study.kind].columns if study.kind in KINDS else {}
     if name in columns:
         said = columns[name].meaning

@@ -36,25 +36,25 @@ They are set before a process loads its libraries.
 """
 
 MEMORY_SHARE = 0.95
-"""Memory limit of a process, as a part of the machine's memory divided by the processes."""
+"""Share of the machine's memory that all processes together are allowed to use."""
 
 LOOK_S = 1.0
 """Interval at which the memory of the processes is checked, s."""
 
 MOST_FAILED_STARTS = 3
-"""Number of consecutive processes that die before they are ready at which the study fails."""
+"""The study fails after this number of consecutive processes that die before they are ready."""
 
 END_S = 10.0
 """Longest time to wait for the end of a killed process, s."""
 
 
 class ProcessExecutor:
-    """Executor of a study's batches on a number of processes, each replaced when it dies."""
+    """Executor of a study's batches on a number of processes. A process that dies is replaced."""
 
     def __init__(self, count: int) -> None:
         self._count = count
         self._workers: list[_Worker] = []
-        self._stillborn = 0
+        self._failed_starts = 0
         self._looked = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
@@ -105,7 +105,7 @@ class ProcessExecutor:
         for worker in ready:
             if not worker.cases:
                 worker.send(shared, batches.next_batch(self._count))
-        # A suspect row is computed alone, so that a second death is certainly its fault.
+        # A suspect row is computed alone, so that a second death is certainly due to this row.
         if ready and not any(worker.cases for worker in ready):
             ready[0].send(shared, suspects.next_batch())
         return not ready or any(worker.cases for worker in ready)
@@ -121,8 +121,8 @@ class ProcessExecutor:
             limit = MEMORY_SHARE * psutil.virtual_memory().total / self._count
             for worker in self._workers:
                 worker.limit_memory(limit)
-        heard = wait([worker.pipe for worker in self._workers], timeout=LOOK_S)
-        return [worker for worker in self._workers if worker.pipe in heard]
+        reporting = wait([worker.pipe for worker in self._workers], timeout=LOOK_S)
+        return [worker for worker in self._workers if worker.pipe in reporting]
 
     def _collect(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
         """Return the rows that a process has finished, or its failed rows if it has died.
@@ -134,19 +134,20 @@ class ProcessExecutor:
             finished = worker.receive()
         except (EOFError, OSError):
             return self._remove_dead(worker, suspects)
-        self._stillborn = 0
+        self._failed_starts = 0
         if cases:
             batches.update_row_time(finished)
         return finished
 
     def _remove_dead(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
-        """Remove a dead process. A row that has killed two processes is returned as an error."""
+        """Remove a dead process. A row during which two processes died is returned with an error.
+        """
         with delay_interrupts():
             self._workers.remove(worker)
             worker.end()
         if not worker.ready:
-            self._stillborn += 1
-            if self._stillborn >= MOST_FAILED_STARTS:
+            self._failed_starts += 1
+            if self._failed_starts >= MOST_FAILED_STARTS:
                 raise StudyError(
                     f"{MOST_FAILED_STARTS} processes died before they computed a row; "
                     "--workers 0 computes in the main process, and may show the reason"
@@ -175,7 +176,8 @@ class _Worker:
         self.end_reason = "died"
         self.pipe, theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=work, args=(theirs,), daemon=True)
-        # The tracker is started before the block, because its start would unblock Ctrl-C.
+        # multiprocessing's resource tracker is started before the block, because starting it in the
+        # block would unblock Ctrl-C.
         resource_tracker.ensure_running()
         with _one_thread_each(), shield_children():
             self._process.start()

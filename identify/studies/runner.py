@@ -80,7 +80,9 @@ SoFar = Callable[[pd.DataFrame], object]
 """Function that gets the table of the rows finished so far."""
 
 SO_FAR_S, SO_FAR_SHARE = 30.0, 0.02
-"""Shortest interval of intermediate results, seconds, and their largest share of the time."""
+"""Shortest interval between tables of finished rows, seconds, and the largest share of the time
+that these tables take.
+"""
 
 
 def run_study(
