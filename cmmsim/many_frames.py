@@ -130,7 +130,7 @@ def measure_exposures(
     normals = estimator.platform.sticker_normals
     seen = estimator.read(images, expected, places, normals).observed(exposure_ends)
     solved = solve_frames(seen, expected, estimator, estimator.platform, places)
-    poses, covariances = estimator.in_base(solved.moves, solved.covariances)
+    poses, covariances = estimator.in_base(solved.camera_from_body, solved.covariances)
     of = seen.index // len(places)
     used = np.bincount(of[solved.used], minlength=len(expected))
     others = {}

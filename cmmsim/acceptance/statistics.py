@@ -71,10 +71,7 @@ def _figures(values: Array) -> dict[str, Array]:
 
 
 def interval_of_mean(values: Array) -> Interval:
-    """Return Student's 95 % interval of the mean of independent normal values (n,), n >= 2.
-
-    It is computed from Student's t distribution.
-    """
+    """Return Student's 95 % interval of the mean of independent normal values (n,), n >= 2."""
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")

@@ -39,7 +39,7 @@ LARGEST_RADIUS_GAP = 0.1
 FINE_WINDOW_SHARE = 0.3
 
 FIT_ITERATIONS = 5
-# Radius of the fitted surroundings of a dot, and the radius beyond which they belong to the ground,
+# Radius of the fitted surroundings of a dot, and radius from which on pixels belong to the ground,
 # both in dot radii.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
@@ -55,9 +55,8 @@ FITTED_SHARE = 0.5
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
 EXTREMES = (2.0, 98.0)
-# The noise of a photograph is unknown and its edges are blurred. All grey values therefore have
-# equal weight, and the limit rejects only shapes that are no ellipse (residuals of 25 grey values
-# rms).
+# The noise of a photograph is unknown, and edges are blurred. All grey values therefore have equal
+# weight, and the limit rejects only shapes that are no ellipse (residuals of 25 grey values rms).
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
@@ -217,7 +216,7 @@ def _refine(
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
     """Return the standard deviation in px of the Gaussian blur with the smallest misfit.
 
-    It describes the blur of lens and focus together.
+    The blur is that of lens and focus together.
     """
     best = SPREADS_PX[0]
     least = np.inf
@@ -237,7 +236,7 @@ def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
 def _dot_shapes(rough: Array, board: Board) -> Array:
     """Return matrices (n, 2, 2) px that map the unit disc to the image of each dot.
 
-    They follow from the homography of the board.
+    The matrices follow from the homography of the board.
     """
     plane = board.points[:, :2]
     flat, _ = cv2.findHomography(plane, rough)
@@ -264,10 +263,10 @@ def _without_neighbours(
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
     """Return the median radius of bright dots, as a share of half the distance to a neighbour.
 
-    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. A dot's
-    share of the area of its cell is the mean grey value of the cell above the ground, divided by
-    the contrast of dot and ground. The radius is overestimated if a dot is so blurred that its
-    middle is not uniform: by a quarter at 2.5 px radius and 1 px of blur.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. The
+    dot's share of a cell's area is (mean - ground) / (dot - ground), with the mean grey value of
+    the cell and the grey values of ground and dot. The radius is overestimated if a dot is so
+    blurred that its middle is not uniform: by a quarter at 2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
@@ -336,7 +335,7 @@ def _bright_spots(bright: NDArray[np.uint8]) -> Array:
 def _sharpest_corners(points: Array) -> Array:
     """Return the four corners (4, 2) of the points' convex hull that have the smallest angles.
 
-    They are in clockwise order in the image, like the corners of a board seen from its front.
+    The corners are in clockwise order in the image, like those of a board seen from the front.
     """
     hull = cv2.convexHull(points.astype(np.float32), clockwise=False)[:, 0].astype(float)
     before, after = (hull - np.roll(hull, step, axis=0) for step in (1, -1))

@@ -146,7 +146,7 @@ def _read_alike(
     right_from_left (4, 4).
     """
     orders = board.symmetries
-    turned = [_renaming_move(board, order) for order in orders]
+    turned = [_symmetry_motion(board, order) for order in orders]
     names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
     places = np.stack([from_right[k] @ turned[j] @ invert(from_left[k]) for k, j in names])
     alike = _alike(places)
@@ -174,7 +174,7 @@ def _read_alike(
     return read, from_right | {k: places[i] @ from_left[k] for k, i in chosen.items()}, places[best]
 
 
-def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
+def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
     """Return the rigid motion (4, 4) in the board's plane that moves points[order] onto points."""
     points = board.points
     renamed = board.points[order]
@@ -196,10 +196,7 @@ def _alike(places: Array) -> Array:
 
 
 def _angles(places: Array, rotations: Array) -> Array:
-    """Return the angles (n, m), rad, between transforms (n, 4, 4) and rotations (m, 3, 3).
-
-    They are in rad.
-    """
+    """Return the angles (n, m), rad, between transforms (n, 4, 4) and rotations (m, 3, 3)."""
     trace = np.einsum("nij,mij->nm", places[:, :3, :3], rotations)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 

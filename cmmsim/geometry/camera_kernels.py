@@ -26,12 +26,12 @@ TRIANGULATION_STEPS = 6
 class Cameras(NamedTuple):
     """Two cameras with ``intrinsics`` (2, 9) and image sizes ``size`` (2, 2), px.
 
-    ``moves`` (2, 4, 4) transform points from their given axes into the axes of each camera.
+    ``extrinsics`` (2, 4, 4) transform points from their given axes into the axes of each camera.
     """
 
     intrinsics: Array
     size: Array
-    moves: Array
+    extrinsics: Array
 
 
 @compiled
@@ -250,8 +250,8 @@ def triangulate(
         gap = 0.0
         for side in range(2):
             gap += add_image(
-                cameras.intrinsics[side], cameras.moves[side], point, pixels[side], spreads[side],
-                line_variance, normal, right,
+                cameras.intrinsics[side], cameras.extrinsics[side], point, pixels[side],
+                spreads[side], line_variance, normal, right,
             )  # fmt: skip
         inverse_entries(normal, inverse)
         x = inverse[0] * right[0] + inverse[1] * right[1] + inverse[2] * right[2]

@@ -104,15 +104,20 @@ def distort_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
 
 @compiled
 def place_discs(
-    moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array
+    camera_from_bodies: Array,
+    owners: Array,
+    places: Array,
+    directions: Array,
+    centres: Array,
+    normals: Array,
 ) -> None:
     """Fill the centres and normals (n, 3) of discs in camera axes.
 
     ``places`` and ``directions`` (n, 3) are in the axes of the bodies ``owners`` (n,), and
-    ``moves`` (b, 4, 4) are the transforms camera_from_body.
+    ``camera_from_bodies`` is (b, 4, 4).
     """
     for n in range(len(places)):
-        move = moves[owners[n]]
+        move = camera_from_bodies[owners[n]]
         for i in range(3):
             centres[n, i] = move[i, 3]
             normals[n, i] = 0.0

@@ -43,10 +43,16 @@ def draw_windows(
     corners = np.asarray(views.corners, dtype=float)
     for shown in views.exposures:
         camera = shown.camera
-        moves = np.ascontiguousarray(shown.camera_from_bodies)
+        camera_from_bodies = np.ascontiguousarray(shown.camera_from_bodies)
         figures = camera.focal_lengths, camera.centre, NEAR, TOUCHING
         draw_view(
-            scene, moves, *figures, images, shown.windows, corners[shown.windows], supersampling
+            scene,
+            camera_from_bodies,
+            *figures,
+            images,
+            shown.windows,
+            corners[shown.windows],
+            supersampling,
         )
     return images
 

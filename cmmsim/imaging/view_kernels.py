@@ -138,7 +138,9 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 
 
 @compiled
-def visible_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
+def visible_discs(
+    scene: Scene, camera_from_bodies: Array, focal: Array, principal: Array, near: float
+) -> tuple:
     """Return the discs that face the camera, from far to near, and larger before smaller.
 
     The results are the numbers (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and extents
@@ -147,7 +149,7 @@ def visible_discs(scene: Scene, moves: Array, focal: Array, principal: Array, ne
     total = len(scene.radii)
     places = np.empty((total, 3))
     normals = np.empty((total, 3))
-    place_discs(moves, scene.owners, scene.places, scene.normals, places, normals)
+    place_discs(camera_from_bodies, scene.owners, scene.places, scene.normals, places, normals)
     kept = np.empty(total, np.int64)
     count = 0
     for n in range(total):
@@ -190,7 +192,7 @@ def visible_discs(scene: Scene, moves: Array, focal: Array, principal: Array, ne
 @compiled
 def occlusion_mask(
     scene: Scene,
-    moves: Array,
+    camera_from_bodies: Array,
     owners: Array,
     probes: Array,
     near: float,
@@ -209,7 +211,7 @@ def occlusion_mask(
     point = np.empty(3)
     for k in range(len(slots)):
         slots[k] = -1
-        move = moves[scene.bodies[k]]
+        move = camera_from_bodies[scene.bodies[k]]
         # Bodies behind the cameras, such as absent obstacles, hide nothing.
         if move[2, 3] < -near:
             continue
@@ -236,7 +238,7 @@ def occlusion_mask(
 
 @compiled
 def solid_outlines(
-    scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array
+    scene: Scene, camera_from_bodies: Array, focal: Array, principal: Array, slots: Array
 ) -> Solids:
     """Return the outlines of solids that lie wholly in front of the camera, from far to near.
 
@@ -246,7 +248,7 @@ def solid_outlines(
     depths = np.empty(total)
     half_planes = np.empty((len(scene.vertices), 3))
     for k in range(total):
-        move = moves[scene.bodies[k]]
+        move = camera_from_bodies[scene.bodies[k]]
         middle = scene.middles[k]
         depths[k] = (
             move[2, 0] * middle[0] + move[2, 1] * middle[1] + move[2, 2] * middle[2] + move[2, 3]
@@ -257,7 +259,7 @@ def solid_outlines(
     shown = np.empty(total, np.int64)
     filled = 0
     for k in order:
-        move = moves[scene.bodies[k]]
+        move = camera_from_bodies[scene.bodies[k]]
         vertices = scene.vertices[scene.vertex_starts[k] : scene.vertex_starts[k + 1]]
         pixels = np.empty((len(vertices), 2))
         nearest = np.inf
@@ -288,7 +290,7 @@ def solid_outlines(
 @compiled
 def draw_view(
     scene: Scene,
-    moves: Array,
+    camera_from_bodies: Array,
     focal: Array,
     principal: Array,
     near: float,
@@ -301,12 +303,16 @@ def draw_view(
     """Draw the windows ``images[group]`` (n, h, w) of one exposure of a camera with a perfect lens.
 
     The windows have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal``
-    (2,) and the principal point ``principal`` (2,), px. Bodies stand at camera_from_body ``moves``
+    (2,) and the principal point ``principal`` (2,), px. Bodies stand at ``camera_from_bodies``
     (b, 4, 4).
     """
-    kept, pixels, shapes, extents, probes = visible_discs(scene, moves, focal, principal, near)
+    kept, pixels, shapes, extents, probes = visible_discs(
+        scene, camera_from_bodies, focal, principal, near
+    )
     slots = np.empty(len(scene.bodies), np.int64)
-    behind = occlusion_mask(scene, moves, scene.owners[kept], probes, near, touching, slots)
-    solids = solid_outlines(scene, moves, focal, principal, slots)
+    behind = occlusion_mask(
+        scene, camera_from_bodies, scene.owners[kept], probes, near, touching, slots
+    )
+    solids = solid_outlines(scene, camera_from_bodies, focal, principal, slots)
     discs = Discs(pixels, shapes, extents, scene.disc_levels[kept], behind)
     draw_layers(images, group, corners, solids, lines, discs)

@@ -61,17 +61,17 @@ STEP_TOLERANCE = 1e-8
 class SolvedFrames:
     """Poses of a body in f frames, and the stickers from which they were computed.
 
-    moves        (f, 4, 4), camera_from_body
-    covariances  (f, 6, 6), of the small errors [dt, dphi] of camera_from_body
-    stickers     the k stickers of all frames, with enlarged covariances if residuals are larger
-                 than noise
-    used         (k,), False for rejected stickers
-    starts       (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
-    verdicts     (f, COLUMNS), reasons why frames are lost
-    places       (n, 3), taught places on ``body``
+    camera_from_body  (f, 4, 4)
+    covariances       (f, 6, 6), of the small errors [dt, dphi] of camera_from_body
+    stickers          the k stickers of all frames, with enlarged covariances if residuals are
+                      larger than noise
+    used              (k,), False for rejected stickers
+    starts            (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
+    verdicts          (f, COLUMNS), reasons why frames are lost
+    places            (n, 3), taught places on ``body``
     """
 
-    moves: Array
+    camera_from_body: Array
     covariances: Array
     stickers: StickerObservation
     used: NDArray[np.bool_]
@@ -132,15 +132,17 @@ def solve_frames(
         np.empty((len(of), 3)),
         np.empty((len(of), 3)),
     )
-    moves = np.array(near, dtype=float)
+    camera_from_body = np.array(near, dtype=float)
     spreads = np.zeros((frames, 6, 6))
     verdicts = np.zeros((frames, kernels.COLUMNS))
     outlines = _outlines(seen, observer, body.sticker_normals[sticker])
     limits = solver_limits(len(places))
     taught = np.ascontiguousarray(places[sticker])
-    kernels.solve_frames(rows, taught, outlines, limits, starts, moves, spreads, verdicts)
+    kernels.solve_frames(
+        rows, taught, outlines, limits, starts, camera_from_body, spreads, verdicts
+    )
     return SolvedFrames(
-        moves,
+        camera_from_body,
         spreads,
         replace(seen, covariances=covariances),
         used,
@@ -162,7 +164,7 @@ def consistent(
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
         raise LostError(solved.reason(0))
-    return solved.of(0), solved.moves[0], solved.covariances[0]
+    return solved.of(0), solved.camera_from_body[0], solved.covariances[0]
 
 
 def solver_limits(stickers: int, step_tolerance: float = STEP_TOLERANCE) -> SolverLimits:

@@ -232,7 +232,9 @@ class PoseEstimator(Observer):
             return lost_measurement(solved.reason(frame))
         used = solved.of(frame)
         try:
-            return self._measured(used, solved.moves[frame], solved.covariances[frame])[0]
+            return self._measured(used, solved.camera_from_body[frame], solved.covariances[frame])[
+                0
+            ]
         except LostError as error:
             return lost_measurement(str(error))
 
@@ -245,14 +247,14 @@ class PoseEstimator(Observer):
         pose, spread = self.in_base(move, covariance)
         return self.measurement(pose, spread, used), move
 
-    def in_base(self, moves: Array, covariances: Array) -> tuple[Array, Array]:
+    def in_base(self, camera_from_platform: Array, covariances: Array) -> tuple[Array, Array]:
         """Return poses (..., 6) of the platform in the base frame and covariances (..., 6, 6).
 
-        ``moves`` (..., 4, 4) are camera_from_platform. ``covariances`` (..., 6, 6) are the
+        ``camera_from_platform`` is (..., 4, 4). ``covariances`` (..., 6, 6) are the
         covariances of their small errors [dt, dphi].
         """
         base_from_camera = self.taught.base_from_camera
-        base_from_platform = base_from_camera @ moves
+        base_from_platform = base_from_camera @ camera_from_platform
         spread = pose_covariance(
             base_from_platform, compose_covariance(base_from_camera, covariances)
         )

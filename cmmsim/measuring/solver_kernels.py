@@ -195,7 +195,7 @@ def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: 
     The misfit is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
     """
     camera = outlines.cameras.intrinsics[side]
-    move = outlines.cameras.moves[side]
+    move = outlines.cameras.extrinsics[side]
     point = np.empty(3)
     centre = np.empty(3)
     turned = np.empty(3)
@@ -311,15 +311,15 @@ def solve(
 @compiled
 def solve_frames(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, starts: Array,
-    moves: Array, covariances: Array, verdicts: Array,
+    camera_from_body: Array, covariances: Array, verdicts: Array,
 ) -> None:  # fmt: skip
     """Call ``solve`` for several frames. Frame j has the stickers ``starts[j]`` to ``starts[j +
     1]``.
 
-    ``moves`` (f,4,4) are first guesses of camera_from_body on entry, and the results at the end.
+    ``camera_from_body`` (f,4,4) contains first guesses on entry, and the results at the end.
     Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS) are filled.
     """
-    for f in range(len(moves)):
+    for f in range(len(camera_from_body)):
         first = starts[f]
         last = starts[f + 1]
         own = ObservedStickers(
@@ -339,7 +339,7 @@ def solve_frames(
         )
         taught = places[first:last]
         # A tracker extrapolates poses from earlier results, so rounding errors accumulate.
-        make_rigid(moves[f])
+        make_rigid(camera_from_body[f])
         for n in range(last - first):
-            turn_arm(moves[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
-        solve(own, taught, shown, limits, moves[f], covariances[f], verdicts[f])
+            turn_arm(camera_from_body[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
+        solve(own, taught, shown, limits, camera_from_body[f], covariances[f], verdicts[f])

@@ -75,14 +75,14 @@ class FrameBlock:
         self.variances.append(variances)
 
     @cached_property
-    def moves(self) -> Array:
+    def camera_from_body(self) -> Array:
         """Transforms camera_from_body (f, 4, 4) of all frames. Frames must not be added later."""
         return np.asarray(self.camera_from_base @ transforms_of(np.array(self.poses)))
 
     @property
     def middle(self) -> Array:
         """Transform camera_from_body (4, 4) in the middle frame."""
-        return np.asarray(self.moves[len(self.moves) // 2])
+        return np.asarray(self.camera_from_body[len(self.camera_from_body) // 2])
 
     @property
     def velocities(self) -> Array:
@@ -90,16 +90,21 @@ class FrameBlock:
         span = self.times[-1] - self.times[0]
         if span == 0.0:
             return np.zeros(self.places.shape)
-        return (apply(self.moves[-1], self.places) - apply(self.moves[0], self.places)) / span
+        return (
+            apply(self.camera_from_body[-1], self.places)
+            - apply(self.camera_from_body[0], self.places)
+        ) / span
 
 
 def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows:
     """Return the rows of blocks of frames in which the same stickers of the platform were seen."""
     index = blocks[0].index
-    moves = np.array([seen.middle for seen in blocks])
-    arms = blocks[0].places @ moves[:, :3, :3].swapaxes(1, 2)
-    slopes, by_rig = _derivatives(geometry.rig, arms + moves[:, None, :3, 3])
-    taught = np.einsum("bij,pkj->bkip", moves[:, :3, :3], geometry.taught_by_rig[1][:, index])
+    camera_from_body = np.array([seen.middle for seen in blocks])
+    arms = blocks[0].places @ camera_from_body[:, :3, :3].swapaxes(1, 2)
+    slopes, by_rig = _derivatives(geometry.rig, arms + camera_from_body[:, None, :3, 3])
+    taught = np.einsum(
+        "bij,pkj->bkip", camera_from_body[:, :3, :3], geometry.taught_by_rig[1][:, index]
+    )
     by_delay = np.zeros((*by_rig.shape[:-1], 1))
     by_delay[1, ..., 0] = np.einsum(
         "bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks])
@@ -183,9 +188,9 @@ def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Arra
     weights = 1.0 / (
         np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2
     )
-    moves = np.concatenate([seen.moves for seen in blocks])
+    camera_from_body = np.concatenate([seen.camera_from_body for seen in blocks])
     pixels = np.array([each for seen in blocks for each in seen.pixels]).swapaxes(0, 1)
-    residuals = pixels - rig.project(apply_each(moves, blocks[0].places))[0]
+    residuals = pixels - rig.project(apply_each(camera_from_body, blocks[0].places))[0]
     starts = np.cumsum([0, *(len(seen.times) for seen in blocks)])[:-1]
     roots = np.sqrt(np.add.reduceat(weights, starts))
     summed = np.add.reduceat(weights[..., None] * residuals, starts, axis=1)

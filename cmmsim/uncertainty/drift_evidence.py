@@ -35,7 +35,7 @@ SIZES = np.array(
 RATES = (0.05, 0.5, 5.0)
 """Standard deviations of random walks after WALK_FRAMES frames, in units of SIZES.
 
-They stand for drifts within hours, minutes and seconds.
+The rates stand for drifts within hours, minutes and seconds.
 """
 
 WALK_FRAMES = 1000
@@ -271,7 +271,7 @@ class Finding:
         True if the parameters were probably wrong at teaching already.
     unseen : tuple of str
         Directions in which a drift of a tenth of a pixel, 20 um or 20 urad could not be detected.
-        Each is named by the parameters that move together.
+        Each direction is named by the parameters that move together.
     """
 
     noticed_s: float | None

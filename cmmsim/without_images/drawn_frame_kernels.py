@@ -117,7 +117,7 @@ class StereoScene(NamedTuple):
 def image_stickers(
     side: int,
     scene: StereoScene,
-    moves: Array,
+    camera_from_bodies: Array,
     ends: Array,
     moving: bool,
     noise: Array,
@@ -125,7 +125,7 @@ def image_stickers(
 ) -> None:
     """Fill the pixels and covariances of stickers in one image, and mark unseen ones as not used.
 
-    ``moves`` (b, 4, 4) are camera_from_body of all solids, the platform first. If the platform is
+    ``camera_from_bodies`` (b, 4, 4) belong to all solids, the platform first. If the platform is
     ``moving``, ``ends`` (2, 4, 4) are its camera_from_body at the beginning and the end of the
     exposure. ``noise`` (n, 3) are unit normal numbers: two for the centre, and one for the limit of
     thin ellipses.
@@ -139,10 +139,12 @@ def image_stickers(
     normals = np.empty((count, 3))
     hidden = np.empty(count, np.bool_)
     for n in range(count):
-        transform_point(moves[0], stickers.true[n], 1.0, places[n])
-        transform_point(moves[0], stickers.normals[n], 0.0, normals[n])
+        transform_point(camera_from_bodies[0], stickers.true[n], 1.0, places[n])
+        transform_point(camera_from_bodies[0], stickers.normals[n], 0.0, normals[n])
         used[n] = used[n] and faces(places[n], normals[n], 0.0)
-    hidden_stickers(moves, places, normals, scene.owners, limits.clear, scene.solids, used, hidden)
+    hidden_stickers(
+        camera_from_bodies, places, normals, scene.owners, limits.clear, scene.solids, used, hidden
+    )
     camera = true_cameras.intrinsics[side]
     point = np.empty(3)
     size = scene.noise.fit_size
@@ -225,19 +227,19 @@ def observe(
     for n in range(len(kept)):
         frame.stickers.used[n] = kept[n]
     platform = np.empty((4, 4))
-    moves = np.empty((1 + len(bodies), 4, 4))
+    camera_from_bodies = np.empty((1 + len(bodies), 4, 4))
     ends = np.empty((2, 4, 4))
     for side in range(2):
         for end in range(2 if moving else 0):
             pose_transform(poses[3 * side + 1 + end], platform)
-            multiply(scene.true_cameras.moves[side], platform, ends[end])
+            multiply(scene.true_cameras.extrinsics[side], platform, ends[end])
         # Both cameras see the same pose unless the right camera exposes later.
         if side == 0 or moving or apart:
             pose_transform(poses[3 * side], platform)
-        multiply(scene.true_cameras.moves[side], platform, moves[0])
+        multiply(scene.true_cameras.extrinsics[side], platform, camera_from_bodies[0])
         for b in range(len(bodies)):
-            multiply(scene.true_cameras.moves[side], bodies[b], moves[1 + b])
-        image_stickers(side, scene, moves, ends, moving, noise[side], frame)
+            multiply(scene.true_cameras.extrinsics[side], bodies[b], camera_from_bodies[1 + b])
+        image_stickers(side, scene, camera_from_bodies, ends, moving, noise[side], frame)
 
 
 @compiled
@@ -261,8 +263,8 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None
         transform_point(place, scene.stickers.normals[n], 0.0, direction)
         found = True
         for side in range(2):
-            transform_point(cameras.moves[side], expected, 1.0, point)
-            transform_point(cameras.moves[side], direction, 0.0, normal)
+            transform_point(cameras.extrinsics[side], expected, 1.0, point)
+            transform_point(cameras.extrinsics[side], direction, 0.0, normal)
             found = found and faces(point, normal, limits.grazing)
             for i in range(2):
                 pixel = frame.pixels[n, side, i]

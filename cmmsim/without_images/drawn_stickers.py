@@ -200,12 +200,14 @@ class StatisticalStereoCamera:
         """Transforms camera_from_base (4, 4) of the left and the right camera."""
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
-    def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def side(
+        self, camera: PinholeCamera, camera_from_bodies: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
         The third result is the mask (m,) of wholly visible stickers.
         """
-        places, normals = self.scene.placed(moves)
+        places, normals = self.scene.placed(camera_from_bodies)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
         with np.errstate(invalid="ignore", divide="ignore"):
             middles, shapes = project_discs(
@@ -220,7 +222,11 @@ class StatisticalStereoCamera:
             distort_outlines(camera, middles, shapes)
             middles += shift
             facing &= holds
-        return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
+        return (
+            middles,
+            shapes,
+            facing & ~self.scene.hidden(camera_from_bodies, places, normals, facing),
+        )
 
 
 class DrawnStickers:
@@ -273,7 +279,10 @@ class DrawnStickers:
             if np.array_equal(first, last):
                 smears.append(np.zeros(at.shape))
                 continue
-            ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
+            ends = (
+                lens.project(camera.scene.placed(camera_from_bodies)[0])[0]
+                for camera_from_bodies in (last, first)
+            )
             smears.append(np.asarray(np.subtract(*ends)))
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
         noise = self.rng.standard_normal((2, len(seen[0]), 6))

@@ -66,7 +66,7 @@ def to_body(move: Array, point: Array, into: Array) -> None:
 
 @compiled
 def hidden_stickers(
-    moves: Array,
+    camera_from_bodies: Array,
     places: Array,
     normals: Array,
     owners: Array,
@@ -78,32 +78,32 @@ def hidden_stickers(
     """Fill ``hidden`` (n,), which is True if a solid hides a sticker or its surroundings.
 
     The surroundings are a disc of radius ``clear`` m around the sticker, in its plane. Its middle
-    and PROBES points on its rim are tested. ``moves`` (b, 4, 4) are camera_from_body of the solids,
+    and PROBES points on its rim are tested. ``camera_from_bodies`` (b, 4, 4) belong to the solids,
     and places and normals (n, 3) of stickers are in camera axes. A sticker is not hidden by its own
     solid ``owners`` (n,). Stickers that are not ``asked`` (n,) count as not hidden.
     """
     camera = np.zeros(3)
-    eyes = np.empty((len(moves), 3))
+    eyes = np.empty((len(camera_from_bodies), 3))
     point = np.empty(3)
     probes = np.empty((1, PROBES + 1, 3))
-    middles = np.empty((len(moves), 3))
+    middles = np.empty((len(camera_from_bodies), 3))
     reach = np.full(1, clear)
-    for b in range(len(moves)):
-        to_body(moves[b], camera, eyes[b])
-        transform_point(moves[b], solids.middles[b], 1.0, middles[b])
+    for b in range(len(camera_from_bodies)):
+        to_body(camera_from_bodies[b], camera, eyes[b])
+        transform_point(camera_from_bodies[b], solids.middles[b], 1.0, middles[b])
     for n in range(len(places)):
         hidden[n] = False
         if not asked[n]:
             continue
         probed = False
-        for b in range(len(moves)):
+        for b in range(len(camera_from_bodies)):
             if b == owners[n] or hidden[n]:
                 continue
             # Two cheap tests first: most solids are far from the line of sight.
             if not reaches(camera, places[n], middles[b], solids.radii[b] + clear):
                 continue
             eye = eyes[b]
-            to_body(moves[b], places[n], point)
+            to_body(camera_from_bodies[b], places[n], point)
             first = solids.starts[b]
             last = solids.starts[b + 1]
             faces = solids.normals[first:last]
@@ -114,7 +114,7 @@ def hidden_stickers(
                 probe_discs(places[n : n + 1], normals[n : n + 1], reach, probes)
                 probed = True
             for k in range(PROBES + 1):
-                to_body(moves[b], probes[0, k], point)
+                to_body(camera_from_bodies[b], probes[0, k], point)
                 if occludes(eye, point, faces, offsets, 0.0, TOUCHING):
                     hidden[n] = True
                     break

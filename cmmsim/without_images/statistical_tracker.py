@@ -295,5 +295,5 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
     )
 
 
-def _cameras(rig: StereoRig, moves: Sequence[Array]) -> Cameras:
-    return rig.kernel_cameras._replace(moves=np.stack(moves))
+def _cameras(rig: StereoRig, extrinsics: Sequence[Array]) -> Cameras:
+    return rig.kernel_cameras._replace(extrinsics=np.stack(extrinsics))

@@ -50,21 +50,21 @@ class StickerScene:
             ),
         )
 
-    def placed(self, moves: Array) -> tuple[Array, Array]:
+    def placed(self, camera_from_bodies: Array) -> tuple[Array, Array]:
         """Return the places and normals (m, 3) of the stickers in the axes of a camera.
 
-        ``moves`` (b, 4, 4) are camera_from_body of the bodies.
+        ``camera_from_bodies`` is (b, 4, 4).
         """
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.disc_kernels import place_discs
 
         places = np.empty_like(self.places)
         normals = np.empty_like(self.normals)
-        place_discs(moves, self.owners, self.places, self.normals, places, normals)
+        place_discs(camera_from_bodies, self.owners, self.places, self.normals, places, normals)
         return places, normals
 
     def hidden(
-        self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
+        self, camera_from_bodies: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Return the mask (m,) of stickers that a solid hides wholly or partly.
 
@@ -75,7 +75,14 @@ class StickerScene:
 
         hidden = np.empty(len(asked), dtype=bool)
         hidden_stickers(
-            moves, places, normals, self.owners, CLEAR * self.radius, self.occluders, asked, hidden
+            camera_from_bodies,
+            places,
+            normals,
+            self.owners,
+            CLEAR * self.radius,
+            self.occluders,
+            asked,
+            hidden,
         )
         return hidden
 

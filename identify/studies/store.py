@@ -1,8 +1,8 @@
 """Folder of a study: its study, the lock while the study runs, and the journal of its rows.
 
-``study.json`` is the resolved study with the versions of the software that began it. ``rows.jsonl``
-is the journal of finished rows, ``study.parquet`` the table of these rows, and ``study.nc`` their
-figures by factors.
+``study.json`` is the resolved study, with the versions of the software that began the study.
+``rows.jsonl`` is the journal of finished rows, ``study.parquet`` the table of these rows, and
+``study.nc`` their figures by factors.
 
 The journal is an append-only file of JSON lines. Finished rows are on the disk before a worker gets
 its next batch. A line counts only if it is complete. After a crash, an incomplete last line is cut

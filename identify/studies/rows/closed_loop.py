@@ -91,7 +91,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     setup = Setup(scenario.with_overrides(UNWATCHED))
     plan = setup.sensor_plan
     number = stream_seed(seed, EXPERIMENT)
-    # A sensor without teaching (None) teaches itself.
+    # With None, the sensor teaches itself.
     taught = exactly_taught(plan.file) if options.teaching == "exact" else None
     sensor = plan.make(setup.robot, number, taught)
     design = setup.design

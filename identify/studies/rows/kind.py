@@ -1,5 +1,6 @@
-"""Definition of a kind of row: a function, its options, its figures, and the keys that it reads. A
-figure is a number that the function computes, such as an rms error.
+"""Definition of a kind of row: a function, its options, its figures, and the keys that it reads.
+
+A figure is a number that the function computes, such as an rms error.
 """
 
 from collections.abc import Callable, Mapping
