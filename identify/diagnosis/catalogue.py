@@ -1,6 +1,7 @@
 """Catalogue of the causes for which a model may miss its record."""
 
 from identify.arrays import Array
+from identify.diagnosis.body_causes import body_causes
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.command_causes import command_causes
 from identify.diagnosis.geometry_causes import geometry_causes
@@ -18,6 +19,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
         *command_causes(problem),
         *geometry_causes(problem),
         *loop_causes(problem, parameters),
+        *body_causes(problem, parameters),
         *measurement_causes(problem, parameters),
     )
     return (*causes, *(one.companion for one in causes if one.companion is not None))

@@ -35,7 +35,12 @@ from scipy.special import ndtri
 
 from dynamics.inertia import SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
-from dynamics.pseudo_inertia import from_log_cholesky, log_cholesky, log_cholesky_slope
+from dynamics.pseudo_inertia import (
+    from_log_cholesky,
+    log_cholesky,
+    log_cholesky_slope,
+    nearest_body,
+)
 from dynamics.spatial_inertia import MOMENTS
 from identify.arrays import Array
 from identify.estimation.prior import StartingGuess
@@ -53,6 +58,12 @@ SMALLEST_SHARE = 1e-3
 """Lower bound of parameters that must be above zero, as a share of the initial guess.
 
 Examples are the platform's mass and the integral gain.
+"""
+
+INSIDE = 1e-3
+"""Distance of the start of a search from bodies that are flat, as a share of their second moments.
+
+The logarithms of a flat body are infinite.
 """
 
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
@@ -84,6 +95,9 @@ class ParameterBounds:
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
             allowed[self.layout.rigid] = self.layout.rigid_of(bodies)
+            for own in self._log_cholesky:
+                second = allowed[own][4:7].sum() / 2
+                allowed[own] = nearest_body(allowed[own], INSIDE * second)
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
     def coordinates(self, parameters: Array) -> Array:

@@ -25,10 +25,12 @@ from dynamics.closed_loop import (
     simulate_commands,
     simulate_servo,
 )
+from dynamics.closed_loop.drives import JointLaw
 from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
+from identify.model.joint_torques import equivalent_commands, while_commands_act
 from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
 from identify.runtime import in_threads
 
@@ -63,6 +65,9 @@ class LoopModel:
         Common errors that the model contains, in their standard deviations. None means no errors.
     marginal : Marginal, optional
         Whitener of the residuals for common errors, see `with_common_errors`.
+    torques : ndarray, shape (N, n), optional
+        Torques or forces that the joints need at the frames beside those of the model, if the
+        logged commands drive it. See `joint_torques`.
     groups : RigidGroups, optional
         Combinations of the inertial parameters on which the motion depends. If they are given,
         sensitivities are with respect to their pivots and to all other parameters.
@@ -82,11 +87,16 @@ class LoopModel:
     acted: Array | None = None
     drawn: Array | None = None
     marginal: Marginal | None = None
+    torques: Array | None = None
     groups: RigidGroups | None = None
 
     def driven_by_commands(self) -> "LoopModel":
         """Return a copy of the model with joints driven by the logged commands."""
         return replace(self, driven=True, marginal=None)
+
+    def with_torques(self, torques: Array) -> "LoopModel":
+        """Return a copy of the model whose joints need further torques (N, n) at the frames."""
+        return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
         """Return a copy of the model that contains these common errors (k,).
@@ -226,11 +236,12 @@ class LoopModel:
         sensor = IdealSensor(self._lost, self._sensed(noise))
         late = self.latencies
         if self.driven and sensitivities:
+            commands = self._commands(parameters)
             return differentiate_commands(
-                *given, self.logged, sensor, latencies=late, groups=self.groups
+                *given, commands, sensor, latencies=late, groups=self.groups
             )
         if self.driven:
-            return simulate_commands(*given, self.logged, sensor, latencies=late)
+            return simulate_commands(*given, self._commands(parameters), sensor, latencies=late)
         if sensitivities:
             return differentiate_servo(*given, sensor, latencies=late, groups=self.groups)
         # The servo always uses the robot that it knows, even if another robot moves.
@@ -247,8 +258,25 @@ class LoopModel:
         sensed = np.asarray(self._sensed(noises))
         given = self.robot, parameters + self.payload, self.reference, self.settings
         if self.driven:
-            return repeat_commands(*given, self.logged, sensed, latencies=self.latencies)
+            commands = self._commands(parameters)
+            return repeat_commands(*given, commands, sensed, latencies=self.latencies)
         return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies)
+
+    def drive_law(self, parameters: Array) -> JointLaw:
+        """Return the law of the drives with its gains among parameters (p,)."""
+        return self.settings.drives.joint_law(parameters[self.robot.layout.joint_pid])
+
+    def _commands(self, parameters: Array) -> Array:
+        """Return the commands (N, n) that drive the model, which are the logged ones at first.
+
+        They are changed by what the drives need for `torques`.
+        """
+        if self.torques is None:
+            return self.logged
+        timing = self.settings.timing
+        late = self.stated_latencies if self.latencies is None else self.latencies
+        needed = while_commands_act(self.torques, late, timing)
+        return self.logged - equivalent_commands(needed, self.drive_law(parameters), timing)
 
     @property
     def _lost(self) -> NDArray[np.bool_] | None:

@@ -1,0 +1,299 @@
+"""Causes in bodies and joints: centres of mass, products of inertia, passive and uneven friction.
+
+Each is a torque that the joints need beside those of the model. The torques of bodies are columns
+of the regressor of full bodies along the motion of the model. Those of passive joints follow from
+the power that friction takes. Let w be the angular velocity of one body of a joint relative to the
+other, and W its derivatives with respect to the twist. Viscous friction is then the wrench W^T w,
+and dry friction W^T w / |w|. The torques act on the model as changes of its commands
+(`identify.model.joint_torques`). Before the motion begins, the drives hold what they need.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from dynamics import Robot
+from dynamics.expressions import function
+from dynamics.geometry import RobotGeometry
+from dynamics.parameters import parameter_layout
+from dynamics.rigid_body.virtual_work import rigid_body_regressor
+from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
+from identify.arrays import Array
+from identify.diagnosis.cause import Cause, Change, pose_columns
+from identify.estimation.output_error import OutputErrorProblem
+from identify.filtering import spline_derivatives
+from identify.model.loop_model import LoopModel
+from identify.runtime import in_threads
+
+PROBED = 1e-5
+"""Largest change of a command for differences, rad or m."""
+
+MOVING = 0.01
+"""Velocity above which a joint moves, as a share of its RMS velocity."""
+
+SLOWEST = 1e-2
+"""Angular velocity, rad/s, below which the dry friction of a passive joint fades."""
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Torques that a cause of size one needs at the joints.
+
+    torques: one array (N, n) for each run, N m or N.
+    """
+
+    name: str
+    unit: str
+    group: str
+    torques: tuple[Array, ...]
+    remedy: str
+    least: float = -np.inf
+
+
+@dataclass(frozen=True)
+class RunMotion:
+    """Motion of a run of the model at its frames.
+
+    poses, twists, twist_dots (N, 6). torque_maps (N, n, 6): torques of the joints by a wrench on
+    the platform.
+    """
+
+    poses: Array
+    twists: Array
+    twist_dots: Array
+    torque_maps: Array
+
+
+def body_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the causes in bodies and joints of a problem at its optimum (p,)."""
+    motions = [run_motion(run, parameters) for run in problem.runs]
+    needed = [
+        *_uneven_bodies(problem.runs[0].robot, parameters, motions),
+        *_passive_friction(problem.runs[0].robot, motions),
+        *_uneven_friction(problem.runs, motions),
+    ]
+
+    def columns(changed: OutputErrorProblem, at: Array) -> Array:
+        return _columns(changed, at, needed)
+
+    return tuple(
+        Cause(
+            name=one.name,
+            unit=one.unit,
+            group=one.group,
+            change=_added(one),
+            step=1.0,
+            remedy=lambda size, one=one: one.remedy,  # type: ignore[misc]
+            least=one.least,
+            quick=(columns, place),
+        )
+        for place, one in enumerate(needed)
+    )
+
+
+def run_motion(run: LoopModel, parameters: Array) -> RunMotion:
+    """Return the motion of a run of the model at parameters (p,)."""
+    found = run.simulate(parameters)
+    robot = run.robot
+    chart = robot.geometry.chart
+    poses = chart.pose(chart.coordinates(found.pose))
+    rates = chart.lifted(chart.coordinates(found.pose_rate))
+    gains, _ = spline_derivatives(rates, run.settings.timing.frame_rate_hz)
+    free = chart.basis
+    jacobians = robot.joint_jacobian(poses) @ free
+    maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
+    return RunMotion(poses, robot.twist(poses, rates), robot.twist_dot(poses, rates, gains), maps)
+
+
+def _added(one: Needed) -> Change:
+    """Return the change of a problem by needed torques."""
+
+    def added(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
+        runs = [
+            run.with_torques(size * torques)
+            for run, torques in zip(problem.runs, one.torques, strict=True)
+        ]
+        return replace(problem, runs=tuple(runs))
+
+    return added
+
+
+def _columns(problem: OutputErrorProblem, parameters: Array, needed: Sequence[Needed]) -> Array:
+    """Return the columns (m, k) of needed torques, by differences of runs of the model."""
+    changes = []
+    for place, run in enumerate(problem.runs):
+        stiffness = float(run.drive_law(parameters).lp)
+        peaks = [max(float(np.abs(one.torques[place]).max()), 1e-300) for one in needed]
+        sizes = [PROBED * stiffness / peak for peak in peaks]
+        ends = [run] + [
+            run.with_torques(size * one.torques[place])
+            for one, size in zip(needed, sizes, strict=True)
+        ]
+        poses = in_threads(lambda end: end.model_poses(parameters), ends)
+        parts = [(pose - poses[0]) / size for pose, size in zip(poses[1:], sizes, strict=True)]
+        changes.append(np.stack(parts, axis=2))
+    return pose_columns(problem, parameters, changes)
+
+
+def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]) -> list[Needed]:
+    """Return centres of mass and products of inertia of the platform and of the bodies of legs.
+
+    Bodies of one kind are equally uneven, each in its own axes. Full bodies are left out, as the
+    model has these parameters.
+    """
+    layout = robot.layout
+    whole = parameter_layout(robot.geometry.legs, ("all",))
+    regressors = [_full_regressor(robot.geometry, one) for one in motions]
+    masses = layout.bodies_of(parameters[layout.rigid])[:, 0]
+    found = []
+    for kind in dict.fromkeys(one.name for one in layout.kinds):
+        own = [
+            place
+            for place, one in enumerate(layout.kinds)
+            if one.name == kind and not layout.full[place]
+        ]
+        if not own:
+            continue
+        words = "the platform" if kind == "platform" else f"the {kind}s"
+        remedy = f"--set 'model.inertia={{ {kind} = \"full\" }}'"
+        for names, unit, group in (
+            (FIRST_MOMENTS, "m", f"centre of mass of {words}"),
+            (PRODUCTS, "kg m2", f"products of inertia of {words}"),
+        ):
+            for name in names:
+                columns = [
+                    whole.rigid_names.index(f"{layout.bodies[place]}.{name}") for place in own
+                ]
+                weights = masses[own] if unit == "m" else np.ones(len(own))
+                torques = tuple(
+                    _by_the_joints(one, regressor[:, :, columns] @ weights)
+                    for one, regressor in zip(motions, regressors, strict=True)
+                )
+                axis = name[-1] if unit == "m" else name
+                found.append(Needed(f"{group}, {axis}", unit, group, torques, remedy))
+    return found
+
+
+def _by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
+    """Return torques (N, n) of the joints for wrenches (N, 6), less those before the motion.
+
+    Before a motion begins, the drives hold the robot in equilibrium.
+    """
+    torques = np.einsum("kij,kj->ki", motion.torque_maps, wrenches)
+    return np.asarray(torques - torques[0])
+
+
+@lru_cache(maxsize=8)
+def _regressor_function(geometry: RobotGeometry) -> ca.Function:
+    """Return the regressor (6, r) of a geometry with full bodies, as a CasADi function."""
+    given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
+    return function("regressor", given, [rigid_body_regressor(geometry, *given)])
+
+
+def _full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
+    """Return the regressor (N, 6, r) of full bodies along a motion."""
+    regressor = _regressor_function(replace(geometry, full_bodies=("all",)))
+    found = regressor(motion.poses.T, motion.twists.T, motion.twist_dots.T).full()
+    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+
+
+def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
+    """Return viscous and dry friction of the passive joints, by the kind of joint."""
+    spins = [_passive_spins(robot, one) for one in motions]
+    found = []
+    for kind in dict.fromkeys(name for name, *_ in spins[0]):
+        viscous = []
+        dry = []
+        for motion, each in zip(motions, spins, strict=True):
+            linear = np.zeros_like(motion.twists)
+            unit = np.zeros_like(motion.twists)
+            for name, relative, by_twist, count in each:
+                if name == kind:
+                    speed = np.linalg.norm(relative, axis=1, keepdims=True)
+                    wrench = count * np.einsum("kij,ki->kj", by_twist, relative)
+                    linear += wrench
+                    unit += wrench / np.hypot(speed, SLOWEST)
+            viscous.append(_by_the_joints(motion, linear))
+            dry.append(_by_the_joints(motion, unit))
+        words = f"the {kind} joints"
+        remedy = (
+            f"--set 'model.passive_friction={{ {kind} = \"viscous\" }}'",
+            f"--set 'model.passive_friction={{ {kind} = \"dry\" }}'",
+        )
+        found += [
+            Needed(
+                f"viscous friction of {words}",
+                "N m s/rad",
+                "friction of passive joints",
+                tuple(viscous),
+                remedy[0],
+                0.0,
+            ),
+            Needed(
+                f"dry friction of {words}",
+                "N m",
+                "friction of passive joints",
+                tuple(dry),
+                remedy[1],
+                0.0,
+            ),
+        ]
+    return found
+
+
+def _passive_spins(robot: Robot, motion: RunMotion) -> list[tuple[str, Array, Array, int]]:
+    """Return kind, relative angular velocity (N, 3), and its derivatives (N, 3, 6) by the twist, of
+    each passive joint that turns, and the number of such joints side by side.
+    """
+    placements = robot.functions["placements"]
+    constants = len(motion.poses)
+
+    def spins(twists: Array) -> Array:
+        """Angular velocities (N, bodies + 2, 3): bodies leg by leg, the base, the platform."""
+        own = placements(motion.poses, twists)[0][:, :, 12:]
+        return np.concatenate([own, np.zeros((constants, 1, 3)), twists[:, None, 3:]], axis=1)
+
+    now = spins(motion.twists)
+    units = [spins(np.tile(one, (constants, 1))) for one in np.eye(6)]
+    by_twist = np.stack(units, axis=3)
+    base = now.shape[1] - 2
+    found = []
+    first = 0
+    for leg in robot.geometry.legs:
+        segments = leg.segments()
+        before = base
+        for place, segment in enumerate(segments):
+            body = first + place
+            if segment.joint in ("ball", "universal", "hinge") and not segment.actuated:
+                pair = now[:, body] - now[:, before], by_twist[:, body] - by_twist[:, before]
+                found.append((segment.joint, *pair, len(segment.copies)))
+            before = body
+        last = "hinge" if leg.chart == "planar" else "ball"
+        pair = now[:, -1] - now[:, before], by_twist[:, -1] - by_twist[:, before]
+        found.append((last, *pair, len(segments[-1].copies)))
+        first += len(segments)
+    return found
+
+
+def _uneven_friction(runs: Sequence[LoopModel], motions: Sequence[RunMotion]) -> list[Needed]:
+    """Return the half differences of the dry friction of each joint between its two directions."""
+    layout = runs[0].robot.layout
+    rates = [
+        np.einsum("kij,kj->ki", run.robot.joint_jacobian(one.poses), one.twists)
+        for run, one in zip(runs, motions, strict=True)
+    ]
+    typical = np.sqrt(np.mean(np.concatenate(rates) ** 2, axis=0))
+    moving = [np.abs(rate) > MOVING * typical for rate in rates]
+    return [
+        Needed(
+            f"dry friction of joint {joint + 1} that differs with direction",
+            layout.unit("joint1.coulomb"),
+            "friction that differs with direction",
+            tuple(np.where(one, np.eye(layout.joints)[joint], 0.0) for one in moving),
+            "--set model.friction_by_direction=true",
+        )
+        for joint in range(layout.joints)
+    ]

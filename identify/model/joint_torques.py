@@ -1,0 +1,60 @@
+"""Torques at the joints as changes of the joint commands with the same effect.
+
+A drive turns a change U of its command into the torque
+
+    lp U + ld c U_dot + li integral(U)
+
+beside that of the motion (`dynamics.closed_loop.drives`). A torque that a joint needs beside those
+of the model therefore acts as a change of its commands, which follows from this equation command by
+command. A model can thus have torques that its equation of motion lacks.
+"""
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from dynamics.closed_loop import FrameTiming
+from dynamics.closed_loop.drives import JointLaw
+from identify.arrays import Array
+
+
+def equivalent_commands(torques: Array, law: JointLaw, timing: FrameTiming) -> Array:
+    """Return the changes (N, n), rad or m, of commands for which drives add torques (N, n).
+
+    The torques, N m or N, are those of the time in which each command acts: their mean for a held
+    command, and the torque at the end of a ramp. Before the first command there is none.
+    """
+    period = 1.0 / timing.frame_rate_hz
+    ramp = timing.hold == "linear"
+    by_rate = law.ld * law.rate_weight / period
+    stiffness = law.lp + by_rate + law.li * period / 2
+    commands = np.zeros_like(torques)
+    integral = np.zeros(torques.shape[1])
+    before = np.zeros(torques.shape[1])
+    for k, torque in enumerate(torques):
+        held = by_rate * before - law.li * (integral + ramp * period * before / 2)
+        commands[k] = (torque + held) / stiffness
+        integral = integral + period * (
+            ramp * (before + commands[k]) / 2 + (not ramp) * commands[k]
+        )
+        before = commands[k]
+    return commands
+
+
+def while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
+    """Return values (N, n) of the frames at the times for which `equivalent_commands` needs them.
+
+    latencies (N,): time, s, from each frame to the start of the action of its command.
+    """
+    period = 1.0 / timing.frame_rate_hz
+    times = np.arange(len(values)) * period
+    begin = np.minimum(times + latencies, times[-1])
+    end = np.minimum(begin + period, times[-1])
+    # A cubic spline would swing about jumps, such as those of dry friction.
+    spline = PchipInterpolator(times, values)
+    if timing.hold == "linear":
+        return np.asarray(spline(end))
+    so_far = spline.antiderivative()
+    lasting = (end - begin)[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = (so_far(end) - so_far(begin)) / lasting
+    return np.where(lasting > 0, mean, spline(end))
