@@ -67,8 +67,8 @@ WINDOW_SHARE = 7 / 6
 class TeachingPlan:
     """Plan of teaching.
 
-    It states the quality of the views of the base, the quality and the number of the views of the
-    platform, and the sizes of windows in px.
+    ``base`` and ``platform`` are the qualities of the views. ``poses`` is the number of views of
+    the platform. The other entries are sizes of windows in px.
     """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))

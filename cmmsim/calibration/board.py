@@ -77,11 +77,11 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) in which the points of the board look the same in a picture.
+        """Orders (points,) of the board's points that a picture cannot tell apart.
 
         The orders belong to the unturned board, to half a turn, and to quarter turns if the board
         has as many rows as columns. An asymmetric grid with an odd number of rows has one order
-        only. A picture does not show which order is the true one.
+        only. The first is the order of ``points``.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":

@@ -263,10 +263,10 @@ def _without_neighbours(
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
     """Return the median radius of bright dots, as a share of half the distance to a neighbour.
 
-    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. The
-    dot's share of a cell's area is (mean - ground) / (dot - ground), with the mean grey value of
-    the cell and the grey values of ground and dot. The radius is overestimated if a dot is so
-    blurred that its middle is not uniform: by a quarter at 2.5 px radius and 1 px of blur.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. With
+    grey values, the dot's share of the cell is (mean of the cell - ground) / (dot - ground). The
+    radius is overestimated if a dot is so blurred that its middle is not uniform: by a quarter at
+    2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0

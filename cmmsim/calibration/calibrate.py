@@ -231,8 +231,7 @@ def contradictions(board: Board, state: RigState, pairs: Sequence[PairView]) -> 
     """Return one line for each contradiction between the pictures and their board file.
 
     The checks are the size of the dots, the order of the two folders, the unit of lengths, and the
-    number of unused pairs. ``state`` is the adjusted state. ``pairs`` are all pairs, and state the
-    reasons of missing sides.
+    number of unused pairs. ``state`` is the adjusted state. ``pairs`` are all pairs, used or not.
     """
     return [
         *_dot_radius(board, pairs),

@@ -3,10 +3,10 @@
 The adjustment assumes that errors of pixels are independent. In photographs a bent board, uneven
 light or the bias of the corner search displaces neighbouring points together. A view then carries
 less information than its number of points suggests. The scores of the views show this, while the
-size of the residuals does not. The score of view v is s_v = J_v' r_v, with the residuals r_v and
-their derivatives J_v by the common unknowns after the view's own pose is eliminated. The sum over
-all views is zero at the solution. Let I_v be the views' reduced normal matrices, which add up to N.
-For independent errors of variance sigma² the covariance of the scores is
+size of the residuals does not. Let r_v be the residuals of view v, and J_v their derivatives by the
+common unknowns after the view's own pose is eliminated. The score of the view is s_v = J_v' r_v.
+The sum over all views is zero at the solution. Let I_v be the views' reduced normal matrices, which
+add up to N. For independent errors of variance sigma² the covariance of the scores is
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 

@@ -6,10 +6,10 @@ of the ellipse, the contrast and the ground. The grey value is the mean plus nor
 and clipped. The variance of the noise depends on the mean. The Fisher information of a grey value
 is a sum over all its possible numbers.
 
-If the noise is below half a grey value, the information depends on where the mean lies between two
-whole grey values, and no estimator is unbiased at each single position of a centre. The information
-is therefore averaged over one grey value, so the bound holds on average over unknown positions. For
-stronger noise the average changes nothing.
+If the noise is below half a grey value, the information depends on the position of the mean between
+two whole grey values. No estimator is then unbiased at each single position of a centre. The
+information is therefore averaged over one grey value, and the bound holds on average over unknown
+positions. For stronger noise, averaging changes nothing.
 """
 
 import numpy as np

@@ -1,12 +1,12 @@
 """Centre of an ellipse from the gradients at all pixels of its edge: the dual conic operator.
 
-Each pixel (x, y) of the edge defines the line l = (a, b, c), c = -(a x + b y), which passes through
-the pixel perpendicular to the gradient (a, b). Lines that touch the ellipse satisfy l' C* l = 0
-with its dual conic C* = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]. This is linear in the five
-unknowns, and (D/2, E/2) is the centre. The gradient (a, b) is not normalised. This weights the
-residual of each line by |gradient|², so pixels away from the edge need not be removed. Source:
-J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine
-Vision and Applications 21 (2009).
+Through each pixel (x, y) of the edge passes a line perpendicular to the gradient (a, b): l = (a, b,
+c) with c = -(a x + b y). Lines that touch the ellipse satisfy l' C* l = 0 with its dual conic C* =
+[[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]. The equation is linear in the five unknowns, and
+(D/2, E/2) is the centre. The gradient (a, b) is not normalised. The residual of each line is thus
+weighted by |gradient|², and pixels away from the edge need not be removed. Source: J.-N. Ouellet,
+P. Hebert, Precise ellipse estimation without contour point extraction, Machine Vision and
+Applications 21 (2009).
 
 With the unknowns u = (A, B, C, D, E) and k = (a², a b, b², a c, b c), the normal equations are: sum
 over lines of k (k' u + c²) = 0. The noise of a pixel changes the gradients around the pixel. The

@@ -1,7 +1,7 @@
 """Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows.
 
 The model of a grey value is ground + contrast * share. The share is the exact part of the pixel
-that the ellipse covers, blurred by the point spread and, if it is known, by the movement during the
+that the ellipse covers. It is blurred by the point spread and, if known, by the movement during the
 exposure. Gauss-Newton solves for the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast,
 ground]. The weight of a grey value is the inverse of the camera's noise variance at the fitted
 value. The inverse of the normal matrix is the covariance of the parameters.
@@ -167,8 +167,9 @@ def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, grou
     """Return the largest accepted reduced chi-square (n,) for a contrast and ground in grey values.
 
     The fit uses a rounding variance that is averaged over all mean grey values. If the noise is
-    below half a grey value, the rounding variance of a uniform ground differs from this average,
-    and the error of the model becomes visible. The limit is raised to allow for both.
+    below half a grey value, two further errors become visible. The rounding variance of a uniform
+    ground differs from its average, and the model of a pixel is not exact. The limit is raised to
+    allow for both.
     """
     model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
     return limits.largest_misfit * (noise.rounding_excess(ground) + model)

@@ -4,11 +4,11 @@ The weight of a pixel is its grey value minus the threshold, ground + THRESHOLD 
 below the threshold. The weight is continuous, so that noise near the threshold moves the centroid
 smoothly. Pixels that can lie beyond the dark ring do not count.
 
-The centroid is biased for two reasons. All light of a pixel is assigned to the middle of the pixel,
-and the threshold removes more light on one side of the spot than on the other. The bias depends on
-the position of the centre within its pixel. In sharp noise-free images of stickers tilted by 45
-degrees, the bias is about 0.01 px rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10. A point
-spread of 0.6 px halves the bias. The covariance does not include the bias.
+The centroid is biased for two reasons. First, all light of a pixel is assigned to the middle of the
+pixel. Second, the threshold removes more light on one side of the spot than on the other. The bias
+depends on the position of the centre within its pixel. In sharp noise-free images of stickers
+tilted by 45 degrees, the bias is about 0.01 px rms at radius 3.8 px, 0.013 at 2.5 and 0.005 at 10.
+A point spread of 0.6 px halves the bias. The covariance does not include the bias.
 """
 
 from dataclasses import dataclass

@@ -184,10 +184,10 @@ def all_angle_rates(poses: Array, rates: Array) -> None:
 
 @compiled
 def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) -> None:
-    """Fill the covariance (6, 6) of a pose (6,) from that of its transform's small error.
+    """Fill ``spread`` (6, 6), the covariance of a pose (6,), from that of a small error [dt, dphi].
 
-    ``covariance`` (6, 6) belongs to the error [dt, dphi] in other axes. ``turn`` (3, 3) rotates
-    these axes to those of the pose.
+    ``covariance`` (6, 6) belongs to the small error of the transform, in other axes than the pose.
+    ``turn`` (3, 3) rotates these axes to those of the pose.
     """
     rates = np.empty((3, 3))
     slopes = np.empty((6, 3))  # derivatives of the place by dt, then of the angles by dphi

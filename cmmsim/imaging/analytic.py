@@ -88,7 +88,7 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Return arrays (k, 3) joined to one, and the index at which each begins."""
+    """Join arrays (k, 3), and return the joined array and the index at which each part begins."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 

@@ -15,8 +15,8 @@ class Solids(NamedTuple):
     """Outlines of solids in an image, from far to near.
 
     ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. Rows starts[k] to starts[k + 1]
-    belong to solid k. ``boxes`` (k, 4) are lowest x, y and highest x, y. ``slots`` (k,) are the
-    indices under which the covered shares of pixels are stored, or -1.
+    belong to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y of the s solids. ``slots``
+    (s,) are the indices under which the shares of pixels that they cover are stored, or -1.
     """
 
     half_planes: Array

@@ -171,8 +171,8 @@ class PaintedWindows:
 class PaintedSolids:
     """Convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
-    ``levels`` (patches,) is the level of a solid or of the lowest disc of a stack, and NaN for
-    other patches.
+    ``levels`` (patches,) has the level of each patch that is a solid or a stack (that of the lowest
+    disc), and NaN for other patches.
     """
 
     def __init__(self, drawable: Drawable) -> None:

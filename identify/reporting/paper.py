@@ -1,8 +1,8 @@
 """Numbers from the paper whose experiment this project repeats.
 
 Reports state them only for runs that repeat the settings of the paper. Each row is the RMS of x, y,
-z [µm] and alpha, beta, gamma [µrad] of the paper's identified model against measurements of a real
-robot, whose truth was not known.
+z [µm] and alpha, beta, gamma [µrad]. The paper compares an identified model with measurements of a
+real robot, whose truth was not known.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings

@@ -2,8 +2,8 @@
 
 Each process is connected to the main process by a pipe. The pipe has no name, address or file, so
 other users cannot reach it. A process gets its next batch when the rows of the batch before are on
-the disk. If a process dies, a new process replaces it. The rows of its batch are computed again at
-the end, each alone. If a process dies again during such a row, the row gets an error.
+the disk. If a process dies, a new process replaces it. The rows of the dead process are computed
+again at the end, each alone. If a process dies again during such a row, the row gets an error.
 
 `concurrent.futures.ProcessPoolExecutor` is not used. If one process dies, that executor ends all
 processes and does not report the rows of the dead process. If the main process is killed, its

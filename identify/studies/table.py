@@ -1,10 +1,15 @@
 """Finished rows as one tidy table in Parquet, and as arrays over the factors in netCDF.
 
-The metadata of the table contain the study. Its columns are ``row``, ``repeat``, the seed as
-``seed_entropy`` and ``seed_spawn_key`` (the arguments of ``numpy.random.SeedSequence``), a column
-per factor under its dotted path, a column per figure with its unit in the name, ``seconds`` and
-``error``. A failed row has NaN figures, and the reason in ``error``. If only some rows of a user's
-own kind have a figure, it is NaN in the other rows.
+The metadata of the table contain the study. The columns are:
+
+- ``row`` and ``repeat``;
+- ``seed_entropy`` and ``seed_spawn_key``, the arguments of ``numpy.random.SeedSequence``;
+- each factor, under its dotted path;
+- each figure, with the unit in the name;
+- ``seconds``, the computing time, and ``error``.
+
+A failed row has NaN figures, and the reason in ``error``. If only some rows of a user's own kind
+have a figure, the figure is NaN in the other rows.
 """
 
 import io

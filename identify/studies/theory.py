@@ -10,9 +10,9 @@ covariance is the sandwich estimate of that score, so the distribution can diffe
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
 need the number of independent errors in a row's figure, while this band uses the scatter of the
-figure over the rows. In simulations with two or more rows, the band contained the true rms in 95 to
-97 % of cases if a figure was the rms of three or more normal numbers. If a figure was a single
-normal number, the worst case, it did so in at least 92 %. A single row has no band.
+figure over the rows. In simulations with two or more rows, figures were the rms of three or more
+normal numbers. The band contained the true rms in 95 to 97 % of cases. For figures that are single
+normal numbers, the worst case, it did so in at least 92 %. A single row has no band.
 
 A law fails if the 99 % interval excludes its statement, widened by the law's tolerance. Otherwise
 it passes if the interval is narrow. If the interval is wide, there are too few rows, and the law is

@@ -17,8 +17,8 @@ def geometry_figure(entry: Mapping[str, Any]) -> Figure:
     """Draw the content of a geometry.json.
 
     One panel shows the standard deviation of each geometric parameter and, if the truth is known,
-    its error. A second panel shows the expected error at validation poses against the number of
-    measured poses, for random and for chosen poses, if this error was computed.
+    its error. If the expected error at validation poses was computed, a second panel shows this
+    error against the number of measured poses, for random and for chosen poses.
     """
     several = "random_poses" in entry
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
