@@ -151,25 +151,27 @@ def rank(
         if len(places) == 1 and found.sizes[0] < causes[places[0]].least:
             # nothing can have such a size
             found = score(projected[:, :0], left, lengths[:0])
-        chance = min(1.0, len(every) * chance_of(found, left, rows))
+        chance = min(1.0, len(every) * p_value_of(found, left, rows))
         worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
         ranked.append(Ranked(one, found, chance, worth))
     ranked.sort(key=lambda one: -one.worth)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)
     alone = [place for place, one in enumerate(causes) if one.alone]
-    few, found = few_alone(projected[:, alone], left, lengths[alone])
+    few, found = forward_selection(projected[:, alone], left, lengths[alone])
     chain = tuple(alone[place] for place in few)
     worth = found.statistic - len(chain) * (price + 2 * np.log(len(alone)))
     if worth <= ranked[0].worth:
         return tuple(ranked)
-    chance = min(1.0, len(every) ** len(chain) * chance_of(found, left, rows))
+    chance = min(1.0, len(every) ** len(chain) * p_value_of(found, left, rows))
     first = next(one for one in ranked if one.candidate.places == chain[:1])
     first = replace(first, chance=min(first.chance, chance))
     return (first, *(one for one in ranked if one.candidate is not first.candidate))
 
 
-def few_alone(columns: Array, residual: Array, lengths: Array) -> tuple[tuple[int, ...], Score]:
+def forward_selection(
+    columns: Array, residual: Array, lengths: Array
+) -> tuple[tuple[int, ...], Score]:
     """Return the places of a few causes alone, each the best beside those before, and their score.
 
     The arguments are as for `score`.
@@ -190,7 +192,7 @@ def few_alone(columns: Array, residual: Array, lengths: Array) -> tuple[tuple[in
     return chain, found
 
 
-def chance_of(found: Score, residual: Array, rows: Rows) -> float:
+def p_value_of(found: Score, residual: Array, rows: Rows) -> float:
     """Return the probability that a model without the causes has such a statistic.
 
     residual (m,): the one that was projected.
@@ -206,7 +208,7 @@ def chance_of(found: Score, residual: Array, rows: Rows) -> float:
     return float(chdtrc(found.freedoms, along @ np.linalg.solve(spread, along)))
 
 
-def together(ranking: Sequence[Ranked], rows: Rows, residual: Array) -> tuple[Ranked, ...]:
+def indistinguishable(ranking: Sequence[Ranked], rows: Rows, residual: Array) -> tuple[Ranked, ...]:
     """Return the first of a ranking and all that cannot be told apart from it, the lead first.
 
     They have no cause in common with the first, and explain as much but for chance, or for a

@@ -14,7 +14,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.ranking import ALIKE, NEAR, Ranked, Rows, misfit_of, rank, together
+from identify.diagnosis.ranking import ALIKE, NEAR, Ranked, Rows, indistinguishable, misfit_of, rank
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -82,7 +82,7 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
         # columns are those without any cause, and follow what was fitted only so far
         if ranking[0].score.statistic < (1 - ALIKE**2) * (point.cost - now.cost):
             break
-        alike = together(ranking, rows, now.beside_all.part(now.residual))
+        alike = indistinguishable(ranking, rows, now.beside_all.part(now.residual))
         best = alike[0]
         trial = _trial(problem, point, now, causes, places, best)
         rival = _rival(causes, best, ranking)

@@ -75,7 +75,7 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
     return chosen
 
 
-def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
+def visibility_shares(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
     """Return the used shares of the limits of visibility for stickers at a pose.
 
     Each sticker has six rows, three for each camera: grazing incidence, and the horizontal and
@@ -97,7 +97,7 @@ def sight_uses(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
     return ca.vertcat(*rows)
 
 
-def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
+def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
     """Return whether the stickers are proved visible in a whole box (6,) [m, rad] about home.
 
     The proof uses bounds of the motion and rotation of each sticker. False means that these bounds
@@ -134,7 +134,9 @@ def within_sight(sight: SightLines, stickers: list[int], home: Array, box: Array
 
 def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
     pose = ca.SX.sym("pose", 6)
-    return ca.Function("sight_uses", [pose], [sight_uses(sight, list(stickers), pose)])
+    return ca.Function(
+        "visibility_shares", [pose], [visibility_shares(sight, list(stickers), pose)]
+    )
 
 
 SQUARINGS = 6
@@ -244,7 +246,7 @@ class MotionConstraints:
         _check_home(robot, settings, margin)
         self.box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
         stickers = required_stickers(sight, robot.home_pose)
-        self.always_in_sight = within_sight(
+        self.always_in_sight = sees_required_stickers(
             sight, stickers, robot.home_pose, chart.lifted(self.box)
         )
         self._robot = robot
@@ -280,7 +282,7 @@ class MotionConstraints:
                 for side in ("left", "right")
                 for what in ("incidence", "across", "up")
             ]
-            uses = sight_uses(sight, stickers, self._pose)
+            uses = visibility_shares(sight, stickers, self._pose)
             limit = (1.0,) * len(names)
             self.limits.append(Limit("visibility", uses, limit, " of the limit", tuple(names)))
 

@@ -37,7 +37,7 @@ from dynamics import Robot
 from identify.arrays import Array, agreed
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import structure
-from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, regressor
+from identify.excitation.motion import Unknowns, log_determinant, motion, regressor, run_times
 from identify.own_parts import CRITERIA, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -148,7 +148,7 @@ def log_observability(
     [rad/s or m/s] smooths the sign of Coulomb friction and makes the function differentiable.
     """
     base = structure(robot)
-    times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
+    times = run_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
     z = ca.MX.sym("z", unknowns.size)
     # Fewer equations than base parameters make the determinant zero.
     if unknowns.coordinates * len(times) < base.rank:

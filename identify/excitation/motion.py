@@ -130,7 +130,7 @@ def is_whole_periods(duration_s: float, fundamental_hz: float) -> bool:
     return round(periods) >= 1 and abs(periods - round(periods)) <= 1e-9 * periods
 
 
-def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
+def run_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
     """Return instants (N,) [s], as dense as `sample_times`, over the run of a trajectory.
 
     If the run is a whole number of periods, they cover one period, because the motion repeats.

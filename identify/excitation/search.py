@@ -169,7 +169,7 @@ def evolve(
             f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least "
             f"{FEWEST_MEMBERS}"
         )
-    filling = _Filling(problem)
+    filling = _ScaledPopulation(problem)
     with progress.stage("evolutionary search", generations) as advance:
         found = differential_evolution(
             filling.cost,
@@ -188,7 +188,7 @@ def evolve(
     return SearchResult(z, problem.value(z), found.nfev, 0, found.nit, reason)
 
 
-class _Filling:
+class _ScaledPopulation:
     """Cost of the members of a population, each scaled to fill the box."""
 
     def __init__(self, problem: SearchProblem) -> None:

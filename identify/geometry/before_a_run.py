@@ -11,7 +11,7 @@ from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.selection import Candidates, Designer, Limits
-from identify.geometry.static_experiment import encoders_of, stand_at, true_poses
+from identify.geometry.static_experiment import encoders_of, measure_static_poses, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
@@ -63,7 +63,7 @@ def run_geometry(
         # This raises an error for poses out of reach before the slow teaching of the sensor.
         true_poses(robot, true, chosen.joints, chosen.poses)
         sensor = plan.taught(robot, seed, progress)
-        data, lost = stand_at(
+        data, lost = measure_static_poses(
             robot, settings, sensor, plan.sight, true, chosen.joints, chosen.poses, seed, progress
         )
         check_encoders(robot, data)

@@ -100,7 +100,7 @@ class PoseModel:
         return np.concatenate([by_numbers, by_frames], axis=2) @ self.scale, by_joints
 
 
-def seen_between(poses: Array, frames: Array) -> Array:
+def measured_poses(poses: Array, frames: Array) -> Array:
     """Return the measured poses for true poses (N, 6) and errors (12,) of the frames, m and rad.
 
     The errors are [dt, dphi] of the base, then of the platform.
@@ -201,7 +201,7 @@ class _Fit:
         of_model, common = np.split(unknowns, [len(self.model.scale)])
         closed = self.model.closed(self.data.joints, of_model, self.data.poses)
         seen = (
-            seen_between(closed, self.model.split(of_model)[1]) + self.data.common_errors @ common
+            measured_poses(closed, self.model.split(of_model)[1]) + self.data.common_errors @ common
         )
         return np.append(
             (self._whiteners @ (seen - self.data.poses)[:, self._free, None]).ravel(), unknowns

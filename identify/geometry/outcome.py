@@ -15,7 +15,7 @@ from identify.files.dataset import covariance_netcdf
 from identify.files.digest import toml_with_digest
 from identify.files.run_folder import rms_figures, save_files
 from identify.files.versions import versions
-from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
+from identify.geometry.calibration import Calibration, PoseModel, frame_columns, measured_poses
 from identify.geometry.observability import combinations
 from identify.geometry.selection import Candidates
 from identify.geometry.static_experiment import true_poses
@@ -179,7 +179,7 @@ class GeometryOutcome:
             # Without the truth there is no such figure. NaN becomes null in the file.
             return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
         stands = true_poses(robot, self.true, joints, poses)
-        predicted = seen_between(closure.poses(joints, found.deviations, poses), found.frames)
+        predicted = measured_poses(closure.poses(joints, found.deviations, poses), found.frames)
         return judged | {
             "unseen": rms_figures(predicted - stands),
             "uncalibrated": rms_figures(poses - stands),

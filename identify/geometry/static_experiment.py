@@ -21,7 +21,7 @@ from dynamics.errors import ConvergenceError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.experiment.sensor_in_loop import robot_transforms
-from identify.geometry.calibration import seen_between
+from identify.geometry.calibration import measured_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
@@ -203,7 +203,7 @@ def drawn(
                 covariances[row] = stated_covariance(sensor, sight, pose) / frames
                 seen[row] = True
             advance()
-    means = seen_between(poses, offset)
+    means = measured_poses(poses, offset)
     if (by_cameras := camera_errors(sensor, poses)) is not None:
         means = means + by_cameras @ rng.standard_normal(by_cameras.shape[2])
     for row in map(int, np.flatnonzero(seen)):
@@ -227,7 +227,7 @@ def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
     return CommonErrors(names, found.changes[:, :, kept], within).modes
 
 
-def stand_at(
+def measure_static_poses(
     robot: Robot,
     settings: Geometry,
     sensor: cmmsim.Sensor,

@@ -8,7 +8,7 @@ import numpy as np
 from cmmsim.visibility import sight_lines
 from dynamics import load_robot
 from identify.experiment.true_robot import misplaced
-from identify.geometry.calibration import PoseModel, Tolerance, calibrate, seen_between
+from identify.geometry.calibration import PoseModel, Tolerance, calibrate, measured_poses
 from identify.geometry.selection import Designer, Limits
 from identify.geometry.static_experiment import encoders_of, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
@@ -79,7 +79,7 @@ def drawn(robot, seed, chosen, frames_per_pose=20):
     off = misplaced(known, plant).geometry.shifted(-offsets).deviations_from(known.geometry)
     joints = chosen.joints + 1e-3 * known.travel_limit * rng.uniform(-1, 1, chosen.joints.shape)
     covariance = np.diag(POSE_STD**2) / frames_per_pose
-    seen = seen_between(
+    seen = measured_poses(
         true_poses(known, off, joints, chosen.poses), FRAMES.root @ rng.standard_normal(12)
     )
     seen += rng.multivariate_normal(np.zeros(6), covariance, len(joints))
@@ -94,6 +94,6 @@ def unseen_errors(robot, found, deviations, count=200):
     """Errors (count, 6) of poses that were not measured, m and rad."""
     known, unseen = known_robot(robot), poses_of(robot, count, 99)
     predicted = designer(robot).model.closure.poses(unseen.joints, found.deviations, unseen.poses)
-    return seen_between(predicted, found.frames) - true_poses(
+    return measured_poses(predicted, found.frames) - true_poses(
         known, deviations, unseen.joints, unseen.poses
     )

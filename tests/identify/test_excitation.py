@@ -20,7 +20,7 @@ from identify.excitation.constraints import (
     MotionConstraints,
     check_periods,
     required_stickers,
-    within_sight,
+    sees_required_stickers,
 )
 from identify.excitation.design import (
     design_trajectories,
@@ -293,7 +293,7 @@ def test_box_that_is_said_to_be_in_sight_is_and_sight_counts_where_that_is_not_p
     sight, box = sight_lines("ctrack780"), np.repeat([0.01, 0.04], 3)
     chosen = required_stickers(sight, robot.home_pose)
     assert len(chosen) == 12
-    assert within_sight(sight, chosen, robot.home_pose, box)
+    assert sees_required_stickers(sight, chosen, robot.home_pose, box)
     for signs in np.random.default_rng(0).choice([-1.0, 1.0], (40, 6)):
         assert sight.visible(robot.home_pose + signs * box)[chosen].all()
     # A narrow image: the shares that are within one are those of stickers that the cameras can look

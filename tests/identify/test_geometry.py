@@ -23,7 +23,7 @@ from identify.files.run_folder import rms_figures
 from identify.geometry.calibration import calibrate
 from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough, combinations
-from identify.geometry.static_experiment import Encoders, measured, stand_at
+from identify.geometry.static_experiment import Encoders, measure_static_poses, measured
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
 from identify.progress import SilentProgress
 from identify.record.geometry_errors import covariance_fault
@@ -143,7 +143,7 @@ def test_cameras_that_are_not_exact_are_handed_to_the_calibration():
         sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=taught)
         sight = Setup(drawing).sensor_plan.sight
         how = robot, drawing.geometry, sensor, sight, nothing, chosen.joints, chosen.poses
-        found.append(stand_at(*how, 0, SilentProgress())[0])
+        found.append(measure_static_poses(*how, 0, SilentProgress())[0])
     exactly, inexactly = found
     assert exactly.common is None
     expected = sensor.common_errors(inexactly.poses, np.zeros_like(inexactly.poses))
