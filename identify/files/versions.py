@@ -1,4 +1,4 @@
-"""Versions of the software that made a result, and their comparison between the rows of a study."""
+"""Versions of the software that made a result, and the comparison of versions of a study's rows."""
 
 import platform
 import warnings
@@ -52,11 +52,11 @@ def product_version() -> str:
 
 
 def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
-    """Compare the versions of other places, given by name, with the versions here.
+    """Compare the versions here with those of other places, such as workers, by the places' names.
 
     Rows from another version of cmmsim belong to another simulation, which is an error. Other
-    versions of numerical packages change figures slightly or not at all. A warning names each such
-    version once. ``remedy`` is the advice at the end of the error.
+    versions of numerical packages change figures slightly or not at all. A warning names each
+    differing version once. ``remedy`` is the advice at the end of the exception's message.
 
     Raises StudyError if a place has another version of cmmsim, or none.
     """

@@ -141,7 +141,7 @@ def _sentence(text: str) -> str:
 def _coloured(element: str) -> str:
     """Return a figure whose colours are variables of the page.
 
-    Screen readers skip it, because its caption describes it.
+    Screen readers skip the figure, because the caption describes it.
     """
     # CSS variables work in a style, but not in an attribute of SVG.
     text = re.sub(r'\sfill="(#[0-9a-f]{6})"', r' style="fill: \g<1>"', element)

@@ -140,7 +140,7 @@ KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "delay betwe
 
 
 def _shares(found: dict[str, Any]) -> str:
-    """Return a sentence with the largest share of each kind of common error in a variance."""
+    """Return a text with each kind of common error's largest share in a parameter's variance."""
     identified = [
         one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
     ]
@@ -177,7 +177,7 @@ def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) 
 def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the models with measurement and truth on the validation trajectories.
 
-    For a run that repeats the experiment of the paper, its table 4 follows.
+    For a run that repeats the experiment of the paper, the paper's table 4 follows.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
@@ -200,7 +200,7 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
 
 
 def prediction_table(result: dict[str, Any]) -> Table:
-    """Compare the predicted deviation of the plant from the identified model with the actual one.
+    """Compare the plant's predicted deviation from the identified model with the actual deviation.
 
     The rows are the validation trajectories.
     """
@@ -270,8 +270,8 @@ def _rms(values: list[float]) -> list[str]:
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """Print a summary of the identification.
 
-    It states what is identified, how well the model explains the record, the time, and the path of
-    the result.
+    The summary states what is identified, how well the model explains the record, the time, and the
+    path of the result.
     """
     identification = result["identification"]
     kinds = {"parameters": "parameters", "groups": "sums of them that the motion depends on"}

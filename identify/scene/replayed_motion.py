@@ -62,8 +62,8 @@ class Motion:
     def drawn(self) -> Array:
         """Poses (N, 6) in which the robot is drawn.
 
-        They are the true poses. If the truth is unknown, each is the last measured pose, projected
-        to the robot's degrees of freedom.
+        The robot is drawn at the true poses. If the truth is unknown, it is drawn at the last
+        measured pose, projected to the robot's degrees of freedom.
         """
         if TRUE in self.poses:
             return self.poses[TRUE]
@@ -158,8 +158,8 @@ def _models(
 ) -> dict[str, Array]:
     """Return the poses (N, 6) of the identified model and of the initial guess.
 
-    If there are none, a note states the reason. Raises RecordError if they do not belong to the
-    record.
+    If there are none, a note states the reason. Raises RecordError if the poses do not belong to
+    the record.
     """
     missing = "so no model is shown; this command adds it: cmmsim validate --out"
     if not run.model.is_file() or not run.result.is_file():

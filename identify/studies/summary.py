@@ -105,9 +105,9 @@ def write(
 def main_figures(study: Study, names: list[str]) -> list[str]:
     """Return the figures among `names` that are plotted and tabulated.
 
-    These are the figures that the study names. If it names none, they are the main figures of a
-    built-in kind, or the first six figures of a user's own kind. Raises StudyError if the study
-    names a figure that no row has.
+    The study names these figures. If it names none, they are the main figures of a built-in kind,
+    or the first six figures of a user's own kind. Raises StudyError if the study names a figure
+    that no row has.
     """
     if study.figures is not None:
         # The first rows of a running study can lack a figure of the kind.

@@ -1,11 +1,11 @@
-"""Comparison of a study's rows with the laws it states, by a measured exponent or ratio.
+"""Comparison of a study's rows with the study's laws, by a measured exponent or ratio.
 
 A log-linear regression estimates how the mean square of a positive figure y depends on other
-quantities. The mean square is modelled as exp(X beta). The estimate solves
-X^T (y^2 / mean - 1) = 0, the score equation of a gamma-distributed y^2 with logarithmic link
-(McCullagh and Nelder 1989, section 8.3). This estimates the scaling of the mean square itself,
-for any distribution of the figure, while a straight line through logarithms does not. The
-covariance is the sandwich estimate of that score, so the distribution can differ between rows.
+quantities. The mean square is modelled as exp(X beta). The estimate solves X^T (y^2 / mean - 1) =
+0, the score equation of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989,
+section 8.3). The result is the scaling of the mean square itself, whatever the distribution of the
+figure. A straight line through logarithms would not give this scaling. The covariance is a sandwich
+estimate, so the figure can have another distribution in each row.
 
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
@@ -14,9 +14,10 @@ figure over the rows. In simulations with two or more rows, figures were the rms
 normal numbers. The band contained the true rms in 95 to 97 % of cases. For figures that are single
 normal numbers, the worst case, it did so in at least 92 %. A single row has no band.
 
-A law fails if the 99 % interval excludes its statement, widened by the law's tolerance. Otherwise
-it passes if the interval is narrow. If the interval is wide, there are too few rows, and the law is
-undecided. One true law in a hundred fails by chance.
+A law states an exponent or a ratio, with a tolerance. The law fails if no value within the
+tolerance lies in the 99 % interval of the measured value. Otherwise the law passes if the interval
+is narrow. If the interval is wide, there are too few rows, and the law is undecided. One true law
+in a hundred fails by chance.
 """
 
 from dataclasses import dataclass
@@ -283,7 +284,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Test whether the figure grows along values of the factor, by its smallest step."""
+    """Test whether the figure grows along values of the factor, by the smallest step."""
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
@@ -329,9 +330,9 @@ def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
 
 
 def _covariates(values: pd.Series) -> Array:
-    """Return the covariates (n, k) of another factor of a sample.
+    """Return the covariates (n, k) of a factor of a sample, other than the factor of the law.
 
-    They are its logarithm, or an indicator of each value except the first.
+    Covariates are the logarithm of the factor, or an indicator of each value except the first.
     """
     if pd.api.types.is_numeric_dtype(values) and (values > 0).all():
         return np.log(values.to_numpy(dtype=float))[:, None]

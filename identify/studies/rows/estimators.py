@@ -87,7 +87,7 @@ COLUMNS = {
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
-    """Compute one row. Figures that an estimator does not return are missing.
+    """Compute one row. A figure that an estimator does not return is missing in the row.
 
     Raises EstimationError, and the exceptions of experiment and sensor.
     """

@@ -74,12 +74,12 @@ class KeysRead:
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:
-    """Return whether a path is one of the keys, or in a section or table that is one of them."""
+    """Return whether a path is one of the keys, or in a section or table that is one of the keys."""
     return any(path == key or path.startswith(f"{key.removesuffix('.')}.") for key in keys)
 
 
 def timing(*names: str) -> tuple[str, ...]:
-    """Return both paths of timing keys: in a scenario's ``[timing]``, and in a sensor file."""
+    """Return two paths of each timing key: in a scenario's ``[timing]``, and in a sensor file."""
     return tuple(
         path
         for name in names
