@@ -124,7 +124,7 @@ def _required(*names):
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory):
+def running_browsers(tmp_path_factory):
     """A function (webgl=True) of a running `Browser`; each kind is started once a process."""
     running = {}
     with ExitStack() as stack:
@@ -136,3 +136,19 @@ def browser(tmp_path_factory):
             return running[webgl]
 
         yield started
+
+
+@pytest.fixture
+def browser(running_browsers):
+    """A function (webgl=True) of a running `Browser`, which shows nothing after the test: a page
+    that plays would be drawn without a graphics card until all tests have ended.
+    """
+    used = {}
+
+    def started(webgl=True):
+        used[webgl] = running_browsers(webgl)
+        return used[webgl]
+
+    yield started
+    for one in used.values():
+        one.driver.get("about:blank")
