@@ -89,7 +89,8 @@ def register_sets(source: Array, targets: Array, covariances: Array) -> Registra
 
     sets, count = targets.shape[:2]
     transforms = rigid_starts(source, targets, np.ones((sets, count)))
-    places = np.ascontiguousarray(np.broadcast_to(source, targets.shape), dtype=float)
+    # a copy, because the kernel is compiled once more for arrays that are read-only
+    places = np.array(np.broadcast_to(source, targets.shape), dtype=float, order="C")
     points = np.ascontiguousarray(targets, dtype=float).reshape(-1, 3)
     informations = np.linalg.inv(covariances.reshape(-1, 3, 3))
     starts = count * np.arange(sets + 1)

@@ -251,11 +251,12 @@ def triangulate(
 
     if near is None:
         near = linear_triangulation(rig, rig.left.undistort(left)[0], rig.right.undistort(right)[0])
-    points = np.array(near, dtype=float)
+    # by rows, because the kernel is compiled once more for arrays in another order
+    points = np.array(near, dtype=float, order="C")
     covariances = np.empty((len(points), 3, 3))
     gaps = np.empty(len(points))
-    pixels = np.stack([left, right], axis=1)
-    spreads = np.stack([left_covariances, right_covariances], axis=1)
+    pixels = np.ascontiguousarray(np.stack([left, right], axis=1))
+    spreads = np.ascontiguousarray(np.stack([left_covariances, right_covariances], axis=1))
     triangulate_all(
         rig.kernel_cameras,
         pixels,

@@ -278,7 +278,8 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
     )
     places = camera.scene.places[own]
     normals = camera.scene.normals[own]
-    taught_places = np.ascontiguousarray(taught.platform_places)
+    # copies, because kernels are compiled once more for arrays that are read-only
+    taught_places = np.array(taught.platform_places, order="C")
     return StereoScene(
         _cameras(camera.rig, camera.from_base),
         estimator.rig.kernel_cameras,
@@ -290,7 +291,7 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
         ),
         limits,
         solver_limits(count, STEP_TOLERANCE),
-        np.ascontiguousarray(taught.base_from_camera),
+        np.array(taught.base_from_camera, order="C"),
         invert(taught.base_from_camera),
     )
 
