@@ -29,7 +29,8 @@ class RobotGeometry:
     m/s^2. Lengths are in m, and vectors are in the axes of the base unless stated otherwise. Legs
     are assembled: the branch of each leg's inverse kinematics at home is selected. `full_bodies`
     are the names of the bodies with ten inertial parameters instead of four (see
-    `parameters.parameter_layout`).
+    `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
+    if all joints share them.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -40,6 +41,7 @@ class RobotGeometry:
     travel_limit: float
     gravity: np.ndarray
     full_bodies: tuple[str, ...] = ()
+    own_gains: bool = False
 
     def __post_init__(self) -> None:
         gravity = np.array(self.gravity, dtype=float)
@@ -81,7 +83,7 @@ class RobotGeometry:
     @cached_property
     def layout(self) -> ParameterLayout:
         """Dynamic parameters of a robot with this geometry."""
-        return parameter_layout(self.legs, self.full_bodies)
+        return parameter_layout(self.legs, self.full_bodies, self.own_gains)
 
     @property
     def prismatic(self) -> bool:
@@ -90,7 +92,10 @@ class RobotGeometry:
 
     @cached_property
     def digest(self) -> bytes:
-        """Digest of all numbers except the travel limit, for caches."""
+        """Digest of all that compiled functions depend on, for caches.
+
+        It has all numbers except the travel limit.
+        """
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         if any(self.layout.full):
             content.update(repr(self.layout.full).encode())
@@ -101,7 +106,8 @@ class RobotGeometry:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RobotGeometry):
             return False
-        return self.digest == other.digest and self.travel_limit == other.travel_limit
+        own = self.digest, self.travel_limit, self.own_gains
+        return own == (other.digest, other.travel_limit, other.own_gains)
 
     def __hash__(self) -> int:
         return hash(self.digest)

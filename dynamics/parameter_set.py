@@ -60,14 +60,14 @@ class Friction(Strict):
 
 
 class JointPid(Strict):
-    """Gains of the joint PID, which all joints share.
+    """Gains of the joint PID. Each is one value that all joints share, or a list with one per leg.
 
     `unit` is the unit of lp. It must be stated if the actuators slide.
     """
 
-    lp: Gain
-    li: Gain
-    ld: Gain
+    lp: Gain | list[Gain]
+    li: Gain | list[Gain]
+    ld: Gain | list[Gain]
     unit: Literal["N m/rad", "N/m"] | None = None
 
 
@@ -81,12 +81,18 @@ class Parameters(BaseModel):
     joint: Friction
     joint_pid: JointPid
 
+    @property
+    def own_gains(self) -> bool:
+        """True if a gain has one value per leg."""
+        return any(isinstance(getattr(self.joint_pid, gain), list) for gain in JOINT_PID)
+
 
 @dataclass(frozen=True)
 class ParameterSet:
     """Named parameter set.
 
-    `dynamic` (p,) is in the order of `Robot.parameter_names`, and `joint_pid` (3,) has lp, li, ld.
+    `dynamic` (p,) is in the order of `Robot.parameter_names`. `joint_pid` (3,) has lp, li, ld, or
+    (3 n,) those of each joint, one after another.
     """
 
     dynamic: np.ndarray
@@ -94,7 +100,7 @@ class ParameterSet:
 
     @property
     def vector(self) -> np.ndarray:
-        """All values: the dynamic parameters, then lp, li, ld."""
+        """All values: the dynamic parameters, then the gains."""
         return np.concatenate([self.dynamic, self.joint_pid])
 
 
@@ -134,15 +140,20 @@ def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Par
     ]
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     stated = values.joint_pid.unit
-    unit = layout.unit("joint_pid.lp")
+    unit = layout.unit(layout.joint_pid_names[0])
+    columns = [
+        per_leg(f"joint_pid.{gain}", getattr(values.joint_pid, gain), layout.joints)
+        for gain in JOINT_PID
+    ]
     if stated != unit and (stated or layout.prismatic):
         raise RobotFileError(
-            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} "
+            f"parameters.{name}.joint_pid.lp = {columns[0][0]:g} "
             f"{f'is in {stated}' if stated else 'has no unit'}, but the actuators "
             f"{'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which is "
             f'stated by unit = "{unit}" in joint_pid'
         )
-    joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
+    each = np.transpose(columns)
+    joint_pid = np.array(each.reshape(-1) if layout.own_gains else each[0])
     for array in (dynamic, joint_pid):
         array.setflags(write=False)
     return ParameterSet(dynamic, joint_pid)

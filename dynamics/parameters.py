@@ -30,12 +30,15 @@ LANES = 8
 """Number of derivatives that are computed at once."""
 
 
-def room_for_derivatives(parameters: int, start: int) -> int:
+def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:
     """Number of columns for the derivatives of one quantity, rounded up to a multiple of LANES.
 
     There is one column for each parameter, for the length of a step, and for each entry of a start
-    state.
+    state. Whether or not joints share their gains, there is a column for each gain of each joint:
+    the compiled code is then the same.
     """
+    parameters = rigid + (2 + len(JOINT_PID)) * joints
+    start = 3 * coordinates + joints
     return -(-(parameters + 1 + start) // LANES) * LANES
 
 
@@ -70,7 +73,7 @@ class ParameterLayout:
     `bodies` are the names of all bodies, the platform first, and `kinds` are their kinds. `of_leg`
     are the indices of the bodies of each leg. `prismatic` is True if the actuators slide. `full` is
     True for each body with ten inertial parameters, and False for each centred body, which has
-    four.
+    four. `own_gains` is True if each joint has its own gains, and False if all joints share them.
     """
 
     bodies: tuple[str, ...]
@@ -78,6 +81,7 @@ class ParameterLayout:
     of_leg: tuple[tuple[int, ...], ...]
     prismatic: bool
     full: tuple[bool, ...]
+    own_gains: bool = False
 
     @property
     def joints(self) -> int:
@@ -118,8 +122,9 @@ class ParameterLayout:
 
     @cached_property
     def joint_pid_names(self) -> tuple[str, ...]:
-        """Names of the gains of the joint PID, which all joints share."""
-        return tuple(f"joint_pid.{gain}" for gain in JOINT_PID)
+        """Names of the gains of the joint PID: lp, li, ld of all joints, or of joint by joint."""
+        owners = self.joint_names if self.own_gains else ("joint_pid",)
+        return tuple(f"{owner}.{gain}" for owner in owners for gain in JOINT_PID)
 
     @cached_property
     def dynamic_names(self) -> tuple[str, ...]:
@@ -128,12 +133,12 @@ class ParameterLayout:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of all parameters: the dynamic ones, then lp, li, ld."""
+        """Names of all parameters: the dynamic ones, then the gains."""
         return self.dynamic_names + self.joint_pid_names
 
     def derivatives(self, coordinates: int) -> int:
         """Number of columns for the derivatives of one number of the loop."""
-        return room_for_derivatives(len(self.names), 3 * coordinates + self.joints)
+        return room_for_derivatives(len(self.rigid_names), self.joints, coordinates)
 
     @property
     def rigid(self) -> slice:
@@ -158,7 +163,7 @@ class ParameterLayout:
     @property
     def joint_pid(self) -> slice:
         """Slice of the gains of the joint PID."""
-        return slice(self.viscous.stop, self.viscous.stop + len(JOINT_PID))
+        return slice(self.viscous.stop, self.viscous.stop + len(self.joint_pid_names))
 
     @property
     def full_bodies(self) -> tuple[str, ...]:
@@ -198,6 +203,24 @@ class ParameterLayout:
         rigid = other.rigid_of(self.bodies_of(dynamic))
         return np.concatenate([rigid, dynamic[..., self.rigid.stop : self.dynamic.stop]], axis=-1)
 
+    def each_gains(self, gains: np.ndarray) -> np.ndarray:
+        """Gains lp, li, ld of each joint (..., n, 3), from the gains (..., 3) or (..., 3 n)."""
+        rows = gains.reshape(*gains.shape[:-1], -1, len(JOINT_PID))
+        return np.broadcast_to(rows, (*gains.shape[:-1], self.joints, len(JOINT_PID)))
+
+    def converted_gains(self, gains: np.ndarray, other: "ParameterLayout") -> np.ndarray:
+        """Gains in the layout of the same robot with shared gains, or with gains of each joint.
+
+        Gains that become shared are the mean of those of all joints.
+        """
+        if self.own_gains == other.own_gains:
+            return gains
+        each = self.each_gains(gains)
+        if other.own_gains:
+            return each.reshape(-1)
+        # the mean of equal numbers can differ from them in the last digit
+        return np.where((each == each[0]).all(axis=0), each[0], each.mean(axis=0))
+
     def leg_slices(self, leg: int) -> list[slice]:
         """Slice of the inertial parameters of each body of a leg."""
         return [self.body_slices[body] for body in self.of_leg[leg]]
@@ -216,13 +239,13 @@ class ParameterLayout:
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Split parameters into inertial parameters, dry friction, viscous friction, and
-        lp, li, ld (3,).
+        lp, li, ld of each joint (n, 3).
         """
         return (
             values[self.rigid],
             values[self.coulomb],
             values[self.viscous],
-            values[self.joint_pid],
+            self.each_gains(values[self.joint_pid]),
         )
 
     def check(self, values: ArrayLike, *, batch: bool = False) -> np.ndarray:
@@ -251,12 +274,14 @@ class ParameterLayout:
         )
 
 
-def parameter_layout(legs: Sequence[Leg], full: Sequence[str] = ()) -> ParameterLayout:
+def parameter_layout(
+    legs: Sequence[Leg], full: Sequence[str] = (), own_gains: bool = False
+) -> ParameterLayout:
     """Layout of a robot with these legs.
 
     The platform is first. The first bodies of all legs follow, and then their second bodies. `full`
     are the names of the bodies or kinds of bodies with ten inertial parameters, such as link2 or
-    link, or "all".
+    link, or "all". `own_gains` is True if each joint has its own gains.
 
     Raises ParameterError, with the valid names, for an unknown name.
     """
@@ -289,6 +314,7 @@ def parameter_layout(legs: Sequence[Leg], full: Sequence[str] = ()) -> Parameter
             bool({"all", name, kind.name} & set(full))
             for name, kind in zip(names, kinds, strict=True)
         ),
+        own_gains,
     )
 
 

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import check_choice, check_type, floats, shown
+from dynamics.checks import check_choice, check_type, flag, floats, shown
 from dynamics.errors import DynamicsError, RobotFileError, ShapeError, SingularPoseError
 from dynamics.geometry import RobotGeometry
 from dynamics.parameter_set import ParameterSet
@@ -175,7 +175,8 @@ class Robot(RobotDynamics):
         Parameters
         ----------
         parameters : array_like, shape (p + 3,)
-            Dynamic parameters, then lp, li, ld of the joint controller.
+            Dynamic parameters, then lp, li, ld of the joint controller. If each joint has its own
+            gains, the shape is (p + 3 n,).
 
         Returns
         -------
@@ -227,16 +228,52 @@ class Robot(RobotDynamics):
         >>> robot.with_full_bodies(["platform"]).parameter_names[:4]
         ('platform.mass', 'platform.mcx', 'platform.mcy', 'platform.mcz')
         """
-        geometry = replace(self.geometry, full_bodies=tuple(names))
-        if geometry.layout == self.layout:
+        return self._in_form(full_bodies=tuple(names))
+
+    def with_own_gains(self, own: bool = True) -> Robot:
+        """Robot whose joints each have their own gains, or whose joints share them.
+
+        Shared gains become the gains of each joint. Gains that become shared are the mean of those
+        of all joints.
+
+        Parameters
+        ----------
+        own : bool
+            True for own gains, False for shared gains.
+
+        Returns
+        -------
+        Robot
+            The other robot, or this robot if nothing changes.
+
+        Raises
+        ------
+        DynamicsError
+            If the argument is neither True nor False.
+
+        Examples
+        --------
+        >>> robot.with_own_gains().layout.joint_pid_names[:4]
+        ('joint1.lp', 'joint1.li', 'joint1.ld', 'joint2.lp')
+        """
+        return self._in_form(own_gains=flag("own", own, DynamicsError))
+
+    def _in_form(self, **form: Any) -> Robot:
+        """Robot with another form of its parameters, which are fields of its geometry."""
+        geometry = replace(self.geometry, **form)
+        own = self.layout
+        other = geometry.layout
+        if other == own:
             return self
         sets = {
             name: ParameterSet(
-                self.layout.converted(given.dynamic, geometry.layout), given.joint_pid
+                own.converted(given.dynamic, other), own.converted_gains(given.joint_pid, other)
             )
             for name, given in self.parameter_sets.items()
         }
-        nominal = replace(self.functions_of, full_bodies=tuple(names))
+        # a robot with functions of its own keeps such functions, which are faster than shared ones
+        own_functions = self.functions_of is self.geometry
+        nominal = None if own_functions else replace(self.functions_of, **form)
         return Robot(RobotDescription(self.name, geometry, sets), nominal)
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:

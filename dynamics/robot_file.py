@@ -240,7 +240,12 @@ def _geometry(content: RobotFile) -> RobotGeometry:
     forms = {"all": content.inertia} if isinstance(content.inertia, str) else content.inertia
     full = tuple(name for name, form in forms.items() if form == "full")
     return RobotGeometry(
-        tuple(content.legs), chart, content.travel_limit, np.array(content.gravity), full
+        tuple(content.legs),
+        chart,
+        content.travel_limit,
+        np.array(content.gravity),
+        full,
+        own_gains=any(values.own_gains for values in content.parameters.values()),
     )
 
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -64,19 +64,28 @@ def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
         "viscous": values.dynamic[layout.viscous],
     }
     lines.append(_table("joint", friction))
-    gains = {gain: values.joint_pid[[entry]] for entry, gain in enumerate(JOINT_PID)}
-    return [
-        *lines,
-        _table("joint_pid", gains)[:-2] + f", unit = {json.dumps(layout.unit('joint_pid.lp'))} }}",
-    ]
+    each = layout.each_gains(values.joint_pid)
+    # a list, even of equal values, states that each joint has its own gains
+    gains = dict(zip(JOINT_PID, each.T if layout.own_gains else each[0], strict=True))
+    unit = layout.unit(layout.joint_pid_names[0])
+    return [*lines, _line("joint_pid", {**gains, "unit": unit})]
 
 
 def _table(name: str, columns: dict[str, np.ndarray]) -> str:
     """Line with a table. A column of equal values is written as one value."""
-    said = {
-        key: column[0] if np.all(column == column[0]) else column for key, column in columns.items()
-    }
-    return f"{name} = {{ {', '.join(f'{key} = {_value(value)}' for key, value in said.items())} }}"
+    return _line(
+        name,
+        {
+            key: column[0] if np.all(column == column[0]) else column
+            for key, column in columns.items()
+        },
+    )
+
+
+def _line(name: str, values: Mapping[str, object]) -> str:
+    """Line with a table."""
+    said = ", ".join(f"{key} = {_value(value)}" for key, value in values.items())
+    return f"{name} = {{ {said} }}"
 
 
 def _key(name: str) -> str:

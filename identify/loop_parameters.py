@@ -2,16 +2,19 @@
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from dynamics import Robot
 from dynamics.closed_loop import Drives, FrameTiming, FrictionLaw, LoopSettings, ServoGains
 from dynamics.closed_loop.drives import DRIVES, DriveName
 from dynamics.errors import ParameterError
+from dynamics.parameters import JOINT_PID, SIGNED
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
@@ -98,9 +101,11 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
 def in_form(robot: Robot, side: Plant | Model) -> Robot:
     """Return the robot with the full and centred bodies that the plant or the model states.
 
-    Bodies that it does not name stay as they are. Raises ScenarioError, with the valid names, for a
-    body that the robot does not have.
+    Bodies that it does not name stay as they are. Joints share their gains, or each has its own, as
+    the plant or the model states. Raises ScenarioError, with the valid names, for a body that the
+    robot does not have, and for shared gains that are unequal.
     """
+    robot = _with_gains(robot, side)
     if side.inertia is None:
         return robot
     layout = robot.layout
@@ -125,6 +130,63 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
 def _with_full_bodies(robot: Robot, names: tuple[str, ...]) -> Robot:
     """Return `Robot.with_full_bodies`, from a cache, because base parameters are kept by robot."""
     return robot.with_full_bodies(names)
+
+
+def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
+    """Return the robot with shared gains, or gains of each joint, as the plant or the model states.
+
+    Raises ScenarioError for shared gains if they are unequal in the parameter set of this side.
+    """
+    own = side.gains == "each"
+    layout = robot.layout
+    if own == layout.own_gains:
+        return robot
+    set_name = side.parameters if isinstance(side, Plant) else side.start_parameters
+    if not own and set_name in robot.parameter_sets:
+        gains = layout.each_gains(robot.parameter_sets[set_name].joint_pid)
+        joint, kind = np.unravel_index(np.argmax(np.abs(gains - gains[0])), gains.shape)
+        if gains[joint, kind] != gains[0, kind]:
+            where = type(side).__name__.lower()
+            names = [f"joint{k + 1}.{JOINT_PID[kind]} = {gains[k, kind]:g}" for k in (0, joint)]
+            raise ScenarioError(
+                f"{where}.gains = 'shared', but the parameter set {set_name!r} of robot "
+                f"{robot.name} has {' and '.join(names)}: set {where}.gains = 'each'"
+            )
+    return with_own_gains(robot, own)
+
+
+@lru_cache(maxsize=16)
+def with_own_gains(robot: Robot, own: bool = True) -> Robot:
+    """Return `Robot.with_own_gains`, from a cache, because base parameters are kept by robot."""
+    return robot.with_own_gains(own)
+
+
+def known_value(values: Mapping[str, float], name: str) -> float | None:
+    """Return the value of a parameter by name, also of a robot whose parameters have another form.
+
+    A first moment or product of inertia without a value is zero. The gain of one joint is the
+    shared gain. The shared gain is the mean of those of all joints. None: there is no value.
+    """
+    if name in values:
+        return float(values[name])
+    owner, _, entry = name.rpartition(".")
+    if entry in SIGNED:
+        return 0.0
+    if entry not in JOINT_PID:
+        return None
+    if owner != "joint_pid":
+        shared = values.get(f"joint_pid.{entry}")
+        return None if shared is None else float(shared)
+    each = [float(value) for one, value in values.items() if one.rpartition(".")[2] == entry]
+    if not each:
+        return None
+    # the mean of equal numbers can differ from them in the last digit
+    return each[0] if len(set(each)) == 1 else float(np.mean(each))
+
+
+def is_gain(name: str) -> bool:
+    """Return True for a gain of the joint PID, shared or of one joint."""
+    return name.rpartition(".")[2] in JOINT_PID
 
 
 @dataclass(frozen=True)

@@ -103,9 +103,14 @@ class Setup:
     progress: Progress | None = None
 
     @cached_property
+    def in_file(self) -> Robot:
+        """The robot as its file describes it."""
+        return self.loaded or load_robot(self.scenario.robot)
+
+    @cached_property
     def nominal(self) -> Robot:
-        """The robot as its file describes it, with full and centred bodies as in the model."""
-        return in_form(self.loaded or load_robot(self.scenario.robot), self.scenario.model)
+        """The robot of the file, with full and centred bodies and gains as in the model."""
+        return in_form(self.in_file, self.scenario.model)
 
     @cached_property
     def known(self) -> KnownGeometry:
@@ -132,7 +137,7 @@ class Setup:
         settings = loop_settings(self.nominal, scenario.servo, timing, control, switches)
         identification = scenario.identification
         robot = true_robot(self.nominal, switches, scenario.geometry, self.known, self.seed)
-        robot = with_true_bodies(robot, self.loaded or load_robot(scenario.robot), switches)
+        robot = with_true_bodies(robot, self.in_file, switches)
         return Plant(
             nominal=self.robot,
             settings=with_springs(settings, self.nominal, switches),
@@ -267,7 +272,7 @@ class Setup:
                 f"{result!r} is not a result: identify.identify(record) returns one"
             )
         scenario = self.scenario.with_drive(result.drive.law)
-        return UnseenErrors(unseen_errors(result.estimate, self.robot, scenario, self.seed))
+        return UnseenErrors(unseen_errors(result.estimate, self.in_file, scenario, self.seed))
 
 
 def with_renderer(scenario: Scenario) -> Scenario:

@@ -63,46 +63,70 @@ Without them, the law could not balance a load, or would be another law.
 
 
 class JointLaw(NamedTuple):
-    """Law of a joint with its gains.
+    """Law of all joints with the gains of each.
 
-    The gains lp, li and ld are 0 if the law does not use them. `lx` and `rate_weight` (c) are as in
-    the formula of this module. `lx_by` (3,) has the derivatives of lx with respect to lp, li, ld.
-    `reads` (3,) is 1 for each gain that the law uses, else 0. `filter_time` is the time constant of
-    the filter of the rate, s, or 0.
+    The gains lp, li and ld (n,) are 0 if the law does not use them. `lx` (n,) and `rate_weight` (c)
+    are as in the formula of this module. `lx_by` (n, 3) has the derivatives of lx with respect to
+    lp, li, ld of the same joint. `reads` (3,) is 1 for each gain that the law uses, else 0.
+    `filter_time` is the time constant of the filter of the rate, s, or 0.
     """
 
-    lp: float
-    li: float
-    ld: float
-    lx: float
+    lp: np.ndarray
+    li: np.ndarray
+    ld: np.ndarray
+    lx: np.ndarray
     rate_weight: float
     lx_by: np.ndarray
     reads: np.ndarray
     filter_time: float = 0.0
 
+    @property
+    def integrates(self) -> bool:
+        """True if the law has an integral, which balances a load at rest."""
+        return bool(self.reads[JOINT_PID.index("li")])
+
     def held(self, torque: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Command (n,) and integral z (n,) that hold joints at an angle (n,) with a torque (n,)."""
-        if self.li:
+        if self.integrates:
             return angle, (torque + self.lx * angle) / self.li
         return angle + torque / self.lp, np.zeros_like(torque)
 
     def held_by_parameters(
-        self, torque: np.ndarray, angle: np.ndarray, by_dynamic: np.ndarray
+        self, torque: np.ndarray, angle: np.ndarray, by_dynamic: np.ndarray, own_gains: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, p) of the command and the integral of `held` with respect to all
         parameters.
 
         `by_dynamic` has the derivatives of the torque with respect to the dynamic parameters.
+        `own_gains` is True if each joint has its own gains among the parameters.
         """
         command, integral = self.held(torque, angle)
-        none = np.zeros((len(torque), len(JOINT_PID)))
+        by_gains = np.zeros((len(torque), len(JOINT_PID)))
+        none = gain_columns(by_gains, own_gains)
         still = np.hstack([np.zeros_like(by_dynamic), none])
-        if self.li:
-            by_gains = np.outer(angle, self.lx_by) / self.li
+        if self.integrates:
+            li = self.li[:, None]
+            by_gains = angle[:, None] * self.lx_by / li
             by_gains[:, 1] -= integral / self.li
-            return still, np.hstack([by_dynamic / self.li, by_gains])
-        none[:, 0] = (angle - command) / self.lp
-        return np.hstack([by_dynamic / self.lp, none]), still
+            return still, np.hstack([by_dynamic / li, gain_columns(by_gains, own_gains)])
+        by_gains[:, 0] = (angle - command) / self.lp
+        by_dynamic = by_dynamic / self.lp[:, None]
+        return np.hstack([by_dynamic, gain_columns(by_gains, own_gains)]), still
+
+
+def gain_columns(by_gains: np.ndarray, own_gains: bool) -> np.ndarray:
+    """Derivatives (..., n, 3) with respect to a joint's gains, as columns of all gains.
+
+    The columns are (..., n, 3) for shared gains. They are (..., n, 3 n) for gains of each joint,
+    with zeros for those of other joints.
+    """
+    if not own_gains:
+        return by_gains
+    *rows, joints, kinds = by_gains.shape
+    columns = np.zeros((*rows, joints, joints, kinds))
+    each = np.arange(joints)
+    columns[..., each, each, :] = by_gains
+    return columns.reshape(*rows, joints, joints * kinds)
 
 
 @dataclass(frozen=True)
@@ -157,7 +181,7 @@ class Drives:
             )
 
     def joint_law(self, gains: np.ndarray) -> JointLaw:
-        """Law with the gains lp, li, ld (3,)."""
+        """Law with the gains lp, li, ld of each joint (n, 3), or of all joints (3,)."""
         return joint_law(self.law, gains, self.filter_time)
 
 
@@ -166,13 +190,17 @@ PID = Drives()
 
 
 def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = None) -> JointLaw:
-    """Law `name` with the gains lp, li, ld (3,) and the time constant of its filter, s."""
+    """Law `name` with the gains lp, li, ld of each joint (n, 3), or of all joints (3,).
+
+    `filter_time` is the time constant of its filter, s.
+    """
     reads = np.array([float(gain in READS[name]) for gain in JOINT_PID])
-    lp, li, ld = (float(gain) if read else 0.0 for gain, read in zip(gains, reads, strict=True))
+    lp, li, ld = np.moveaxis(np.where(reads, gains, 0.0), -1, 0)
     if name != "cascade":
-        return JointLaw(lp, li, ld, 0.0, 1.0, np.zeros(3), reads, filter_time or 0.0)
+        none = np.zeros_like(lp)
+        return JointLaw(lp, li, ld, none, 1.0, np.zeros_like(gains), reads, filter_time or 0.0)
     lx = li * ld / lp
-    return JointLaw(lp, li, ld, lx, 0.0, np.array([-lx / lp, ld / lp, li / lp]), reads)
+    return JointLaw(lp, li, ld, lx, 0.0, np.stack([-lx / lp, ld / lp, li / lp], axis=-1), reads)
 
 
 class CascadeGains(NamedTuple):

@@ -293,6 +293,7 @@ def _fill(
     task.servo_jacobian = servo_jacobian.address
     rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
     law = settings.drives.joint_law(gains)
+    task.gain_step = gains.shape[1] if problem.robot.layout.own_gains else 0
     for name, value in law._asdict().items():
         task[name] = value
     task.kp = settings.servo.kp
@@ -313,7 +314,7 @@ def _fill(
     task.rigid = rigid
     # indices of the parameters of rigid bodies that have a column of derivatives
     columns = problem.columns
-    shown = len(problem.columns) - 2 * sizes.joints - len(gains)
+    shown = len(problem.columns) - 2 * sizes.joints - sizes.gains
     task.shown = shown
     task.pivots[:shown] = columns[:shown]
     rest = np.zeros(sizes.joints)

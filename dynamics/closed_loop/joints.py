@@ -209,10 +209,11 @@ class JointElasticity:
         per_inertia = np.zeros((2 * n, 2 * n))
         per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
-        _, coulomb, viscous, (lp, _, ld) = robot.layout.split(parameters)
+        _, coulomb, viscous, gains = robot.layout.split(parameters)
+        lp, _, ld = gains.T
         # slope of dry friction at rest, over the Coulomb torque
         slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0
-        stiffness = _coupled(self.stiffness, np.full(n, lp))
+        stiffness = _coupled(self.stiffness, lp)
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)
         motion = np.block(
             [

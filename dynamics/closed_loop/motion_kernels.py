@@ -24,10 +24,8 @@ def drive(task: Record, now: Record, at: Record) -> None:
     count = len(at.angle)
     first = 2 * len(at.bias)
     time = at.time
-    lp = task.lp
-    li = task.li
-    ld = task.ld
     for i in range(count):
+        ld = task.ld[i]
         if task.stiffness > 0:
             # joint PID and friction act on the motors: their angles replace those of the cranks
             motor = state[len(state) - 2 * count + i]
@@ -42,9 +40,9 @@ def drive(task: Record, now: Record, at: Record) -> None:
         if task.filter_time > 0:
             damped = ld * state[first + count + i]
         at.error[i] = error
-        at.torque[i] = lp * error + damped + li * state[first + i]
-        if task.lx > 0:
-            at.torque[i] -= task.lx * at.angle[i]
+        at.torque[i] = task.lp[i] * error + damped + task.li[i] * state[first + i]
+        if task.lx[i] > 0:
+            at.torque[i] -= task.lx[i] * at.angle[i]
         # A law that commands torques replaces the joint PID, whose error is then not integrated.
         if task.torques:
             at.torque[i] = now.command[i] + now.command_slope[i] * time
@@ -70,7 +68,8 @@ def winds_up(task: Record, at: Record, joint: int) -> bool:
     """
     if task.torques or follows_law(task, at, joint) > 0:
         return False
-    return bool((task.li * at.error[joint] - task.lx * at.velocity[joint]) * at.torque[joint] > 0)
+    growth = task.li[joint] * at.error[joint] - task.lx[joint] * at.velocity[joint]
+    return bool(growth * at.torque[joint] > 0)
 
 
 @kernel
@@ -226,7 +225,7 @@ def push(task: Record, now: Record, at: Record) -> None:
     copy(at.state[size : 2 * size], at.slope[:size])
     for i in range(count):
         held = winds_up(task, at, i)
-        at.slope[2 * size + i] = task.lx * at.velocity[i] / task.li if held else at.error[i]
+        at.slope[2 * size + i] = task.lx[i] * at.velocity[i] / task.li[i] if held else at.error[i]
     if task.filter_time > 0:
         for i in range(count):
             unfiltered = task.rate_weight * now.command_rate[i] - at.velocity[i]

@@ -25,7 +25,7 @@ from dynamics.closed_loop.start_state import (
 )
 from dynamics.errors import SimulationError
 from dynamics.legs.geometric_numbers import MOST_NUMBERS
-from dynamics.parameters import RigidGroups
+from dynamics.parameters import JOINT_PID, RigidGroups
 from dynamics.robot import Robot
 
 
@@ -36,7 +36,8 @@ class Sizes:
     `joints` and `coordinates` are the numbers of joints and coordinates of the robot, and `rigid`
     is the number of parameters of the rigid bodies. `geometry` is the space for geometric numbers,
     which are the last inputs of functions (see `Robot.moved`); it is the same for most robots.
-    `filters` is the number of joints whose drives filter a rate.
+    `filters` is the number of joints whose drives filter a rate. `gains` is the number of gains of
+    the joint PID.
     """
 
     joints: int
@@ -44,11 +45,12 @@ class Sizes:
     rigid: int
     geometry: int = 0
     filters: int = 0
+    gains: int = len(JOINT_PID)
 
     @property
     def parameters(self) -> int:
         """Number of all parameters: rigid bodies, friction of every joint, joint PID."""
-        return self.rigid + 2 * self.joints + 3
+        return self.rigid + 2 * self.joints + self.gains
 
     @property
     def start(self) -> int:
@@ -112,6 +114,7 @@ class LoopProblem:
             coordinates=motion.inputs[0],
             rigid=motion.inputs[2],
             filters=motion.outputs[2][0] if self.settings.drives.filter_time else 0,
+            gains=len(self.robot.layout.joint_pid_names),
             geometry=max(
                 MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(known.constants)
             ),

@@ -146,8 +146,12 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         # what the run computes, and who measures
         integers("sensitivities servo_knows measured"),
         # law of the drives, with its gains
-        reals("lp li ld lx rate_weight"),
-        reals("lx_by reads", "gain"),
+        reals("lp li ld lx", "joint"),
+        reals("lx_by", "joint", "gain"),
+        reals("reads", "gain"),
+        reals("rate_weight"),
+        # number of columns from the gains of a joint to those of the next
+        integers("gain_step"),
         # servo, elastic joints, timing, limits
         reals("kp kd ki stiffness damping motor_inertia period"),
         integers("torques"),
@@ -294,7 +298,7 @@ def _lengths(sizes: Sizes) -> dict[str, int]:
         "filtered row": max(filters, 1),
         # slopes of the pose, the pose rate, joint integrals and filtered rates; torques
         "stage row": moving + joints + filters,
-        "column": room_for_derivatives(sizes.parameters, sizes.start),
+        "column": room_for_derivatives(sizes.rigid, joints, coordinates),
         "command on its way": MAX_DELAY_FRAMES + 3,
         "servo input": coordinates + numbers,
         "rate map input": 2 * coordinates + numbers,

@@ -79,10 +79,10 @@ def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
         mode = now.mode[i]
         slips = now.mode[i] != 0
         law = follows_law(task, at, i)
-        known.by_error[i, k] = law * (task.lp + task.lx)
-        known.by_integral[i, k] = law * task.li
-        known.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld
-        known.damping[i, k] = 0.0 if filtering else law * task.ld
+        known.by_error[i, k] = law * (task.lp[i] + task.lx[i])
+        known.by_integral[i, k] = law * task.li[i]
+        known.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld[i]
+        known.damping[i, k] = 0.0 if filtering else law * task.ld[i]
         if slips:
             known.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(
                 task.friction, at.velocity[i], mode
@@ -102,30 +102,30 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
     count = len(now.mode)
     first = 2 * len(at.bias)
     rigid = task.shown
-    lp = rigid + 2 * count
     for i in range(len(at.bias)):
         for k in range(rigid):
             d.push[i, k] = -now.stages.columns[i, task.pivots[k], stage]
     for i in range(count):
+        lp = rigid + 2 * count + task.gain_step * i
         mode = now.mode[i]
         row = d.direct[i]
         law = follows_law(task, at, i)
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
-        if task.lx > 0 or task.filter_time > 0:
+        if task.lx[i] > 0 or task.filter_time > 0:
             fill(row, 0.0)
             # `by_error` has lp + lx, but lx does not act on the command: subtract that effect
-            add_row(-law * task.lx, d.acting[i], row, now.width)
+            add_row(-law * task.lx[i], d.acting[i], row, now.width)
         if task.filter_time > 0:
             rate = at.state[first + count + i]
-            add_row(law * task.ld, d.filtered[i], row, now.width)
+            add_row(law * task.ld[i], d.filtered[i], row, now.width)
         for k in (lp, lp + 1, lp + 2, rigid + i, rigid + count + i):
-            if task.lx == 0 and task.filter_time == 0:
+            if task.lx[i] == 0 and task.filter_time == 0:
                 row[k] = 0.0
         row[lp] += law * task.reads[0] * at.error[i]
         row[lp + 1] += law * task.reads[1] * at.state[first + i]
         row[lp + 2] += law * task.reads[2] * rate
         for k in range(3):
-            row[lp + k] -= law * task.lx_by[k] * at.angle[i]
+            row[lp + k] -= law * task.lx_by[i, k] * at.angle[i]
         row[rigid + i] -= dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
         row[rigid + count + i] -= at.velocity[i] if mode != 0 else 0.0
 
@@ -161,18 +161,18 @@ def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> No
     size = len(at.bias)
     width = now.width
     known = now.stages
-    lp = task.shown + 2 * len(now.mode)
     for i in range(len(now.mode)):
         if winds_up(task, at, i):
+            lp = task.shown + 2 * len(now.mode) + task.gain_step * i
             row = d.k[k, 2 * size + i]
-            share = task.lx / task.li
+            share = task.lx[i] / task.li[i]
             fill(row, 0.0)
             for j in range(size):
                 add_row(0.5 * share * known.crank_by_rate[i, j, k], d.trial[j], row, width)
                 add_row(share * at.jacobian[i, j], d.trial[size + j], row, width)
             for gain in range(3):
-                row[lp + gain] += task.lx_by[gain] / task.li * at.velocity[i]
-            row[lp + 1] -= share / task.li * at.velocity[i]
+                row[lp + gain] += task.lx_by[i, gain] / task.li[i] * at.velocity[i]
+            row[lp + 1] -= share / task.li[i] * at.velocity[i]
 
 
 @entry

@@ -185,7 +185,7 @@ def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: D
     parameters = checked_loop_parameters(robot, parameters, drives.law)
     check_start_pose(robot, parameters, pose)
     jacobian = robot.coordinate_jacobian(pose)
-    law = drives.joint_law(parameters[robot.layout.joint_pid])
+    law = drives.joint_law(robot.layout.split(parameters)[3])
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
     demand = np.linalg.solve(jacobian, law.held(holding, robot.inverse_kinematics(pose))[0])
     (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
@@ -241,7 +241,7 @@ def _joint_loop(
         system[moving, rate] = law.rate_weight * ld * push
     system[summed, at] = -jacobian
     system[summed, command] = np.eye(joints)
-    system[summed, summed] = -np.eye(joints) if li == 0 else 0.0
+    system[summed, summed] = 0.0 if law.integrates else -np.eye(joints)
     system[command, slope] = np.eye(joints)
     return system
 

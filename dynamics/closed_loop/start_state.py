@@ -123,7 +123,7 @@ class StartState:
 def checked_loop_parameters(
     robot: Robot, parameters: object, drive: DriveName = "pid"
 ) -> np.ndarray:
-    """Dynamic parameters of a robot, then lp, li, ld, checked for the law of its drives.
+    """Dynamic parameters of a robot, then its gains, checked for the law of its drives.
 
     Raises ParameterError for a dynamic parameter, and SimulationError for everything else.
     """
@@ -167,7 +167,7 @@ def equilibrium(
     robot : Robot
         Robot at rest.
     parameters : ndarray, shape (p,)
-        Dynamic parameters of the robot, then lp, li, ld of its drives.
+        Dynamic parameters of the robot, then the gains of its drives.
     pose : array_like, shape (6,)
         Pose of the platform.
     servo : ServoGains
@@ -205,7 +205,7 @@ def equilibrium(
     pose = floats("pose", pose, (6,))
     rest = np.zeros(6)
     chart = robot.geometry.chart
-    law = drives.joint_law(parameters[robot.layout.joint_pid])
+    law = drives.joint_law(robot.layout.split(parameters)[3])
     check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)
     regressor = robot.regressor(pose, rest, rest)
@@ -219,7 +219,9 @@ def equilibrium(
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
     command, integral = law.held(torque, angles)
-    by_command, by_integral = law.held_by_parameters(torque, angles, torque_map)
+    by_command, by_integral = law.held_by_parameters(
+        torque, angles, torque_map, robot.layout.own_gains
+    )
     known = servo_robot or robot
     servo_integral = np.zeros(len(chart.freedoms))
     # the command comes from the servo's integral, unless it comes from a feedforward

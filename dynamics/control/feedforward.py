@@ -34,7 +34,7 @@ def joint_commands(
     """
     period = 1 / timing.frame_rate_hz
     along = spans(model, motion, np.arange(frames) * period + timing.latency_s, period)
-    law = drives.joint_law(model.parameters[model.robot.layout.joint_pid])
+    law = drives.joint_law(model.gains)
     lp = law.lp
     li = law.li
     ld = law.ld

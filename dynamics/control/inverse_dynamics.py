@@ -67,7 +67,7 @@ class Model:
     robot : Robot
         Kinematics and dynamics.
     parameters : ndarray, shape (p,)
-        Dynamic parameters, then lp, li, ld of the drives.
+        Dynamic parameters, then the gains of the drives.
     friction : FrictionLaw
         Law of joint friction.
     doubt : float
@@ -93,12 +93,17 @@ class Model:
         """Dynamic parameters, without the gains of the joint PID."""
         return self.parameters[self.robot.layout.dynamic]
 
+    @property
+    def gains(self) -> np.ndarray:
+        """Gains lp, li, ld of each joint (n, 3)."""
+        return self.robot.layout.split(self.parameters)[3]
+
     def held(self, pose: np.ndarray, drives: Drives) -> tuple[np.ndarray, np.ndarray]:
         """Joint commands (n,) and integrals (n,) of the drives at rest at a pose (6,).
 
         Friction torques are zero.
         """
-        law = drives.joint_law(self.parameters[self.robot.layout.joint_pid])
+        law = drives.joint_law(self.gains)
         rest = np.zeros((1, 6))
         return law.held(self.torque(pose[None], rest, rest)[0], self.robot.inverse_kinematics(pose))
 

@@ -203,7 +203,7 @@ class Prediction:
         if limit is not None:
             # conditional integration, as in the drives
             further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
-            growing = np.where(further, law.lx * velocity / (li or 1.0), error)
+            growing = np.where(further, law.lx * velocity / np.where(li, li, 1.0), error)
             torque = np.clip(torque, -limit, limit)
         push = np.linalg.solve(mass, jacobian.T)
         falling = np.linalg.solve(mass, bias[:, 0])
@@ -217,7 +217,9 @@ class Prediction:
         by_state = np.zeros((at.moving.stop, at.offset.start))
         by_state[at.coordinates, at.rates] = np.eye(len(rate))
         of_rates = by_state[at.rates]
-        of_rates[:, at.coordinates] = push @ (-stiff * pid * jacobian - damping * (turning / 2))
+        of_rates[:, at.coordinates] = push @ (
+            (-stiff * pid)[:, None] * jacobian - damping * (turning / 2)
+        )
         of_rates[:, at.coordinates] -= np.linalg.solve(mass, by_q)
         of_rates[:, at.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
         of_rates[:, at.integral] = li * pid * push

@@ -87,8 +87,8 @@ class Mechanism:
     """Bodies, of which the base is the first, and their connections.
 
     `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` holds the range of each
-    joint by name if the file states it. `gains` (3,) are lp, li, ld. `notes` are remarks on the
-    file.
+    joint by name if the file states it. `gains` are lp, li, ld (3,), or those of each joint (3 n,).
+    `notes` are remarks on the file.
     """
 
     name: str

@@ -116,7 +116,8 @@ def mjcf_text(
     )
     coulomb = flag("coulomb", coulomb, DynamicsError)
     inertias = physical_inertias(robot.layout, values, allow_unphysical_inertia)
-    _, dry, viscous, _ = robot.layout.split(values)
+    dry = values[robot.layout.coulomb]
+    viscous = values[robot.layout.viscous]
     chain = _Chain(robot)
     gains = robot.parameter_sets["initial"].joint_pid
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))

@@ -91,7 +91,7 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
         connections.append(Connection(int(model.body_parentid[body]), body, freedoms))
     connections += [_loop(mujoco, model, data, k) for k in range(model.neq) if model.eq_active0[k]]
     limited = [joint for joint in range(model.njnt) if model.jnt_limited[joint]]
-    travel = _numeric(model, "travel_limit", 1)
+    travel = _numeric(model, "travel_limit")
     return Mechanism(
         name=bytes(model.names).split(b"\0")[0].decode(),
         solids=solids,
@@ -100,8 +100,8 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
         ranges={
             _joint_name(model, joint): tuple(model.jnt_range[joint].tolist()) for joint in limited
         },
-        gains=_numeric(model, "joint_pid", 3),
-        travel_limit=None if travel is None else float(travel[0]),
+        gains=_numeric(model, "joint_pid"),
+        travel_limit=float(travel[0]) if travel is not None and len(travel) == 1 else None,
     )
 
 
@@ -198,13 +198,9 @@ def _refuse_others(mujoco: Any, model: Any) -> None:
             raise RobotFileError(f"actuator {model.actuator(k).name or k} drives no joint")
 
 
-def _numeric(model: Any, name: str, count: int) -> np.ndarray | None:
-    """Numbers of the element `numeric` with a name.
-
-    None if the file has no such element, or one with another count of numbers.
-    """
+def _numeric(model: Any, name: str) -> np.ndarray | None:
+    """Numbers of the element `numeric` with a name. None if the file has no such element."""
     try:
-        found = np.array(model.numeric(name).data, dtype=float)
+        return np.array(model.numeric(name).data, dtype=float)
     except KeyError:
         return None
-    return found if len(found) == count else None

@@ -6,6 +6,7 @@ This is the only module that imports MuJoCo.
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dynamics.bodies import parts_of
@@ -179,14 +180,21 @@ class MujocoRobot:
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
-    def feed_back(self, stiffness: float, damping: float) -> None:
+    def feed_back(self, stiffness: ArrayLike, damping: ArrayLike) -> None:
         """Add -stiffness * coordinate - damping * rate to every control, inside MuJoCo's
         integrator.
+
+        Each is one number, or one number (n,) per joint.
         """
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
-        stiffness = real("stiffness", stiffness, MujocoError, least=0)
-        damping = real("damping", damping, MujocoError, least=0)
-        self.model.actuator_biasprm[:, :3] = [0.0, -stiffness, -damping]
+        self.model.actuator_biasprm[:, 0] = 0.0
+        for column, (name, given) in enumerate(
+            (("stiffness", stiffness), ("damping", damping)), start=1
+        ):
+            values = floats(name, given, (), (len(self._joint),), error=MujocoError, finite=False)
+            for value in values.ravel().tolist():
+                real(name, value, MujocoError, least=0)
+            self.model.actuator_biasprm[:, column] = -values
 
     def step(self, control: np.ndarray) -> None:
         """Do one step under a control (n,), N m or N."""

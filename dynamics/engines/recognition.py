@@ -27,6 +27,7 @@ from dynamics.kinematics.platform import Chart
 from dynamics.legs.chain import SAME, leg_of
 from dynamics.legs.leg import Body, Leg, Placement
 from dynamics.parameter_set import ParameterSet
+from dynamics.parameters import JOINT_PID
 from dynamics.pseudo_inertia import full_body, is_centred
 from dynamics.rigid_body.jacobians import joint_jacobian
 from dynamics.rigid_body.virtual_work import mass_matrix
@@ -100,12 +101,15 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     notes += _spinning(geometry, found)
     friction = np.transpose([one.actuated.friction for one in found])
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
-    gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
-    if plain.gains is None:
+    gains = plain.gains
+    known = len(JOINT_PID), len(JOINT_PID) * layout.joints
+    if gains is None or len(gains) not in known:
+        gains = _gains(geometry, dynamic[layout.rigid])
         notes.append(
             "the file has no joint PID: gains are chosen for a natural frequency of 3 Hz at the "
             "joint with the least inertia"
         )
+    geometry = replace(geometry, own_gains=len(gains) > len(JOINT_PID))
     robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
     parsed_robot(robot_text(robot), "the robot")  # raises if a number is out of range
     return robot, notes

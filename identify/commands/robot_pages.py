@@ -59,12 +59,24 @@ def base_parameters(
         entry,
         json,
         quiet,
-        lambda: _print_groups(found, singular, angle, counts, chosen.name == PAPERS),
+        lambda: _print_groups(
+            found,
+            singular,
+            angle,
+            counts,
+            gains=len(chosen.layout.joint_pid_names),
+            papers=chosen.name == PAPERS,
+        ),
     )
 
 
 def _print_groups(
-    found: "BaseParameters", singular: int, angle: float, counts: dict[int, int], papers: bool
+    found: "BaseParameters",
+    singular: int,
+    angle: float,
+    counts: dict[int, int],
+    gains: int,
+    papers: bool,
 ) -> None:
     for expression in found.expressions():
         typer.echo(expression)
@@ -76,12 +88,11 @@ def _print_groups(
         f"columns by at most {found.gap[0]:.1e}; both ways find the same groups to {angle:.1e} rad."
     )
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
-    # The printed count adds the three gains of the joint controller.
     left = len(found.names) - len(found.unseen)
     typer.echo(
         f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the "
         f"units, and finds {tried}. Without the parameters that no motion shows, {left} remain, or "
-        f"{left + 3} with the gains of the joint "
+        f"{left + gains} with the gains of the joint "
         f"controller{'; its table lists 49' if papers else ''}."
     )
 

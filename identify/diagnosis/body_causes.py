@@ -125,7 +125,7 @@ def _columns(problem: OutputErrorProblem, parameters: Array, needed: Sequence[Ne
     """Return the columns (m, k) of needed torques, by differences of runs of the model."""
     changes = []
     for place, run in enumerate(problem.runs):
-        stiffness = float(run.drive_law(parameters).lp)
+        stiffness = float(run.drive_law(parameters).lp.min())
         peaks = [max(float(np.abs(one.torques[place]).max()), 1e-300) for one in needed]
         sizes = [PROBED * stiffness / peak for peak in peaks]
         ends = [run] + [

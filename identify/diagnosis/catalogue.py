@@ -4,6 +4,7 @@ from identify.arrays import Array
 from identify.diagnosis.body_causes import body_causes
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.command_causes import command_causes
+from identify.diagnosis.gain_causes import gain_causes
 from identify.diagnosis.geometry_causes import geometry_causes
 from identify.diagnosis.loop_causes import loop_causes
 from identify.diagnosis.measurement_causes import measurement_causes
@@ -18,6 +19,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
     causes = (
         *command_causes(problem),
         *geometry_causes(problem),
+        *gain_causes(problem, parameters),
         *loop_causes(problem, parameters),
         *body_causes(problem, parameters),
         *measurement_causes(problem, parameters),

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from dynamics import Robot
-from dynamics.parameters import JOINT_PID
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.base_parameters import (
     BaseParameters,
@@ -155,12 +155,12 @@ class GroupEstimates:
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
 
-def group_rows(base: BaseParameters) -> Array:
+def group_rows(base: BaseParameters, layout: ParameterLayout) -> Array:
     """Return the groups as combinations (rank, p) of all parameters.
 
     The gains of the joint PID belong to no group.
     """
-    return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID))))
+    return np.pad(base.combinations, ((0, 0), (0, len(layout.joint_pid_names))))
 
 
 def group_estimates(
@@ -171,7 +171,7 @@ def group_estimates(
     uncertainty: Uncertainty,
 ) -> GroupEstimates:
     """Return the estimates of the groups from parameters (p,) and their uncertainty."""
-    rows = group_rows(base)
+    rows = group_rows(base, guess.layout)
     return GroupEstimates(
         names=base.group_names(),
         expressions=base.expressions(),
@@ -200,18 +200,21 @@ It is allowed without a warning if an instrument was used to fix the factor.
 """
 
 
-def scale_warnings(anchor: ScaleAnchor, left: float, prior_share: float) -> tuple[str, ...]:
+def scale_warnings(
+    anchor: ScaleAnchor, gain: str, left: float, prior_share: float
+) -> tuple[str, ...]:
     """Return a warning if an instrument was used to fix the scale, but does not fix it.
 
-    Poses determine the controller's gain up to the scale. left: relative standard deviation of the
-    gain due to errors of the initial guess. prior_share: share of these errors in its variance.
+    Poses determine the controller's gain up to the scale. gain: its name. left: relative standard
+    deviation of the gain due to errors of the initial guess. prior_share: share of these errors in
+    its variance.
     """
     if anchor.value is None or left <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
         return ()
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "
         "measured quantity only in sums with other parameters, and the initial guess of these "
-        f"leaves joint_pid.lp uncertain by {left:.1%}; values in kg, N m or N are as uncertain: "
+        f"leaves {gain} uncertain by {left:.1%}; values in kg, N m or N are as uncertain: "
         "use identification.scale_anchor = joint_gain, or state further weighed masses in "
         "identification.prior",
     )
@@ -350,7 +353,7 @@ def judge(
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
     each = np.eye(len(estimate))
     # Every law of the drives has this gain, and poses determine it up to the common factor.
-    gain = robot.layout.names.index("joint_pid.lp")
+    gain = robot.layout.joint_pid.start
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
     gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
     # Torque commands determine the scale.
@@ -379,7 +382,7 @@ def judge(
         },
         intervals=bounded.intervals(each),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
-        group_intervals=bounded.intervals(group_rows(base)),
+        group_intervals=bounded.intervals(group_rows(base, robot.layout)),
         conditioning=conditioned,
         base_rank=rank_by_threshold(np.concatenate(excited), qr_threshold),
         active_bounds=bounded.active_bounds,
@@ -389,6 +392,8 @@ def judge(
             *explanation.warnings(),
             *bounded.warnings(),
             *conditioned.warnings(),
-            *scale_warnings(problem.anchor, gain_left, float(prior_share[gain])),
+            *scale_warnings(
+                problem.anchor, robot.layout.names[gain], gain_left, float(prior_share[gain])
+            ),
         ),
     )

@@ -8,14 +8,15 @@ no pose of the closed loop (eq. 17 and 31). Poses alone do not determine this co
 fixed by one of these anchors:
 
     platform_mass   the platform was weighed
-    joint_gain      the proportional gain of the joint PID is known
+    joint_gain      the proportional gain of the joint PID is known, of the first joint if each
+                    joint has its own
     payload         a second run with a known load on the platform (`identify.record.conditions`);
                     the record of that run states the standard deviations of the load, which widen
                     the intervals (`covariance`)
     prior           only the initial guess, with its standard deviations
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -29,7 +30,7 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import as_number, shown
-from identify.loop_parameters import check_parameter_set
+from identify.loop_parameters import check_parameter_set, is_gain
 from identify.scenario import Model, PriorValue
 from identify.scenario.sections import Identification
 
@@ -50,19 +51,25 @@ class StartingGuess:
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """Gains (p,) that the law of the drives does not read."""
-        read = [f"joint_pid.{gain}" for gain in READS[self.drive]]
         names = self.layout.names
-        return np.isin(names, self.layout.joint_pid_names) & ~np.isin(names, read)
+        return np.isin(names, self.layout.joint_pid_names) & ~np.isin(
+            names, gains_among(self.layout, READS[self.drive])
+        )
 
     @property
     def above_zero(self) -> tuple[str, ...]:
         """Parameters that must be above zero for a model to exist."""
-        return ("platform.mass", *(f"joint_pid.{gain}" for gain in ABOVE_ZERO[self.drive]))
+        return ("platform.mass", *gains_among(self.layout, ABOVE_ZERO[self.drive]))
 
     @property
     def rows(self) -> Array:
         """Matrix (p, p) of the guess as equations in the parameters, in standard deviations."""
         return np.diag(1 / self.std)
+
+
+def gains_among(layout: ParameterLayout, kinds: Collection[str]) -> list[str]:
+    """Return the names of the gains of some kinds, such as lp."""
+    return [name for name in layout.joint_pid_names if name.rpartition(".")[2] in kinds]
 
 
 FIXED = 1e-9
@@ -88,6 +95,12 @@ def starting_guess(
     values = chosen.vector.copy()
     std = relative_std * typical_sizes(robot, chosen.vector, torque)
     for name, prior in known.items():
+        if name not in robot.layout.names and is_gain(name):
+            form = "each" if robot.layout.own_gains else "shared"
+            raise ScenarioError(
+                f"identification.prior: {name} is no gain of the model, whose gains are "
+                f"{', '.join(robot.layout.joint_pid_names[:3])} and so on: model.gains = {form!r}"
+            )
         if name not in robot.layout.names:
             raise ScenarioError(
                 f"identification.prior: {name} is a parameter of a full body, but this body of the "
@@ -172,10 +185,19 @@ def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
 
 
-MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
-"""Parameter that an anchor measures, by the anchor's name."""
+MEASURING = ("platform_mass", "joint_gain")
+"""Anchors that measure a parameter, see `measured_parameter`."""
 
-ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
+ANCHORS = (*MEASURING, "payload", "prior")
+
+
+def measured_parameter(anchor: str, layout: ParameterLayout) -> str:
+    """Return the name of the parameter that an anchor measures.
+
+    If each joint has its own gains, the gain of the first joint is measured.
+    """
+    return {"platform_mass": "platform.mass", "joint_gain": layout.joint_pid_names[0]}[anchor]
+
 
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
 """Standard deviation of an ordinary instrument, by units.
@@ -186,7 +208,7 @@ The instrument is a platform balance, kg, or the data of the controller for a ga
 
 def default_std(name: str, layout: ParameterLayout) -> float:
     """Return the standard deviation, SI, of an ordinary instrument for an anchor of a robot."""
-    return DEFAULT_STD[layout.unit(MEASURED_PARAMETER[name])]
+    return DEFAULT_STD[layout.unit(measured_parameter(name, layout))]
 
 
 @dataclass(frozen=True)
@@ -209,7 +231,7 @@ class ScaleAnchor:
         if self.value is None or self.std is None:
             return np.zeros((0, len(layout.names))), np.zeros(0)
         row = np.zeros((1, len(layout.names)))
-        row[0, layout.names.index(MEASURED_PARAMETER[self.name])] = 1 / self.std
+        row[0, layout.names.index(measured_parameter(self.name, layout))] = 1 / self.std
         return row, np.array([self.value / self.std])
 
 
@@ -221,11 +243,11 @@ def measured_anchor(
     std: standard deviation of the instrument, None for the default. true (p,): true parameters of
     the robot.
     """
-    if name not in MEASURED_PARAMETER:
+    if name not in MEASURING:
         # These anchors have no measured parameter. The record under a load states the load.
         return ScaleAnchor(name)
     spread = default_std(name, layout) if std is None else std
-    measured = true[layout.names.index(MEASURED_PARAMETER[name])]
+    measured = true[layout.names.index(measured_parameter(name, layout))]
     return ScaleAnchor(name, float(measured + spread * rng.standard_normal()), spread)
 
 
@@ -248,7 +270,7 @@ def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
             "the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, "
             f"scale_anchor_std), found {shown(name)}; valid anchors: {', '.join(ANCHORS)}"
         )
-    if name not in MEASURED_PARAMETER:
+    if name not in MEASURING:
         return ScaleAnchor(str(name))
     value, std = (_positive(record, f"scale_anchor_{what}", layout) for what in ("value", "std"))
     return ScaleAnchor(str(name), value, std)
@@ -260,7 +282,7 @@ def _positive(record: xr.Dataset, attribute: str, layout: ParameterLayout) -> fl
     number = as_number(value)
     if not 0 < number < np.inf:
         anchor = record.attrs["scale_anchor"]
-        measured = MEASURED_PARAMETER[anchor]
+        measured = measured_parameter(anchor, layout)
         raise RecordError(
             f"the record's attribute {attribute} is {shown(value)}, must be a finite number > 0 in "
             f"{layout.unit(measured)}: the scale anchor {anchor} measures {measured}"

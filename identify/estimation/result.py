@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.closed_loop.drives import READS, cascade_gains
-from dynamics.parameters import JOINT_PID, SIGNED, ParameterLayout
+from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.common_error_estimates import CommonErrorEstimates
@@ -27,9 +27,10 @@ from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
-from identify.estimation.prior import ScaleAnchor
+from identify.estimation.prior import ScaleAnchor, gains_among
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result
+from identify.loop_parameters import known_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -203,13 +204,11 @@ class IdentificationResult:
         if isinstance(truth, xr.Dataset):
             pairs = zip(truth["parameter"].values, truth["parameter_value"].values, strict=True)
             truth = {str(name): float(value) for name, value in pairs}
-        # A first moment or product of inertia that the plant does not state is zero.
-        zero = {name: 0.0 for name in self.names if name.rsplit(".", 1)[1] in SIGNED}
-        known = zero | dict(truth)
-        missing = [name for name in self.names if name not in known]
+        known = {name: known_value(truth, name) for name in self.names}
+        missing = [name for name, value in known.items() if value is None]
         if missing:
             raise EstimationError(f"the truth has no {missing[0]}; {len(missing)} are missing")
-        return np.array([float(known[name]) for name in self.names])
+        return np.array(list(known.values()), dtype=float)
 
     def _repr_html_(self) -> str:
         return result_html(self)
@@ -266,25 +265,35 @@ class IdentificationResult:
     def _drive(self) -> dict[str, Any]:
         """Return the law of the drives with its probability, and the gains of a cascade."""
         law = self.drive.law
-        gains = self.layout.joint_pid
         entry: dict[str, Any] = {
             "law": law,
             "decided_by": "record" if self.drive.asked else "scenario",
             "sure": self.drive.sure,
             "probabilities": dict(self.drive.probabilities),
             "in_loop": self.drive.in_loop,
-            "fixed_at_zero": [f"joint_pid.{name}" for name in JOINT_PID if name not in READS[law]],
+            "fixed_at_zero": gains_among(self.layout, set(JOINT_PID) - set(READS[law])),
         }
         if law == "cascade" and self.drive.in_loop:
+            entry["gains"] = self._cascade_gains()
+        return entry
+
+    def _cascade_gains(self) -> dict[str, dict[str, Any]]:
+        """Return the gains of the cascade, as kp, or as joint1.kp if each joint has its own."""
+        layout = self.layout
+        entries: dict[str, dict[str, Any]] = {}
+        units = "1/s", layout.unit("joint_pid.ld"), layout.unit("joint_pid.lp")
+        kinds = len(JOINT_PID)
+        for first in range(layout.joint_pid.start, layout.joint_pid.stop, kinds):
+            gains = slice(first, first + kinds)
             own, by_gains = cascade_gains(self.estimate[gains])
             std = np.sqrt(np.diag(by_gains @ self.covariance[gains, gains] @ by_gains.T))
-            units = "1/s", self.layout.unit("joint_pid.ld"), self.layout.unit("joint_pid.lp")
+            owner = f"{self.names[first].partition('.')[0]}." if layout.own_gains else ""
             rows = zip(own._fields, units, map(float, own), std.tolist(), strict=True)
-            entry["gains"] = {
-                name: {"unit": unit, "estimate": value, "std": err}
+            entries |= {
+                f"{owner}{name}": {"unit": unit, "estimate": value, "std": err}
                 for name, unit, value, err in rows
             }
-        return entry
+        return entries
 
     def _parameter(self, k: int) -> dict[str, Any]:
         return {

@@ -31,7 +31,7 @@ from scipy.optimize import lsq_linear
 
 from dynamics.closed_loop import FrameTiming
 from dynamics.closed_loop.command_schedule import acting_times
-from dynamics.closed_loop.drives import JointLaw
+from dynamics.closed_loop.drives import JointLaw, gain_columns
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import SMALLEST_SHARE
 from identify.estimation.output_error import OutputErrorProblem
@@ -61,11 +61,11 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
     guess = problem.guess
     noise = 0.1
     count = len(guess.values)
-    pid = guess.layout.joint_pid
+    layout = guess.layout
     drives = problem.runs[0].settings.drives
-    law = drives.joint_law(guess.values[pid])
+    law = drives.joint_law(layout.split(guess.values)[3])
     matrix, right, common = _stacked(problem, law)
-    signed = np.append(guess.layout.signed, np.zeros(3, dtype=bool))
+    signed = np.append(layout.signed, np.zeros(len(layout.joint_pid_names), dtype=bool))
     least = np.where(signed, -np.inf, 0.0)
     lower = np.concatenate([least, np.full(matrix.shape[1] - count, -np.inf)])
     rows = _condensed(matrix, right, common)
@@ -76,8 +76,9 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
         left = whitened @ np.append(solution, -1.0)
         noise = max(noise * float(np.sqrt(np.sum(left**2) / len(right))), 1e-9)
-        if law.lx:  # the columns of a cascade depend on the gains
-            law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
+        if law.lx.any():  # the columns of a cascade depend on the gains
+            found = np.maximum(solution[:count], SMALLEST_SHARE * guess.values)
+            law = drives.joint_law(layout.split(found)[3])
             matrix, right, common = _stacked(problem, law)
             rows = _condensed(matrix, right, common)
     return np.maximum(solution[:count], least)
@@ -140,7 +141,7 @@ def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> A
         moved.append(common.latency_std * rate[:, :, None])
     if not moved:
         return np.zeros((*run.logged.shape, 0))
-    lp, li, _ = guess.values[guess.layout.joint_pid]
+    lp, li, _ = guess.layout.split(guess.values)[3].T[:, :, None]
     angle = np.concatenate(moved, axis=2)
     integral = running_integral(angle, run.settings.timing.frame_rate_hz)
     return np.concatenate([lp * angle, li * integral], axis=2)
@@ -166,7 +167,7 @@ def joint_balance(
     -------
     columns : ndarray, shape (N, n, p + n)
         Columns of the balance, N m or N per unit of each unknown. The columns of the dynamic
-        parameters give the joint's torque. The columns of lp, li, ld and of the torques at the
+        parameters give the joint's torque. The columns of the gains and of the torques at the
         start follow. They give the controller's torque with the opposite sign.
     slipping : ndarray of bool, shape (N, n)
         True for frames in which a joint slips.
@@ -193,7 +194,7 @@ def joint_balance(
     start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
     rate = first_order(law.rate_weight * command_rate - velocity, law.filter_time, rate_hz)
     pid = np.stack([command - angle, integral - angle_integral, rate], axis=2)
-    by_gains = law.reads * pid - law.lx_by * angle[:, :, None]
+    by_gains = gain_columns(law.reads * pid - law.lx_by * angle[:, :, None], robot.layout.own_gains)
     columns = np.concatenate([torque_map @ regressor, -by_gains, start], axis=2)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
     edge = max(1, round(EDGE_FRACTION * count))

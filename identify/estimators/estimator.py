@@ -38,7 +38,7 @@ class Evidence:
     """Input of an estimator.
 
     problem: the record as an output-error problem, with initial guess and scale anchor. channels:
-    measured channels of the joints, or None. known_gains (3,): lp, li and ld of the joint PID, or
+    measured channels of the joints, or None. known_gains (3,) or (3 n,): gains of the joint PID, or
     None if they are unknown.
     """
 

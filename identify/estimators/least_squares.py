@@ -5,7 +5,7 @@ With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 2
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
-Both form one system with the unknowns Xi, lp, li, ld and the torques z (n,) at the start. The
+Both form one system with the unknowns Xi, the gains and the torques z (n,) at the start. The
 measured torque determines the scale, so no anchor is needed. Parameters that the motion does not
 excite keep the initial guess with its standard deviations.
 
@@ -93,7 +93,7 @@ def torque_equations(
     low_pass = problem.low_pass
     rate_hz = run.settings.timing.frame_rate_hz
     layout = run.robot.layout
-    law = run.settings.drives.joint_law(problem.guess.values[layout.joint_pid])
+    law = run.settings.drives.joint_law(layout.split(problem.guess.values)[3])
     balance, found = joint_balance(run, poses, low_pass, law)
     rows = found if slipping is None else slipping
     columns = balance[rows]

@@ -46,9 +46,16 @@ from numpy.typing import NDArray
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, LoopSettings, differentiate_servo
+from dynamics.parameters import JOINT_PID
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
-from identify.estimation.prior import MEASURED_PARAMETER, StartingGuess, default_std, model_guess
+from identify.estimation.prior import (
+    MEASURING,
+    StartingGuess,
+    default_std,
+    measured_parameter,
+    model_guess,
+)
 from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import (
     RESPONSE_BITS,
@@ -119,8 +126,8 @@ def knowledge(
     guess = model_guess(side.robot, side.model, settings)
     prior = np.eye(len(layout.names))
     anchor = settings.scale_anchor
-    if anchor in MEASURED_PARAMETER:
-        place = layout.names.index(MEASURED_PARAMETER[anchor])
+    if anchor in MEASURING:
+        place = layout.names.index(measured_parameter(anchor, layout))
         std = settings.anchor_std or default_std(anchor, layout)
         # The matrix is in units of the prior standard deviations.
         prior[place, place] += (guess.std[place] / std) ** 2
@@ -155,8 +162,12 @@ STEP = 1e-5
 
 
 def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArray:
-    """Return L (K,) [N m/rad or N/m] of the joint PID with `parameters` (p,) at s (K,) [1/s]."""
-    lp, li, ld = parameters[robot.layout.joint_pid]
+    """Return L (K, q) [N m/rad or N/m] of the joint PID with `parameters` (p,) at s (K,) [1/s].
+
+    q is the number of joints if each has its own gains, else 1.
+    """
+    lp, li, ld = parameters[robot.layout.joint_pid].reshape(-1, len(JOINT_PID)).T
+    s = s[:, None]
     return np.asarray(lp + ld * s + li / s)
 
 
@@ -182,17 +193,17 @@ def torque_response(
     # The last digits of the quotient differ between processors, so it is rounded.
     stiffness = agreed(stiffness, RESPONSE_BITS)
     damping = parameters[robot.layout.viscous][:, None] * joint_rates
-    loop = pid_response(robot, parameters, s) * (1 + servo_response(settings, s))
+    loop = pid_response(robot, parameters, s) * (1 + servo_response(settings, s))[:, None]
     total = np.multiply.outer(s**2, inertia) + np.multiply.outer(s, damping) + stiffness
-    return np.asarray(np.linalg.inv(total + np.multiply.outer(loop, joint_rates)))
+    return np.asarray(np.linalg.inv(total + loop[:, :, None] * joint_rates))
 
 
 def tracking_response(
     robot: Robot, parameters: Array, settings: LoopSettings, s: ComplexArray
 ) -> ComplexArray:
     """Return T (K, m, m) from desired to actual coordinates. See `torque_response`."""
-    gain = pid_response(robot, parameters, s) * servo_response(settings, s)
-    drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
+    gain = pid_response(robot, parameters, s) * servo_response(settings, s)[:, None]
+    drive = gain[:, :, None] * robot.coordinate_jacobian(robot.home_pose)
     return np.asarray(torque_response(robot, parameters, settings, s) @ drive)
 
 
@@ -262,9 +273,14 @@ def sensitivity_spectrum(
     spectrum = ca.reshape(waved, count, 2 * joints * len(s))
     error = 1 / pid_response(robot, parameters, s)
     torque = ca.DM(dynamic).T @ spectrum
-    gains = [
-        torque @ _real_filter(response * f[:, None, None]) for f in (error, error / s, error * s)
-    ]
+    kinds = [response * f[:, None, :] for f in (error, error / s[:, None], error * s[:, None])]
+    # the gain of one joint acts on the error of this joint alone
+    parts = (
+        [kind * own for own in np.eye(joints) for kind in kinds]
+        if robot.layout.own_gains
+        else kinds
+    )
+    gains = [torque @ _real_filter(part) for part in parts]
     return ca.vertcat(-spectrum @ _real_filter(response), *gains)
 
 

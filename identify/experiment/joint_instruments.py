@@ -22,7 +22,7 @@ from dynamics.closed_loop.drives import joint_law
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
-from identify.experiment.truth import true_parameters
+from identify.experiment.truth import true_parameters, true_values
 from identify.files.dataset import (
     Variables,
     check_finite,
@@ -152,14 +152,16 @@ def measure_joints(
     angle = truth[at_encoder].values
     command = record["command"].values
     known = true_parameters(truth)
-    gains = np.array([known[f"joint_pid.{name}"] for name in JOINT_PID])
+    joints = range(1, command.shape[1] + 1)
+    names = [f"joint{joint}.{gain}" for joint in joints for gain in JOINT_PID]
+    gains = np.reshape(true_values(known, names), (-1, len(JOINT_PID)))
     law = joint_law(
         truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s")
     )
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
     sampled = truth["joint_torque"].values
     # A filtered derivative does not jump with the rate of the command.
-    at_jump = np.array([law.lp, 0.0 if law.filter_time else law.rate_weight * law.ld])
+    at_jump = np.array([law.lp, law.ld * (0.0 if law.filter_time else law.rate_weight)])
     torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
     read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
@@ -191,8 +193,8 @@ def frame_mean(
         Commands of the frames.
     start : ndarray, shape (n,)
         Command before the first frame.
-    gains : ndarray, shape (2,)
-        Gains lp and ld.
+    gains : ndarray, shape (2, n)
+        Gains lp and ld of each joint.
     timing : Timing
         Frame rate, and whether commands are held or ramp.
     latencies : ndarray, shape (N,)

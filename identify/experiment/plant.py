@@ -124,10 +124,12 @@ class Plant:
         """Return the true parameters (p,) in the layout of a model.
 
         First moments and products of inertia that the plant has and the model lacks are left out.
+        If the model shares gains and the plant does not, they are the mean of those of all joints.
         """
         own = self.robot.layout
         dynamic = own.converted(self.parameters[own.dynamic], layout)
-        return np.concatenate([dynamic, self.parameters[own.joint_pid]])
+        gains = own.converted_gains(self.parameters[own.joint_pid], layout)
+        return np.concatenate([dynamic, gains])
 
     def check(self) -> None:
         """Check that the plant can be simulated and stand still at home.
@@ -190,11 +192,18 @@ class Plant:
             loop is stable.
         DynamicsError
             Errors of `dynamics.closed_loop.simulate_servo`.
+        ScenarioError
+            If the law commands torques, but the plant has gains of each joint.
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
         known = None if self.robot is self.nominal else self.nominal
         law = law or LawInLoop()
+        if law.drives.torques and self.robot.layout.own_gains:
+            raise ScenarioError(
+                "plant.gains = 'each', but under this control law the drives take torques, and no "
+                "gain of a joint acts: set plant.gains = 'shared'"
+            )
         # The law decides whether commands are torques. All other drive settings are the plant's.
         settings = replace(settings, drives=replace(settings.drives, torques=law.drives.torques))
         given = (self.robot, parameters, reference, settings)
@@ -246,7 +255,7 @@ class Plant:
             prismatic=self.robot.layout.prismatic,
         )
         # These are already among the parameters.
-        among = {"drive_gains", "values", "inertia"}
+        among = {"drive_gains", "values", "inertia", "gains"}
         switches = self.switches.model_dump(exclude_none=True, exclude=among)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 

@@ -1,10 +1,12 @@
 """True robot of a scenario: its geometry, its bodies and its parameters."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from dynamics import Robot
 from dynamics.errors import ParameterError
-from dynamics.parameters import SIGNED, parameter_layout
+from dynamics.parameters import JOINT_PID, SIGNED, ParameterLayout, parameter_layout
 from dynamics.pseudo_inertia import body_fault
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
@@ -19,28 +21,41 @@ from identify.scenario.sections import Geometry
 
 
 def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> Robot:
-    """Return the true robot with the full bodies of the plant.
+    """Return the true robot with the full bodies and the gains of the plant.
 
-    They are those of the robot file, unless the plant states others, and all bodies with a true
-    first moment or product of inertia. Raises ScenarioError, with the valid names, for a true value
-    of a parameter that the robot does not have.
+    The full bodies are those of the robot file, unless the plant states others, and all bodies with
+    a true first moment or product of inertia. Raises ScenarioError, with the valid names, for a
+    true value of a parameter that the robot does not have.
     """
-    stated = in_form(in_file, switches).layout
+    of_plant = in_form(in_file, switches)
+    stated = of_plant.layout
     full = set(stated.full_bodies)
-    known = parameter_layout(in_file.geometry.legs, ("all",)).names
+    known = parameter_layout(in_file.geometry.legs, ("all",), stated.own_gains).names
     for name in switches.values:
         if name not in known:
             raise ScenarioError(
                 f"plant.values names {name!r}; {robot.name} has {', '.join(stated.bodies)}, each "
                 f"with {', '.join(FULL_INERTIAL)} (such as platform.mcz), "
-                f"{', '.join(stated.joint_names)} with coulomb and viscous, and joint_pid"
+                f"{', '.join(stated.joint_names)} with coulomb and viscous, and {_gains(stated)}"
             )
         body, entry = name.split(".")
         if entry in SIGNED:
             full.add(body)
-    if full == set(robot.layout.full_bodies):
+    layout = robot.layout
+    if full == set(layout.full_bodies) and stated.own_gains == layout.own_gains:
         return robot
-    return in_file.with_geometry(robot.geometry).with_full_bodies(sorted(full))
+    geometry = replace(
+        robot.geometry, full_bodies=of_plant.geometry.full_bodies, own_gains=stated.own_gains
+    )
+    return of_plant.with_geometry(geometry).with_full_bodies(sorted(full))
+
+
+def _gains(layout: ParameterLayout) -> str:
+    """Return the names of the gains of a plant, with the setting for those of another form."""
+    names = ", ".join(JOINT_PID)
+    if layout.own_gains:
+        return f"with plant.gains = 'each' also with {names}"
+    return f"joint_pid with {names}, or with plant.gains = 'each' each joint"
 
 
 def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
@@ -51,8 +66,10 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
     # Only the values of this guess are used, so its standard deviation is arbitrary.
     values = starting_guess(robot, switches.parameters, 1.0, drive=switches.drive).values
     layout = robot.layout
+    # a view: all joints have the gains of the plant's drives, if each has its own
+    gains = values[layout.joint_pid].reshape(-1, len(JOINT_PID))
     for name, gain in switches.drive_gains.items():
-        values[layout.names.index(f"joint_pid.{name}")] = gain
+        gains[:, JOINT_PID.index(name)] = gain
     for name, value in switches.values.items():
         values[layout.names.index(name)] = value
     changed = {name.split(".")[0] for name in switches.values}

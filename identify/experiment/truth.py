@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from dynamics.parameters import SIGNED
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import (
@@ -20,6 +19,7 @@ from identify.files.dataset import (
     read_group,
     with_joint_units,
 )
+from identify.loop_parameters import known_value
 from identify.record.provenance import digest
 from identify.record.recording import TRUTH_GROUP, read, run_names
 
@@ -136,14 +136,15 @@ def true_poses(truth: xr.Dataset) -> Array:
 def true_values(truth: Mapping[str, float], names: Iterable[str]) -> list[float]:
     """Return the true values of parameters by name.
 
-    A first moment or product of inertia that the plant does not state is zero. Raises RecordError
-    if another parameter is missing.
+    For parameters that the plant has in another form see `known_value`. Raises RecordError if a
+    parameter is missing.
     """
     found = []
     for name in names:
-        if name not in truth and name.rsplit(".", 1)[-1] not in SIGNED:
+        value = known_value(truth, name)
+        if value is None:
             raise RecordError(f"the truth has no {name}")
-        found.append(float(truth.get(name, 0.0)))
+        found.append(value)
     return found
 
 

@@ -10,6 +10,7 @@ import xarray as xr
 
 from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
+from identify.errors import EstimationError
 from identify.loop_parameters import drives_of, in_form, loop_settings
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
@@ -107,6 +108,11 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     check_origin(record, side.robot, side.timing, side.settings.servo)
     # Checked before the model is made, because a short record cannot be filtered.
     check_length(record.sizes["time"], side.fewest_frames, side.timing.frame_rate_hz)
+    if takes_torques(record) and side.robot.layout.own_gains:
+        raise EstimationError(
+            "model.gains = 'each', but the commands of the record are torques, and no gain of a "
+            "joint acts under them: set model.gains = 'shared'"
+        )
     run = _model(record, side)
     check_reference(run.reference, side.timing.frame_rate_hz)
     check_channels(side.robot.geometry.chart, run.measured, run.logged, run.ok)

@@ -232,7 +232,7 @@ class LoopModel:
         LoopFailure
             The run is unstable.
         """
-        given = robot or self.robot, parameters + self.payload, self.reference, self.settings
+        given = *self._moving(parameters, robot or self.robot), self.reference, self.settings
         sensor = IdealSensor(self._lost, self._sensed(noise))
         late = self.latencies
         if self.driven and sensitivities:
@@ -256,7 +256,7 @@ class LoopModel:
         returned in place of the run.
         """
         sensed = np.asarray(self._sensed(noises))
-        given = self.robot, parameters + self.payload, self.reference, self.settings
+        given = *self._moving(parameters, self.robot), self.reference, self.settings
         if self.driven:
             commands = self._commands(parameters)
             return repeat_commands(*given, commands, sensed, latencies=self.latencies)
@@ -264,7 +264,7 @@ class LoopModel:
 
     def drive_law(self, parameters: Array) -> JointLaw:
         """Return the law of the drives with its gains among parameters (p,)."""
-        return self.settings.drives.joint_law(parameters[self.robot.layout.joint_pid])
+        return self.settings.drives.joint_law(self.robot.layout.split(parameters)[3])
 
     def _commands(self, parameters: Array) -> Array:
         """Return the commands (N, n) that drive the model, which are the logged ones at first.
@@ -277,6 +277,10 @@ class LoopModel:
         late = self.stated_latencies if self.latencies is None else self.latencies
         needed = while_commands_act(self.torques, late, timing)
         return self.logged - equivalent_commands(needed, self.drive_law(parameters), timing)
+
+    def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
+        """Return the robot that moves in a run, and its parameters (p,) with the known load."""
+        return robot, parameters + self.payload
 
     @property
     def _lost(self) -> NDArray[np.bool_] | None:

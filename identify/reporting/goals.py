@@ -12,6 +12,7 @@ import numpy as np
 
 from identify.estimation.explanation import MISFIT, SIGNIFICANT, SUSPICIOUS
 from identify.files.run_folder import rms_row
+from identify.loop_parameters import is_gain
 
 # Limits of the goals: RMS in µm and µrad, a share of the truth, and standard deviations.
 VALIDATION_UM = 2.0
@@ -133,7 +134,7 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
 
 def is_friction_or_pid(name: str) -> bool:
     """Tell whether a parameter is a joint friction or a gain of the joint controller."""
-    return name.startswith("joint_pid.") or name.endswith((".coulomb", ".viscous"))
+    return is_gain(name) or name.endswith((".coulomb", ".viscous"))
 
 
 def within_tolerance(parameter: dict[str, Any]) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from identify.estimation.identifiability import RESTS_ON_PRIOR
+from identify.loop_parameters import is_gain
 from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
@@ -66,7 +67,9 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     """
     anchor = identification["scale_anchor"]
     said = ANCHORS.get(anchor, anchor)
-    gain = identification["parameters"].get("joint_pid.lp", {})
+    parameters = identification["parameters"]
+    name = next((one for one in GAINS if one in parameters), GAINS[0])
+    gain = parameters.get(name, {})
     share = gain.get("prior_share") or 0.0
     if not identification.get("drive", {}).get("in_loop", True):
         return "The overall scale is fixed by the commanded torques."
@@ -74,10 +77,13 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
         return f"The overall scale is fixed by {said}."
     return (
         f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the "
-        "variance of joint_pid.lp comes from the initial guess, and all values in kg, N m or N are "
+        f"variance of {name} comes from the initial guess, and all values in kg, N m or N are "
         "only as good as this guess."
     )
 
+
+GAINS = ("joint_pid.lp", "joint1.lp")
+"""Gain whose variance shows whether the scale is fixed, if joints share gains, or if not."""
 
 ANCHORS = {
     "platform_mass": "the weighed mass of the platform",
@@ -202,7 +208,7 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     if left and len(left) == len(parameters):
         return [("the model does not explain the record, and no estimate can be trusted", left)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
-    shown = (alone | {name for name in parameters if name.startswith("joint_pid.")}) - fixed
+    shown = (alone | set(filter(is_gain, parameters))) - fixed
     outside = set() if identification.get("drive", {}).get("in_loop", True) else shown - alone
     shown -= outside
     kinds = {

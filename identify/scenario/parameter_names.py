@@ -20,14 +20,16 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
     from dynamics.robot_file import read_robot_file
 
     try:
-        # The model can have full bodies where the robot file has none.
-        layout = parameter_layout(read_robot_file(robot).geometry.legs, ("all",))
+        # The model can have full bodies and gains of each joint where the robot file has none.
+        legs = read_robot_file(robot).geometry.legs
+        layout = parameter_layout(legs, ("all",))
+        valid = {*layout.names, *parameter_layout(legs, ("all",), own_gains=True).names}
     except RobotFileError as error:
         raise ValueError(f"robot: {error}") from None
     for name in known:
-        if name not in layout.names:
+        if name not in valid:
             # TOML reads a dotted key without quotes as a table within a table.
-            unquoted = any(full.startswith(f"{name}.") for full in layout.names)
+            unquoted = any(full.startswith(f"{name}.") for full in valid)
             quoted = f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}'
             hint = quoted if unquoted else ""
             raise ValueError(
@@ -45,7 +47,8 @@ def in_words(layout: "ParameterLayout") -> str:
     return (
         f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), for a full body also mcx, mcy, mcz, "
         "Ixy, Ixz or Iyz, coulomb or viscous of "
-        f"{_range(layout.joint_names)}, and {layout.joint_pid_names[0]}, {gains}"
+        f"{_range(layout.joint_names)}, and {layout.joint_pid_names[0]}, {gains}, with model.gains "
+        f"= each {layout.joint_names[0]}.lp and so on"
     )
 
 

@@ -117,6 +117,11 @@ class _Side(Section):
         description="full: bodies have ten inertial parameters; centred: four; or a table by body "
         'or kind of body, as { platform = "full" }; by default as the robot file says',
     )
+    gains: Literal["shared", "each"] = Field(
+        "shared",
+        description="shared: all joints have the same gains lp, li, ld; each: every joint has its "
+        "own, such as joint3.lp",
+    )
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(
         None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
@@ -167,7 +172,7 @@ class Plant(_Side):
         {},
         description="true values of single parameters, instead of those of the parameter set, SI; "
         "a body with a first moment or a product of inertia is a full body; "
-        '{ "platform.mcz" = 0.7 }',
+        '{ "platform.mcz" = 0.7 }, or with gains = "each" { "joint3.lp" = 11 }',
     )
     drive: DriveName = Field(
         "pid", description="law of the drives; pid is the paper's, cascade is P-PI"

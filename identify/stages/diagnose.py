@@ -40,7 +40,7 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     side = model_side(robot, scenario).with_drive(settled_drive(identification))
     records = [files.content(name) for name in record_files(scenario.identification)]
     problem = output_error_problem(records, side, scenario.identification)
-    found = diagnosis_from(problem, parameter_vector(robot, identification, "estimate"), own)
+    found = diagnosis_from(problem, parameter_vector(side.robot, identification, "estimate"), own)
     save_result(run_folder.result, with_diagnosis(result, found))
     return found
 

@@ -19,7 +19,7 @@ from identify.files.run_folder import (
 )
 from identify.geometry.before_a_run import run_geometry
 from identify.geometry.outcome import GeometryOutcome
-from identify.loop_parameters import check_parameter_set
+from identify.loop_parameters import check_parameter_set, in_form
 from identify.progress import Progress
 from identify.record.checks import check_length, check_trajectory, fewest_frames
 from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
@@ -83,7 +83,7 @@ def open_run(
     scenario = load_scenario(run_folder.whole_scenario)
     trajectories = load_trajectories(run_folder.trajectories)
     robot = load_robot(scenario.robot)
-    known = known_geometry(robot, scenario.geometry, folder)
+    known = known_geometry(in_form(robot, scenario.model), scenario.geometry, folder)
     return run_folder, Setup(scenario, trajectories.seed, robot, known, progress), trajectories
 
 
@@ -96,7 +96,7 @@ def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | Non
     found = outcome.calibration.robot.geometry
     robot = nominal.moved(found.deviations_from(nominal.geometry))
     known = KnownGeometry(robot, outcome.calibration.covariance)
-    return outcome, replace(setup, loaded=setup.nominal, calibrated=known)
+    return outcome, replace(setup, loaded=setup.in_file, calibrated=known)
 
 
 def check_planned(

@@ -21,6 +21,7 @@ from dynamics import Robot, closed_loop
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
 from dynamics.inertia import grouped, physical_inertias
+from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.excitation.design import admissible_trajectories
 from identify.progress import Progress, SilentProgress
@@ -98,7 +99,7 @@ def compare_engines(
 ) -> EngineRuns:
     """Run both engines on the exciting trajectory, each with its own parameters.
 
-    The parameters are the dynamic parameters and the gains lp, li and ld.
+    The parameters are the dynamic parameters and the gains.
 
     Raises
     ------
@@ -176,7 +177,7 @@ def _mujoco_rows(
     Between two commands the command is interpolated linearly, as in the closed loop with linear
     hold.
     """
-    lp, li, ld = parameters[robot.layout.joint_pid]
+    lp, li, ld = robot.layout.split(parameters)[3].T
     # The number of steps per command is an integer.
     steps = round(1 / (COMMAND_RATE_HZ * engine.timestep))
     dt = 1 / (COMMAND_RATE_HZ * steps)
@@ -255,7 +256,7 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
     return {
         "robot": robot.name,
         "parameters": f"{PARAMETER_SET}, friction zero",
-        "joint_pid": dict(zip(("lp", "li", "ld"), chosen.joint_pid.tolist(), strict=True)),
+        "joint_pid": _gains_entry(robot, chosen.joint_pid),
         "duration_s": float(runs.time[-1]),
         "steady_from_s": STEADY_FROM_S,
         "mujoco": {
@@ -270,6 +271,15 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "goal": {"position_steady_um": GOAL_UM, "angle_steady_urad": GOAL_URAD},
         "met": verdict.met,
         "paper": PAPER,
+    }
+
+
+def _gains_entry(robot: Robot, gains: Array) -> dict[str, float | list[float]]:
+    """Return the gains by name, each one number or, if joints do not share it, one per joint."""
+    columns = robot.layout.each_gains(gains).T.tolist()
+    own = robot.layout.own_gains
+    return {
+        name: column if own else column[0] for name, column in zip(JOINT_PID, columns, strict=True)
     }
 
 

@@ -44,7 +44,7 @@ def _assert_derivative(run, parameters, index, ours, tolerance):
     poses, 1e-15, is then 1e-7 at most; where a step changes the pattern of events the poses have a
     kink.
     """
-    largest, misses, unit = np.abs(ours).max(), [], np.eye(67)[index]
+    largest, misses, unit = np.abs(ours).max(), [], np.eye(len(parameters))[index]
     if largest == 0:  # an inertia about an axis that nothing turns about
         far = run(parameters + 0.4 * parameters * unit).pose
         np.testing.assert_array_equal(far, run(parameters).pose, err_msg=f"parameter {index}")

@@ -1,0 +1,78 @@
+"""Model of a run whose joints have unequal gains, with shared gains among the parameters."""
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from dynamics import Robot
+from dynamics.closed_loop import ClosedLoopRun
+from dynamics.closed_loop.drives import JointLaw
+from dynamics.parameters import JOINT_PID
+from identify.arrays import Array
+from identify.loop_parameters import with_own_gains
+from identify.model.loop_model import LoopModel
+
+
+@dataclass(frozen=True)
+class UnequalGains(LoopModel):
+    """Model of a run in which the gains of each joint differ from the shared gains.
+
+    Attributes
+    ----------
+    differences : ndarray, shape (n, 3)
+        Gains lp, li, ld of each joint beyond the shared gains.
+    """
+
+    differences: Array = field(default_factory=lambda: np.zeros((0, len(JOINT_PID))))
+
+    def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
+        dynamic = (parameters + self.payload)[robot.layout.dynamic]
+        return with_own_gains(robot), np.concatenate([dynamic, self._gains(parameters).ravel()])
+
+    def drive_law(self, parameters: Array) -> JointLaw:
+        """Return the law of the drives with the gains of each joint."""
+        return self.settings.drives.joint_law(self._gains(parameters))
+
+    def _gains(self, parameters: Array) -> Array:
+        """Return the gains (n, 3) of each joint for parameters (p,)."""
+        return self.robot.layout.split(parameters)[3] + self.differences
+
+    def simulate(
+        self,
+        parameters: Array,
+        sensitivities: bool = False,
+        robot: Robot | None = None,
+        noise: Array | None = None,
+    ) -> ClosedLoopRun:
+        """Simulate the model. Derivatives are with respect to the shared gains."""
+        run = super().simulate(parameters, sensitivities, robot, noise)
+        if run.pose_sensitivity is None:
+            return run
+        others, by_gains = self._split(run.pose_sensitivity)
+        # a shared gain changes the gains of all joints by the same amount
+        shared = np.concatenate([others, by_gains.sum(axis=2)], axis=2)
+        return replace(run, pose_sensitivity=shared)
+
+    def by_gains(self, parameters: Array) -> Array:
+        """Return derivatives (N, 6, n, 3) of the poses with respect to the gains of each joint.
+
+        Raises LoopFailure if the model is unstable.
+        """
+        run = super().simulate(parameters, sensitivities=True)
+        assert run.pose_sensitivity is not None
+        return self._split(run.pose_sensitivity)[1]
+
+    def _split(self, sensitivity: Array) -> tuple[Array, Array]:
+        """Return derivatives (N, 6, q) by all parameters but gains, and by gains (N, 6, n, 3)."""
+        gains = self.robot.layout.joints * len(JOINT_PID)
+        rows = sensitivity.shape[:2]
+        by_gains = sensitivity[:, :, -gains:].reshape(*rows, -1, len(JOINT_PID))
+        return sensitivity[:, :, :-gains], by_gains
+
+
+def with_unequal_gains(run: LoopModel, differences: Array) -> UnequalGains:
+    """Return a model of a run with gains (n, 3) beyond those that its joints have."""
+    if isinstance(run, UnequalGains):
+        return replace(run, differences=run.differences + differences)
+    same = {one.name: getattr(run, one.name) for one in fields(run)}
+    return UnequalGains(**same, differences=differences)
