@@ -30,7 +30,8 @@ class RobotGeometry:
     are assembled: the branch of each leg's inverse kinematics at home is selected. `full_bodies`
     are the names of the bodies with ten inertial parameters instead of four (see
     `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
-    if all joints share them.
+    if all joints share them. `passive_friction` are the names of the parameters of passive joints
+    (see `parameters.passive_parameters`).
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -42,6 +43,7 @@ class RobotGeometry:
     gravity: np.ndarray
     full_bodies: tuple[str, ...] = ()
     own_gains: bool = False
+    passive_friction: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         gravity = np.array(self.gravity, dtype=float)
@@ -62,7 +64,7 @@ class RobotGeometry:
         object.__setattr__(
             self, "legs", tuple(leg.assembled(at, k + 1) for k, (leg, at) in enumerate(at_home))
         )
-        # raises ParameterError for the name of a full body that there is not
+        # raises ParameterError for a full body or passive joint that there is not
         self.layout  # noqa: B018
 
     @property
@@ -83,7 +85,7 @@ class RobotGeometry:
     @cached_property
     def layout(self) -> ParameterLayout:
         """Dynamic parameters of a robot with this geometry."""
-        return parameter_layout(self.legs, self.full_bodies, self.own_gains)
+        return parameter_layout(self.legs, self.full_bodies, self.own_gains, self.passive_friction)
 
     @property
     def prismatic(self) -> bool:
@@ -99,6 +101,8 @@ class RobotGeometry:
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         if any(self.layout.full):
             content.update(repr(self.layout.full).encode())
+        if self.layout.passive_names:
+            content.update(repr(self.layout.passive_names).encode())
         for leg in self.legs:
             content.update(repr([(name, _plain(value)) for name, value in leg]).encode())
         return content.digest()

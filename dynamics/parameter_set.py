@@ -59,6 +59,13 @@ class Friction(Strict):
     viscous: Damping | list[Damping]
 
 
+class PassiveFriction(Strict):
+    """Dry friction, N m, and viscous friction, N m s/rad, of the passive joints at one place."""
+
+    coulomb: Force | None = None
+    viscous: Damping | None = None
+
+
 class JointPid(Strict):
     """Gains of the joint PID. Each is one value that all joints share, or a list with one per leg.
 
@@ -80,6 +87,20 @@ class Parameters(BaseModel):
     platform: BodyInertia
     joint: Friction
     joint_pid: JointPid
+    passive: dict[str, PassiveFriction] = Field(
+        {},
+        description="friction of passive joints, each named by the body outwards from it: "
+        "{ link_joint = { viscous = 0.005 }, platform_joint = { coulomb = 0.02 } }",
+    )
+
+    @property
+    def passive_values(self) -> dict[str, float]:
+        """Values of the stated friction of passive joints, by parameter name."""
+        return {
+            f"{joint}.{law}": value
+            for joint, friction in self.passive.items()
+            for law, value in friction.model_dump(exclude_none=True).items()
+        }
 
     @property
     def own_gains(self) -> bool:
@@ -138,7 +159,8 @@ def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Par
         per_leg(f"joint.{key}", value, layout.joints)
         for key, value in values.joint.model_dump().items()
     ]
-    dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
+    passive = [values.passive_values.get(name, 0.0) for name in layout.passive_names]
+    dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), passive, *friction]))
     stated = values.joint_pid.unit
     unit = layout.unit(layout.joint_pid_names[0])
     columns = [

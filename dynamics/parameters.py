@@ -26,6 +26,11 @@ ALL_TEN = list(range(len(FULL_INERTIAL)))
 CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
 """Places of the parameters of a centred body among those of a full body."""
 
+PASSIVE_JOINT = "{}_joint"
+"""Name of a passive joint: that of the body outwards from it, such as link_joint."""
+
+PASSIVE_LAWS = ("coulomb", "viscous")
+
 LANES = 8
 """Number of derivatives that are computed at once."""
 
@@ -68,12 +73,15 @@ class RigidGroups:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Parameters of a robot: of its bodies, of joint friction, and of the joint PID.
+    """Parameters of a robot: of its bodies, of the friction of passive and actuated joints, and of
+    the joint PID.
 
     `bodies` are the names of all bodies, the platform first, and `kinds` are their kinds. `of_leg`
     are the indices of the bodies of each leg. `prismatic` is True if the actuators slide. `full` is
     True for each body with ten inertial parameters, and False for each centred body, which has
     four. `own_gains` is True if each joint has its own gains, and False if all joints share them.
+    `passive_names` are the parameters of the friction of passive joints, such as
+    link_joint.viscous.
     """
 
     bodies: tuple[str, ...]
@@ -82,6 +90,7 @@ class ParameterLayout:
     prismatic: bool
     full: tuple[bool, ...]
     own_gains: bool = False
+    passive_names: tuple[str, ...] = ()
 
     @property
     def joints(self) -> int:
@@ -95,6 +104,14 @@ class ParameterLayout:
 
     @cached_property
     def rigid_names(self) -> tuple[str, ...]:
+        """Names of the parameters of the equation of motion.
+
+        They are the inertial parameters, body by body, and the friction of passive joints.
+        """
+        return self.inertial_names + self.passive_names
+
+    @cached_property
+    def inertial_names(self) -> tuple[str, ...]:
         """Names of the inertial parameters, body by body."""
         return tuple(
             f"{body}.{name}"
@@ -142,8 +159,18 @@ class ParameterLayout:
 
     @property
     def rigid(self) -> slice:
-        """Slice of the inertial parameters."""
+        """Slice of the parameters of the equation of motion."""
         return slice(0, len(self.rigid_names))
+
+    @property
+    def inertial(self) -> slice:
+        """Slice of the inertial parameters."""
+        return slice(0, len(self.inertial_names))
+
+    @property
+    def passive(self) -> slice:
+        """Slice of the friction of passive joints."""
+        return slice(self.inertial.stop, self.rigid.stop)
 
     @property
     def coulomb(self) -> slice:
@@ -196,12 +223,17 @@ class ParameterLayout:
         return np.concatenate(rows, axis=-1)
 
     def converted(self, dynamic: np.ndarray, other: "ParameterLayout") -> np.ndarray:
-        """Dynamic parameters (..., p) in the layout of the same robot with other full bodies.
+        """Dynamic parameters (..., p) in the layout of the same robot in another form.
 
-        New parameters of full bodies are zero.
+        Parameters that this layout does not have are zero.
         """
-        rigid = other.rigid_of(self.bodies_of(dynamic))
-        return np.concatenate([rigid, dynamic[..., self.rigid.stop : self.dynamic.stop]], axis=-1)
+        inertial = other.rigid_of(self.bodies_of(dynamic))
+        passive = np.zeros((*dynamic.shape[:-1], len(other.passive_names)))
+        for place, name in enumerate(other.passive_names):
+            if name in self.passive_names:
+                passive[..., place] = dynamic[..., self.dynamic_names.index(name)]
+        rest = dynamic[..., self.rigid.stop : self.dynamic.stop]
+        return np.concatenate([inertial, passive, rest], axis=-1)
 
     def each_gains(self, gains: np.ndarray) -> np.ndarray:
         """Gains lp, li, ld of each joint (..., n, 3), from the gains (..., 3) or (..., 3 n)."""
@@ -274,14 +306,39 @@ class ParameterLayout:
         )
 
 
+def may_be_absent(name: str) -> bool:
+    """Return True for a parameter that is zero for a robot whose layout does not have it.
+
+    These are first moments and products of inertia, and the friction of passive joints.
+    """
+    joint, _, entry = name.rpartition(".")
+    return entry in SIGNED or joint.endswith(PASSIVE_JOINT.format(""))
+
+
+def passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
+    """Names of all parameters of the friction of passive joints that a robot can have."""
+    bodies = [
+        body.name
+        for leg in legs
+        for body, segment in zip(leg.bodies, leg.segments(), strict=True)
+        if segment.passive
+    ]
+    joints = [PASSIVE_JOINT.format(name) for name in dict.fromkeys([*bodies, "platform"])]
+    return tuple(f"{joint}.{law}" for joint in joints for law in PASSIVE_LAWS)
+
+
 def parameter_layout(
-    legs: Sequence[Leg], full: Sequence[str] = (), own_gains: bool = False
+    legs: Sequence[Leg],
+    full: Sequence[str] = (),
+    own_gains: bool = False,
+    passive: Sequence[str] = (),
 ) -> ParameterLayout:
     """Layout of a robot with these legs.
 
     The platform is first. The first bodies of all legs follow, and then their second bodies. `full`
     are the names of the bodies or kinds of bodies with ten inertial parameters, such as link2 or
-    link, or "all". `own_gains` is True if each joint has its own gains.
+    link, or "all". `own_gains` is True if each joint has its own gains. `passive` are the names of
+    parameters of passive joints (see `passive_parameters`).
 
     Raises ParameterError, with the valid names, for an unknown name.
     """
@@ -305,6 +362,11 @@ def parameter_layout(
             f"{', '.join(dict.fromkeys(kind.name for kind in kinds))}, or a body such as "
             f"{names[-1]}"
         )
+    possible = passive_parameters(legs) if passive else ()
+    if unknown := [name for name in passive if name not in possible]:
+        raise ParameterError(
+            f"there is no friction {unknown[0]!r} of passive joints; valid: {', '.join(possible)}"
+        )
     return ParameterLayout(
         names,
         kinds,
@@ -315,6 +377,7 @@ def parameter_layout(
             for name, kind in zip(names, kinds, strict=True)
         ),
         own_gains,
+        tuple(name for name in possible if name in passive),
     )
 
 
@@ -335,4 +398,8 @@ PRISMATIC = {"coulomb": "N", "viscous": "N s/m", "lp": "N/m", "li": "N/(m s)", "
 
 def unit_of(name: str, prismatic: bool = False) -> str:
     """Unit of a parameter name such as `crank1.mass` or `joint_pid.lp`."""
+    joint, _, entry = name.rpartition(".")
+    if joint.endswith(PASSIVE_JOINT.format("")):
+        # passive joints turn, whatever the actuators do
+        return REVOLUTE[entry]
     return (UNITS | (PRISMATIC if prismatic else REVOLUTE))[name.rsplit(".", 1)[1]]

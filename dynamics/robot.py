@@ -276,6 +276,35 @@ class Robot(RobotDynamics):
         nominal = None if own_functions else replace(self.functions_of, **form)
         return Robot(RobotDescription(self.name, geometry, sets), nominal)
 
+    def with_passive_friction(self, names: Sequence[str]) -> Robot:
+        """Robot whose passive joints have friction, with one parameter for each name.
+
+        Joints at the same place of all legs share their parameters. A passive joint is named by the
+        body outwards from it. The friction is viscous or dry, see `rigid_body.passive_friction`.
+        New parameters are zero, so that the robot moves as before.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Names of parameters, such as "link_joint.viscous" or "platform_joint.coulomb".
+
+        Returns
+        -------
+        Robot
+            The other robot, or this robot if nothing changes.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such parameter. The message lists the valid names.
+
+        Examples
+        --------
+        >>> robot.with_passive_friction(["link_joint.viscous"]).layout.passive_names
+        ('link_joint.viscous',)
+        """
+        return self._in_form(passive_friction=tuple(names))
+
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
         """Robot with another geometry with the same kinds of legs. It has its own functions.
 

@@ -239,6 +239,9 @@ def _geometry(content: RobotFile) -> RobotGeometry:
     chart = Chart(content.chart, tuple(content.home_pose))
     forms = {"all": content.inertia} if isinstance(content.inertia, str) else content.inertia
     full = tuple(name for name, form in forms.items() if form == "full")
+    passive = dict.fromkeys(
+        name for values in content.parameters.values() for name in values.passive_values
+    )
     return RobotGeometry(
         tuple(content.legs),
         chart,
@@ -246,6 +249,7 @@ def _geometry(content: RobotFile) -> RobotGeometry:
         np.array(content.gravity),
         full,
         own_gains=any(values.own_gains for values in content.parameters.values()),
+        passive_friction=tuple(passive),
     )
 
 

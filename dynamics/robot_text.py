@@ -59,6 +59,13 @@ def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
         names = FULL_INERTIAL if any(layout.full[row] for row in own) else INERTIAL
         columns = {name: bodies[own, FULL_INERTIAL.index(name)] for name in names}
         lines.append(_table(kind, columns))
+    passive: dict[str, list[str]] = {}
+    for name, value in zip(layout.passive_names, values.dynamic[layout.passive], strict=True):
+        joint, law = name.split(".")
+        passive.setdefault(joint, []).append(f"{law} = {_value(float(value))}")
+    if passive:
+        tables = (f"{joint} = {{ {', '.join(laws)} }}" for joint, laws in passive.items())
+        lines.append(f"passive = {{ {', '.join(tables)} }}")
     friction = {
         "coulomb": values.dynamic[layout.coulomb],
         "viscous": values.dynamic[layout.viscous],

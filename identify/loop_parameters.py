@@ -14,7 +14,7 @@ from dynamics import Robot
 from dynamics.closed_loop import Drives, FrameTiming, FrictionLaw, LoopSettings, ServoGains
 from dynamics.closed_loop.drives import DRIVES, DriveName
 from dynamics.errors import ParameterError
-from dynamics.parameters import JOINT_PID, SIGNED
+from dynamics.parameters import JOINT_PID, may_be_absent
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
@@ -99,13 +99,20 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
 
 
 def in_form(robot: Robot, side: Plant | Model) -> Robot:
-    """Return the robot with the full and centred bodies that the plant or the model states.
+    """Return the robot with the bodies and the passive friction that plant or model state.
 
     Bodies that it does not name stay as they are. Joints share their gains, or each has its own, as
-    the plant or the model states. Raises ScenarioError, with the valid names, for a body that the
-    robot does not have, and for shared gains that are unequal.
+    the plant or the model states. Raises ScenarioError, with the valid names, for a body or a
+    passive joint that the robot does not have, and for shared gains that are unequal.
     """
     robot = _with_gains(robot, side)
+    if side.passive_friction is not None:
+        try:
+            robot = _with_passive_friction(robot, tuple(side.passive_friction))
+        except ParameterError as error:
+            raise ScenarioError(
+                f"{type(side).__name__.lower()}.passive_friction: {error}"
+            ) from None
     if side.inertia is None:
         return robot
     layout = robot.layout
@@ -164,13 +171,13 @@ def with_own_gains(robot: Robot, own: bool = True) -> Robot:
 def known_value(values: Mapping[str, float], name: str) -> float | None:
     """Return the value of a parameter by name, also of a robot whose parameters have another form.
 
-    A first moment or product of inertia without a value is zero. The gain of one joint is the
+    A first moment, product of inertia or passive friction without a value is zero. The gain of one joint is the
     shared gain. The shared gain is the mean of those of all joints. None: there is no value.
     """
     if name in values:
         return float(values[name])
     owner, _, entry = name.rpartition(".")
-    if entry in SIGNED:
+    if may_be_absent(name):
         return 0.0
     if entry not in JOINT_PID:
         return None
@@ -187,6 +194,12 @@ def known_value(values: Mapping[str, float], name: str) -> float | None:
 def is_gain(name: str) -> bool:
     """Return True for a gain of the joint PID, shared or of one joint."""
     return name.rpartition(".")[2] in JOINT_PID
+
+
+@lru_cache(maxsize=16)
+def _with_passive_friction(robot: Robot, names: tuple[str, ...]) -> Robot:
+    """Return `Robot.with_passive_friction`, from a cache."""
+    return robot.with_passive_friction(names)
 
 
 @dataclass(frozen=True)

@@ -162,8 +162,9 @@ MOTIONS = {"ups": ups_motions, "pss": slider_motions, "pus": slider_motions}
 class ClosedChain:
     """A robot with dynamic parameters (p,); friction is no part of it."""
 
-    def __init__(self, robot, values):
-        self.robot, self.model = robot, pin.Model()
+    def __init__(self, robot, values, moving=None):
+        """moving: robot with compiled kinematics, which are the same in any form of its bodies."""
+        self.robot, self.model = moving or robot, pin.Model()
         self.model.gravity.linear = robot.geometry.gravity
         self._bodies, layout = robot.layout.bodies_of(values), robot.layout
         platform = self._body(0, pin.JointModelFreeFlyer, pin.SE3.Identity(), self._bodies[0], NONE)

@@ -122,6 +122,11 @@ class Segment(NamedTuple):
     actuated: bool = False
     copies: np.ndarray = np.zeros((1, 3))
 
+    @property
+    def passive(self) -> bool:
+        """True if the joint turns without an actuator."""
+        return self.joint != "slide" and not self.actuated
+
 
 class Leg(BaseModel, ABC):
     """Leg with a base joint B and a platform joint A.

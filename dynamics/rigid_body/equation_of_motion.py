@@ -34,6 +34,7 @@ from dynamics.rigid_body.accelerations import (
     slope_derivative,
 )
 from dynamics.rigid_body.jacobians import freedoms, platform_arms
+from dynamics.rigid_body.passive_friction import passive_friction_columns
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
@@ -91,6 +92,8 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     platform = rigid[layout.body_slices[0]]
     mass = platform_mass(pose, platform)
     bias = platform_columns(pose, twist, twist_dot, gravity, layout.full[0]) @ platform
+    if layout.passive_names:
+        bias += passive_friction_columns(geometry, pose, twist) @ rigid[layout.passive]
 
     def end(
         masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]
@@ -201,10 +204,16 @@ def _derivatives(
         parts.append(of_leg[:count])
     platform = _platform_columns(joints, gravity, layout.full[0])
     of_platform = layout.body_slices[0]
-    alone = [
-        free.T @ ca.jacobian(platform @ rigid[of_platform], of) @ free
-        for of in (joints.pose, joints.rate)
-    ]
+    whole = platform @ rigid[of_platform]
+    passive = ca.SX.zeros(6, 0)
+    # at a stop nothing turns that friction could act on
+    if layout.passive_names and count > 3:
+        to_twist = pose_rate_to_twist(joints.pose)
+        passive = to_twist.T @ passive_friction_columns(
+            geometry, joints.pose, to_twist @ joints.rate
+        )
+        whole += passive @ rigid[layout.passive]
+    alone = [free.T @ ca.jacobian(whole, of) @ free for of in (joints.pose, joints.rate)]
 
     def end(
         by_pose: Sequence[ca.SX],
@@ -214,6 +223,8 @@ def _derivatives(
     ) -> list[ca.SX]:
         columns = ca.SX.zeros(free.shape[1], layout.rigid.stop)
         columns[:, of_platform] = free.T @ platform
+        if passive.shape[1]:
+            columns[:, layout.passive] = free.T @ passive
         for number, of_leg in enumerate(local):
             slices = layout.leg_slices(number)
             ends = np.cumsum([0, *(own.stop - own.start for own in slices)]).tolist()

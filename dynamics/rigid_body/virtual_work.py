@@ -29,13 +29,14 @@ from dynamics.rigid_body.jacobians import (
     reach_margin,
     singularity_measures,
 )
+from dynamics.rigid_body.passive_friction import passive_friction_columns
 from dynamics.spatial_inertia import FULL_INERTIAL, spatial_inertia
 
 
 def rigid_body_regressor(
     geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX
 ) -> ca.SX:
-    """Columns of Gamma (6, p) for the inertial parameters of platform and legs (eq. 25)."""
+    """Columns of Gamma (6, p) for the parameters of the equation of motion (eq. 25)."""
     gravity = ca.DM(geometry.gravity)
     layout = geometry.layout
     columns = ca.SX.zeros(6, layout.rigid.stop)
@@ -54,6 +55,7 @@ def rigid_body_regressor(
         ends = np.cumsum([0, *(body.numel() for body in bodies)]).tolist()
         for own, wrench in zip(slices, ca.horzsplit(wrenches, ends), strict=True):
             columns[:, own] = wrench
+    columns[:, layout.passive] = passive_friction_columns(geometry, pose, twist)
     return columns
 
 
@@ -81,14 +83,17 @@ def platform_columns(
 def inertial_wrench(
     geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX
 ) -> ca.SX:
-    """Wrench M twist_dot + C twist + G (6,) for inertial parameters `rigid`.
+    """Wrench M twist_dot + C twist + G (6,) for parameters `rigid` of the equation of motion.
 
-    It equals the product of the regressor and the parameters, but the regressor is not computed.
+    It includes the friction of passive joints. It is the product of the regressor and the
+    parameters, but the regressor is not computed.
     """
     gravity = ca.DM(geometry.gravity)
     layout = geometry.layout
     columns = platform_columns(pose, twist, twist_dot, gravity, layout.full[0])
     total = columns @ rigid[layout.body_slices[0]]
+    if layout.passive_names:
+        total += passive_friction_columns(geometry, pose, twist) @ rigid[layout.passive]
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
@@ -216,6 +221,8 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     # Coulomb and viscous friction of eq. 24, without its second v_E, which is a misprint
     rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
+    passive = passive_friction_columns(geometry, pose, twist) @ xi[layout.passive]
+    rubbed = jacobian.T @ friction + passive if layout.passive_names else jacobian.T @ friction
     torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction
     return [
         function("mass_matrix", [pose, xi, *geometry.symbols], [mass]),
@@ -225,7 +232,7 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
             [coriolis_matrix(geometry, pose, twist, rigid)],
         ),
         function("gravity_wrench", [pose, xi, *geometry.symbols], [holding]),
-        function("friction_wrench", [pose, twist, xi, *geometry.symbols], [jacobian.T @ friction]),
+        function("friction_wrench", [pose, twist, xi, *geometry.symbols], [rubbed]),
         function("regressor", [pose, twist, twist_dot, *geometry.symbols], [regressor]),
         function("inverse_dynamics", [pose, twist, twist_dot, xi, *geometry.symbols], [torques]),
         function("forward_dynamics", [pose, twist, torque, xi, *geometry.symbols], [acceleration]),

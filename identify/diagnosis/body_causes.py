@@ -1,11 +1,9 @@
 """Causes in bodies and joints: centres of mass, products of inertia, passive and uneven friction.
 
 Each is a torque that the joints need beside those of the model. The torques of bodies are columns
-of the regressor of full bodies along the motion of the model. Those of passive joints follow from
-the power that friction takes. Let w be the angular velocity of one body of a joint relative to the
-other, and W its derivatives with respect to the twist. Viscous friction is then the wrench W^T w,
-and dry friction W^T w / |w|. The torques act on the model as changes of its commands
-(`identify.model.joint_torques`). Before the motion begins, the drives hold what they need.
+of the regressor of full bodies along the motion of the model. Those of passive joints are the
+columns of `dynamics.rigid_body.passive_friction`. The torques act on the model as changes of its
+commands (`identify.model.joint_torques`). Before the motion begins, the drives hold what they need.
 """
 
 from collections.abc import Sequence
@@ -18,7 +16,8 @@ import numpy as np
 from dynamics import Robot
 from dynamics.expressions import function
 from dynamics.geometry import RobotGeometry
-from dynamics.parameters import parameter_layout
+from dynamics.parameters import parameter_layout, passive_parameters
+from dynamics.rigid_body.passive_friction import passive_friction_columns
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
@@ -33,9 +32,6 @@ PROBED = 1e-5
 
 MOVING = 0.01
 """Velocity above which a joint moves, as a share of its RMS velocity."""
-
-SLOWEST = 1e-2
-"""Angular velocity, rad/s, below which the dry friction of a passive joint fades."""
 
 
 @dataclass(frozen=True)
@@ -201,81 +197,50 @@ def _full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
 
 
 def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
-    """Return viscous and dry friction of the passive joints, by the kind of joint."""
-    spins = [_passive_spins(robot, one) for one in motions]
-    found = []
-    for kind in dict.fromkeys(name for name, *_ in spins[0]):
-        viscous = []
-        dry = []
-        for motion, each in zip(motions, spins, strict=True):
-            linear = np.zeros_like(motion.twists)
-            unit = np.zeros_like(motion.twists)
-            for name, relative, by_twist, count in each:
-                if name == kind:
-                    speed = np.linalg.norm(relative, axis=1, keepdims=True)
-                    wrench = count * np.einsum("kij,ki->kj", by_twist, relative)
-                    linear += wrench
-                    unit += wrench / np.hypot(speed, SLOWEST)
-            viscous.append(_by_the_joints(motion, linear))
-            dry.append(_by_the_joints(motion, unit))
-        words = f"the {kind} joints"
-        remedy = (
-            f"--set 'model.passive_friction={{ {kind} = \"viscous\" }}'",
-            f"--set 'model.passive_friction={{ {kind} = \"dry\" }}'",
-        )
-        found += [
-            Needed(
-                f"viscous friction of {words}",
-                "N m s/rad",
-                "friction of passive joints",
-                tuple(viscous),
-                remedy[0],
-                0.0,
-            ),
-            Needed(
-                f"dry friction of {words}",
-                "N m",
-                "friction of passive joints",
-                tuple(dry),
-                remedy[1],
-                0.0,
-            ),
-        ]
-    return found
+    """Return viscous and dry friction of the passive joints, by their place in the legs.
 
-
-def _passive_spins(robot: Robot, motion: RunMotion) -> list[tuple[str, Array, Array, int]]:
-    """Return kind, relative angular velocity (N, 3), and its derivatives (N, 3, 6) by the twist, of
-    each passive joint that turns, and the number of such joints side by side.
+    Parameters that the model has are left out.
     """
-    placements = robot.functions["placements"]
-    constants = len(motion.poses)
-
-    def spins(twists: Array) -> Array:
-        """Angular velocities (N, bodies + 2, 3): bodies leg by leg, the base, the platform."""
-        own = placements(motion.poses, twists)[0][:, :, 12:]
-        return np.concatenate([own, np.zeros((constants, 1, 3)), twists[:, None, 3:]], axis=1)
-
-    now = spins(motion.twists)
-    units = [spins(np.tile(one, (constants, 1))) for one in np.eye(6)]
-    by_twist = np.stack(units, axis=3)
-    base = now.shape[1] - 2
+    geometry = robot.geometry
+    names = passive_parameters(geometry.legs)
+    columns = [_passive_columns(geometry, one) for one in motions]
     found = []
-    first = 0
-    for leg in robot.geometry.legs:
-        segments = leg.segments()
-        before = base
-        for place, segment in enumerate(segments):
-            body = first + place
-            if segment.joint in ("ball", "universal", "hinge") and not segment.actuated:
-                pair = now[:, body] - now[:, before], by_twist[:, body] - by_twist[:, before]
-                found.append((segment.joint, *pair, len(segment.copies)))
-            before = body
-        last = "hinge" if leg.chart == "planar" else "ball"
-        pair = now[:, -1] - now[:, before], by_twist[:, -1] - by_twist[:, before]
-        found.append((last, *pair, len(segments[-1].copies)))
-        first += len(segments)
+    for place, name in enumerate(names):
+        if name in robot.layout.passive_names:
+            continue
+        torques = tuple(
+            _by_the_joints(one, wrenches[:, :, place])
+            for one, wrenches in zip(motions, columns, strict=True)
+        )
+        joint, law = name.split(".")
+        kind = "dry" if law == "coulomb" else law
+        words = f"{kind} friction of the {joint.replace('_', ' ')}s"
+        known = ", ".join(f'"{one}"' for one in (*robot.layout.passive_names, name))
+        found.append(
+            Needed(
+                name=words,
+                unit=robot.layout.unit(name),
+                group="friction of passive joints",
+                torques=torques,
+                remedy=f"--set 'model.passive_friction=[{known}]'",
+                least=0.0,
+            )
+        )
     return found
+
+
+def _passive_columns(geometry: RobotGeometry, motion: RunMotion) -> Array:
+    """Return the wrenches (N, 6, k) of all parameters of passive friction along a motion."""
+    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
+    found = _passive_function(whole)(motion.poses.T, motion.twists.T).full()
+    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+
+
+@lru_cache(maxsize=8)
+def _passive_function(geometry: RobotGeometry) -> ca.Function:
+    """Return the wrenches (6, k) of passive friction of a geometry, as a CasADi function."""
+    given = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
+    return function("passive_friction", given, [passive_friction_columns(geometry, *given)])
 
 
 def _uneven_friction(runs: Sequence[LoopModel], motions: Sequence[RunMotion]) -> list[Needed]:

@@ -18,7 +18,7 @@ from scipy.linalg import orth, qr, subspace_angles
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.parameters import ParameterLayout, RigidGroups
+from dynamics.parameters import PASSIVE_JOINT, ParameterLayout, RigidGroups
 from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL
 from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
@@ -81,7 +81,13 @@ class BaseParameters:
 
         Friction is left out, because friction parameters are in no group with other parameters.
         """
-        inertial = np.flatnonzero([name.split(".")[1] in FULL_INERTIAL for name in self.names])
+        # these parameters come first
+        inertial = np.flatnonzero(
+            [
+                entry in FULL_INERTIAL or joint.endswith(PASSIVE_JOINT.format(""))
+                for joint, entry in (name.split(".") for name in self.names)
+            ]
+        )
         rows = np.flatnonzero(np.isin(self.pivots, inertial))
         return RigidGroups(np.array(self.pivots)[rows], self.combinations[np.ix_(rows, inertial)])
 

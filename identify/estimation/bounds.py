@@ -94,7 +94,7 @@ class ParameterBounds:
         allowed = np.where(self._signed, parameters, np.maximum(parameters, 0.0))
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
-            allowed[self.layout.rigid] = self.layout.rigid_of(bodies)
+            allowed[self.layout.inertial] = self.layout.rigid_of(bodies)
             for own in self._log_cholesky:
                 second = allowed[own][4:7].sum() / 2
                 allowed[own] = nearest_body(allowed[own], INSIDE * second)
@@ -178,7 +178,7 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     lower[guess.fixed] = -1.0  # the prior fixes them at zero, so their bounds must not be active
     lower[layout.dynamic][layout.signed] = -np.inf
     if physical:
-        lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
+        lower[layout.inertial] = np.maximum(lower[layout.inertial], SMALLEST)
         for own, full in zip(layout.body_slices, layout.full, strict=True):
             lower[own] = -np.inf if full else lower[own]
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]

@@ -59,6 +59,7 @@ from identify.estimation.prior import (
     asymmetry,
     friction,
     holding_torque,
+    passive_torque,
 )
 
 IDENTIFIABLE_SHARE = 0.5
@@ -117,7 +118,8 @@ def identifiability(
     held = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
     unsaid = np.where(friction(layout), held, 1.0)
     uneven = ASYMMETRY_SHARE * asymmetry(robot, guess.values)
-    unsaid[layout.rigid] = np.where(layout.signed[layout.rigid], uneven, 1.0)
+    unsaid[layout.inertial] = np.where(layout.signed[layout.inertial], uneven, 1.0)
+    unsaid[layout.passive] = FRICTION_SHARE * passive_torque(robot, held / FRICTION_SHARE)
     sizes = np.where(guess.values != 0, np.abs(guess.values), unsaid)
     return Identifiability(guess.std, sizes, model_holds)
 

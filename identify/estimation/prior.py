@@ -103,8 +103,8 @@ def starting_guess(
             )
         if name not in robot.layout.names:
             raise ScenarioError(
-                f"identification.prior: {name} is a parameter of a full body, but this body of the "
-                f"model of {robot.name} is centred; see model.inertia"
+                f"identification.prior: the model of {robot.name} has no {name}; full bodies are "
+                "set by model.inertia, and friction of passive joints by model.passive_friction"
             )
         place = robot.layout.names.index(name)
         values[place] = prior.value
@@ -159,21 +159,26 @@ def typical_sizes(robot: Robot, values: Array, torque: float) -> Array:
     """
     layout = robot.layout
     sizes = np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
-    sizes[layout.rigid] = np.where(
-        layout.signed[layout.rigid], asymmetry(robot, values), sizes[layout.rigid]
-    )
+    own = layout.inertial
+    sizes[own] = np.where(layout.signed[own], asymmetry(robot, values), sizes[own])
+    sizes[layout.passive] = passive_torque(robot, torque)
     return sizes
 
 
+def passive_torque(robot: Robot, torque: float) -> float:
+    """Return a torque, N m, of the size that actuators hold with a torque, N m, or a force, N."""
+    return torque * robot.geometry.characteristic_length if robot.layout.prismatic else torque
+
+
 def asymmetry(robot: Robot, values: Array) -> Array:
-    """Return sizes (r,) of the first moments and products of inertia of a robot's bodies.
+    """Return sizes (i,) of the first moments and products of inertia of a robot's bodies.
 
     A first moment is that of the mass of the body at half its length. A product is the mean of the
     moments of inertia. The sizes of all other inertial parameters are zero. values (p,): parameters
     of the robot.
     """
     layout = robot.layout
-    bodies = layout.bodies_of(values[layout.rigid])
+    bodies = layout.bodies_of(values)
     found = np.zeros_like(bodies)
     found[:, 1:4] = (bodies[:, 0] * robot.geometry.body_lengths / 2)[:, None]
     found[:, 7:] = bodies[:, 4:7].mean(axis=1, keepdims=True)

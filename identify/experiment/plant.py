@@ -255,7 +255,7 @@ class Plant:
             prismatic=self.robot.layout.prismatic,
         )
         # These are already among the parameters.
-        among = {"drive_gains", "values", "inertia", "gains"}
+        among = {"drive_gains", "values", "inertia", "gains", "passive_friction"}
         switches = self.switches.model_dump(exclude_none=True, exclude=among)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 

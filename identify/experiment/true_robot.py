@@ -6,7 +6,13 @@ import numpy as np
 
 from dynamics import Robot
 from dynamics.errors import ParameterError
-from dynamics.parameters import JOINT_PID, SIGNED, ParameterLayout, parameter_layout
+from dynamics.parameters import (
+    JOINT_PID,
+    SIGNED,
+    ParameterLayout,
+    parameter_layout,
+    passive_parameters,
+)
 from dynamics.pseudo_inertia import body_fault
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
@@ -21,33 +27,45 @@ from identify.scenario.sections import Geometry
 
 
 def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> Robot:
-    """Return the true robot with the full bodies and the gains of the plant.
+    """Return the true robot with the full bodies, the passive friction and the gains of the plant.
 
-    The full bodies are those of the robot file, unless the plant states others, and all bodies with
-    a true first moment or product of inertia. Raises ScenarioError, with the valid names, for a
-    true value of a parameter that the robot does not have.
+    Bodies and friction are those of the robot file, unless the plant states others, and those of
+    which the plant states a true value: a first moment, a product of inertia, or friction of a
+    passive joint. Raises ScenarioError, with the valid names, for a true value of a parameter that
+    the robot does not have.
     """
     of_plant = in_form(in_file, switches)
     stated = of_plant.layout
     full = set(stated.full_bodies)
-    known = parameter_layout(in_file.geometry.legs, ("all",), stated.own_gains).names
+    passive = list(stated.passive_names)
+    legs = in_file.geometry.legs
+    possible = passive_parameters(legs)
+    known = parameter_layout(legs, ("all",), stated.own_gains, possible).names
     for name in switches.values:
         if name not in known:
             raise ScenarioError(
                 f"plant.values names {name!r}; {robot.name} has {', '.join(stated.bodies)}, each "
                 f"with {', '.join(FULL_INERTIAL)} (such as platform.mcz), "
-                f"{', '.join(stated.joint_names)} with coulomb and viscous, and {_gains(stated)}"
+                f"{', '.join(stated.joint_names)} with coulomb and viscous, "
+                f"{', '.join(possible)}, and {_gains(stated)}"
             )
         body, entry = name.split(".")
         if entry in SIGNED:
             full.add(body)
+        if name in possible:
+            passive.append(name)
     layout = robot.layout
-    if full == set(layout.full_bodies) and stated.own_gains == layout.own_gains:
+    same_bodies = full == set(layout.full_bodies) and stated.own_gains == layout.own_gains
+    if same_bodies and set(passive) == set(layout.passive_names):
         return robot
     geometry = replace(
-        robot.geometry, full_bodies=of_plant.geometry.full_bodies, own_gains=stated.own_gains
+        robot.geometry,
+        full_bodies=of_plant.geometry.full_bodies,
+        own_gains=stated.own_gains,
+        passive_friction=of_plant.geometry.passive_friction,
     )
-    return of_plant.with_geometry(geometry).with_full_bodies(sorted(full))
+    true = of_plant.with_geometry(geometry)
+    return true.with_full_bodies(sorted(full)).with_passive_friction(passive)
 
 
 def _gains(layout: ParameterLayout) -> str:

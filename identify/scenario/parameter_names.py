@@ -16,14 +16,16 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
         return
     # Late imports: dynamics loads CasADi, which the help of the command line does not need.
     from dynamics.errors import RobotFileError
-    from dynamics.parameters import parameter_layout
+    from dynamics.parameters import parameter_layout, passive_parameters
     from dynamics.robot_file import read_robot_file
 
     try:
-        # The model can have full bodies and gains of each joint where the robot file has none.
+        # The model can have full bodies, passive friction and gains of each joint where the robot
+        # file has none.
         legs = read_robot_file(robot).geometry.legs
-        layout = parameter_layout(legs, ("all",))
-        valid = {*layout.names, *parameter_layout(legs, ("all",), own_gains=True).names}
+        passive = passive_parameters(legs)
+        layout = parameter_layout(legs, ("all",), passive=passive)
+        valid = {*layout.names, *parameter_layout(legs, own_gains=True).names}
     except RobotFileError as error:
         raise ValueError(f"robot: {error}") from None
     for name in known:
@@ -47,8 +49,9 @@ def in_words(layout: "ParameterLayout") -> str:
     return (
         f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), for a full body also mcx, mcy, mcz, "
         "Ixy, Ixz or Iyz, coulomb or viscous of "
-        f"{_range(layout.joint_names)}, and {layout.joint_pid_names[0]}, {gains}, with model.gains "
-        f"= each {layout.joint_names[0]}.lp and so on"
+        f"{_range(layout.joint_names)}, {', '.join(layout.passive_names)}, and "
+        f"{layout.joint_pid_names[0]}, {gains}, with model.gains = each {layout.joint_names[0]}.lp "
+        "and so on"
     )
 
 

@@ -122,6 +122,12 @@ class _Side(Section):
         description="shared: all joints have the same gains lp, li, ld; each: every joint has its "
         "own, such as joint3.lp",
     )
+    passive_friction: list[str] | None = Field(
+        None,
+        description="parameters of the friction of passive joints, each joint named by the body "
+        'outwards from it; ["link_joint.viscous", "platform_joint.coulomb"]; by default those of '
+        "the robot file",
+    )
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(
         None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
@@ -171,7 +177,8 @@ class Plant(_Side):
     values: dict[str, float] = Field(
         {},
         description="true values of single parameters, instead of those of the parameter set, SI; "
-        "a body with a first moment or a product of inertia is a full body; "
+        "a body with a first moment or a product of inertia is a full body, and a passive joint "
+        "with friction has it; "
         '{ "platform.mcz" = 0.7 }, or with gains = "each" { "joint3.lp" = 11 }',
     )
     drive: DriveName = Field(

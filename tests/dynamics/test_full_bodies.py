@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import dynamics
 from dynamics.errors import ParameterError, RobotFileError
+from dynamics.parameters import passive_parameters
 from dynamics.pseudo_inertia import (
     about_centre,
     body_fault,
@@ -17,6 +18,7 @@ from dynamics.pseudo_inertia import (
     pseudo_inertia,
 )
 from dynamics.rigid_body.equation_of_motion import equation_of_motion, motion_derivatives
+from dynamics.rigid_body.passive_friction import SLOW
 from tests.dynamics.conftest import SLOW_ROBOTS
 
 SCALES = np.repeat([0.01, 0.04], 3), np.repeat([0.1, 0.5], 3), np.repeat([1.0, 5.0], 3)
@@ -43,11 +45,15 @@ def drawn_bodies(robot, rng):
 
 @pytest.fixture(scope="module", params=SLOW_ROBOTS)
 def full(request):
-    """A robot with full bodies only, its parameters, and 20 states that its platform can have."""
+    """A robot with full bodies only and friction in all passive joints, its parameters, and 20
+    states that its platform can have.
+    """
     robot = dynamics.load_robot(request.param).with_full_bodies(["all"])
+    robot = robot.with_passive_friction(passive_parameters(robot.geometry.legs))
     rng = np.random.default_rng(1)
     values = robot.nominal_parameters.copy()
-    values[robot.layout.rigid] = robot.layout.rigid_of(drawn_bodies(robot, rng))
+    values[robot.layout.inertial] = robot.layout.rigid_of(drawn_bodies(robot, rng))
+    values[robot.layout.passive] = rng.uniform(0.01, 0.1, len(robot.layout.passive_names))
     free = robot.geometry.chart.basis @ robot.geometry.chart.basis.T
     away, twist, gain = (rng.uniform(-1, 1, (20, 6)) * scale @ free for scale in SCALES)
     return robot, values, (robot.home_pose + away, twist, gain)
@@ -64,8 +70,9 @@ def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
     )
     layout, free = robot.layout, robot.geometry.chart.basis
     frictionless = np.array(values)
-    frictionless[layout.rigid.stop :] = 0
-    chain = ClosedChain(robot, values)
+    frictionless[layout.inertial.stop :] = 0
+    centred = robot.with_full_bodies(()).with_passive_friction(())
+    chain = ClosedChain(robot, values, moving=centred)
     rest = np.zeros((2, 6))
     holding = robot.casadi("inverse_dynamics")(robot.home_pose, *rest, values).full()
     torques = (1 + 2 * np.abs(holding).max()) * np.random.default_rng(5).standard_normal(
@@ -82,7 +89,7 @@ def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
         speeds = np.transpose([chain.state(pose, one, torque).v for one in free.T])
         columns = chain.regressor(state, a, speeds).reshape(free.shape[1], -1)
         wrenches = free.T @ regressor(pose, twist, theirs).full()
-        errors.append(np.abs(wrenches[:, layout.rigid] - columns))
+        errors.append(np.abs(wrenches[:, layout.inertial] - columns))
         sizes.append(np.abs(columns))
         torque_found = np.linalg.solve((jacobian(pose).full() @ free).T, wrenches @ frictionless)
         np.testing.assert_allclose(torque_found, torque, atol=1e-9 * np.abs(torque).max())
@@ -100,7 +107,7 @@ def test_mass_and_coriolis_matrix_and_equation_of_motion_are_one_dynamics(full):
     regressor, mass, coriolis, gravity = (robot.casadi(name) for name in names)
     layout, free = robot.layout, robot.geometry.chart.basis
     inertial = values.copy()
-    inertial[layout.rigid.stop :] = 0
+    inertial[layout.inertial.stop :] = 0
     motion = equation_of_motion(robot.geometry).whole
     derivatives = motion_derivatives(robot.geometry).whole
     for pose, twist, gain in zip(*states, strict=True):
@@ -143,6 +150,47 @@ def _angle_rates(pose, omega):
     step = 1e-7
     turned = Rotation.from_rotvec(step * omega) * Rotation.from_euler("XYZ", pose[3:])
     return (turned.as_euler("XYZ") - pose[3:]) / step
+
+
+def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(full):
+    """With the angular velocities of the chain that Pinocchio gets: viscous c |w|^2, which as a
+    quadratic form in the twist is the whole wrench; dry c |w|^2 / sqrt(|w|^2 + SLOW^2).
+    """
+    pytest.importorskip("pinocchio")
+    from tests.closed_chain import MOTIONS, base_from_platform, crank_motions
+
+    robot, values, (poses, twists, _) = full
+    layout, free = robot.layout, robot.geometry.chart.basis @ robot.geometry.chart.basis.T
+    wrench, inverse, jacobian = (
+        robot.casadi(name) for name in ("friction_wrench", "inverse_kinematics", "joint_jacobian")
+    )
+    passive = values.copy()
+    passive[: layout.inertial.stop] = passive[layout.rigid.stop :] = 0
+    constants = dict(zip(layout.passive_names, values[layout.passive], strict=True))
+    rng = np.random.default_rng(3)
+    for pose, first in zip(poses, twists, strict=True):
+        for twist in (first, *(rng.standard_normal((3, 6)) @ free)):
+            theta, rates = inverse(pose)[0].full().ravel(), (jacobian(pose).full() @ twist)
+            turn, power = base_from_platform(pose), 0.0
+            for number, leg in enumerate(robot.geometry.legs):
+                arm = turn @ leg.platform_joint
+                at, moving = pose[:3] + arm, twist[:3] + np.cross(twist[3:], arm)
+                motions = MOTIONS.get(leg.type, crank_motions)(
+                    leg, theta[number], rates[number], at, moving
+                )
+                spins = [np.zeros(3), *(omega for _, omega in motions[:2]), twist[3:]]
+                joints = [f"{body.name}_joint" for body in leg.bodies] + ["platform_joint"]
+                bars = 2 if leg.type == "parallelogram" else 1
+                for place, (joint, inner, outer) in enumerate(
+                    zip(joints, spins[:-1], spins[1:], strict=True)
+                ):
+                    size = np.linalg.norm(outer - inner)
+                    many = bars if place else 1
+                    power += many * constants.get(f"{joint}.viscous", 0.0) * size**2
+                    dry = constants.get(f"{joint}.coulomb", 0.0)
+                    power += many * dry * size**2 / np.hypot(size, SLOW)
+            ours = twist @ wrench(pose, twist, passive).full().ravel()
+            np.testing.assert_allclose(ours, power, rtol=1e-9)
 
 
 def test_a_full_body_without_first_moments_and_products_is_a_centred_body(robot, states):

@@ -139,5 +139,8 @@ def test_bodies_and_values_that_there_are_not_are_refused_in_one_line():
     prior = {"prior": {"platform.mcz": {"value": 0.7, "std": 0.01}}}
     given = scenario.with_overrides({"identification.prior": prior["prior"]})
     record = identify.set_up(scenario).run()
-    with pytest.raises(ScenarioError, match=r"platform\.mcz is a parameter of a full body, but"):
+    with pytest.raises(
+        ScenarioError,
+        match=r"model of rss6 has no platform\.mcz; full bodies are set by model\.inertia",
+    ):
         identify.identify(record, scenario=given)

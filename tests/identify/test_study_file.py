@@ -375,6 +375,7 @@ ALONE = {
         "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
     "scenario.plant.inertia", "scenario.model.inertia", "scenario.plant.values",
+    "scenario.plant.passive_friction", "scenario.model.passive_friction",
     "scenario.rig.known", "scenario.rig.errors", "scenario.rig.drift",
     "scenario.identification.nuisances", "scenario.control.law", "scenario.excitation.law",
     "scenario.plant.drive_gains", "scenario.plant.derivative_filter_s", "scenario.model.derivative_filter_s",

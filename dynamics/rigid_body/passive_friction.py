@@ -1,0 +1,68 @@
+"""Friction of the passive joints of the legs, by the relative angular velocity of their bodies.
+
+Let w (3,) be the angular velocity of the outer body of a joint relative to the inner one, and W
+(3, 6) its derivatives with respect to the twist of the platform. Friction with the moment c w takes
+the power c |w|^2, and is thus the wrench c W^T w at the platform. Dry friction has the moment
+c w / |w|. It fades over the angular velocity `SLOW`, so that the equation of motion stays smooth:
+
+    viscous   c W^T w
+    coulomb   c W^T w / sqrt(|w|^2 + SLOW^2)
+
+A joint of two parallel bars counts twice.
+"""
+
+import casadi as ca
+
+from dynamics.geometry import AnyGeometry, RobotGeometry
+from dynamics.parameters import PASSIVE_JOINT
+from dynamics.rigid_body.jacobians import platform_arms
+
+SLOW = 0.02
+"""Relative angular velocity, rad/s, over which dry friction of a passive joint fades."""
+
+
+def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
+    """Wrench (6, k) at the platform for a unit of each parameter of passive friction.
+
+    The parameters are those of the layout, in its order.
+    """
+    names = geometry.layout.passive_names
+    columns = ca.SX.zeros(6, len(names))
+    if not names:
+        return columns
+    moving = ca.SX.sym("twist", 6)
+    for name, relative, count in _relative_spins(geometry, pose, moving):
+        by_twist = ca.jacobian(relative, moving)
+        spin = ca.substitute(relative, moving, ca.densify(twist))
+        viscous = count * (by_twist.T @ spin)
+        sizes = {
+            "viscous": viscous,
+            "coulomb": viscous / ca.sqrt(ca.dot(spin, spin) + SLOW**2),
+        }
+        for law, wrench in sizes.items():
+            if f"{name}.{law}" in names:
+                columns[:, names.index(f"{name}.{law}")] += wrench
+    return columns
+
+
+def _relative_spins(
+    geometry: AnyGeometry, pose: ca.SX, twist: ca.SX
+) -> list[tuple[str, ca.SX, int]]:
+    """Name, relative angular velocity (3,) and number of parallel joints of each passive joint."""
+    nominal = geometry if isinstance(geometry, RobotGeometry) else geometry.nominal
+    found = []
+    for leg, known, arm in zip(
+        geometry.legs, nominal.legs, platform_arms(geometry, pose), strict=True
+    ):
+        velocity = twist[0:3] + ca.cross(twist[3:6], arm)
+        spins = leg.angular_velocities(pose[0:3] + arm, velocity)
+        before = ca.SX.zeros(3)
+        segments = known.segments()
+        for body, segment, spin in zip(leg.bodies, segments, spins, strict=True):
+            if segment.passive:
+                found.append((PASSIVE_JOINT.format(body.name), spin - before, len(segment.copies)))
+            before = spin
+        found.append(
+            (PASSIVE_JOINT.format("platform"), twist[3:6] - before, len(segments[-1].copies))
+        )
+    return found
