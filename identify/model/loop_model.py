@@ -31,14 +31,9 @@ from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
 from identify.model.joint_torques import equivalent_commands, while_commands_act
+from identify.record.checks import long_gap_warnings
 from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
 from identify.runtime import in_threads
-
-LONG_GAP_S = 0.5
-"""Longest time, s, of consecutive lost frames without a warning.
-
-The model runs through these frames without measurements.
-"""
 
 
 @dataclass(frozen=True)
@@ -235,13 +230,11 @@ class LoopModel:
         given = *self._moving(parameters, robot or self.robot), self.reference, self.settings
         sensor = IdealSensor(self._lost, self._sensed(noise))
         late = self.latencies
-        if self.driven and sensitivities:
-            commands = self._commands(parameters)
-            return differentiate_commands(
-                *given, commands, sensor, latencies=late, groups=self.groups
-            )
         if self.driven:
-            return simulate_commands(*given, self._commands(parameters), sensor, latencies=late)
+            known = *given, self._commands(parameters)
+            if sensitivities:
+                return differentiate_commands(*known, sensor, latencies=late, groups=self.groups)
+            return simulate_commands(*known, sensor, latencies=late)
         if sensitivities:
             return differentiate_servo(*given, sensor, latencies=late, groups=self.groups)
         # The servo always uses the robot that it knows, even if another robot moves.
@@ -258,8 +251,9 @@ class LoopModel:
         sensed = np.asarray(self._sensed(noises))
         given = *self._moving(parameters, self.robot), self.reference, self.settings
         if self.driven:
-            commands = self._commands(parameters)
-            return repeat_commands(*given, commands, sensed, latencies=self.latencies)
+            return repeat_commands(
+                *given, self._commands(parameters), sensed, latencies=self.latencies
+            )
         return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies)
 
     def drive_law(self, parameters: Array) -> JointLaw:
@@ -402,19 +396,7 @@ class LoopModel:
 
     def warnings(self) -> tuple[str, ...]:
         """Return a warning if many consecutive frames were lost, which weakens the estimate."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], ~self.ok, [0]])))
-        if not len(edges):
-            return ()
-        gaps = edges[1::2] - edges[::2]
-        longest = int(gaps.argmax())
-        rate_hz = self.settings.timing.frame_rate_hz
-        if gaps[longest] <= LONG_GAP_S * rate_hz:
-            return ()
-        return (
-            f"{gaps[longest]} frames in a row were lost from t = "
-            f"{edges[2 * longest] / rate_hz:.2f} s on: the model runs through "
-            f"{gaps[longest] / rate_hz:.2f} s without measurements",
-        )
+        return long_gap_warnings(self.ok, self.settings.timing.frame_rate_hz)
 
     @cached_property
     def whitener(self) -> Array:

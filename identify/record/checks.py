@@ -349,3 +349,26 @@ def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
         if fits(poses * np.repeat([position, angle], 3)):
             return f"; in {units} it would fit, and records are in m and rad"
     return ""
+
+
+LONG_GAP_S = 0.5
+"""Longest time, s, of consecutive lost frames without a warning.
+
+The model runs through these frames without measurements.
+"""
+
+
+def long_gap_warnings(ok: NDArray[np.bool_], rate_hz: float) -> tuple[str, ...]:
+    """Return a warning if many consecutive frames (N,) were lost, which weakens the estimate."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], ~ok, [0]])))
+    if not len(edges):
+        return ()
+    gaps = edges[1::2] - edges[::2]
+    longest = int(gaps.argmax())
+    if gaps[longest] <= LONG_GAP_S * rate_hz:
+        return ()
+    return (
+        f"{gaps[longest]} frames in a row were lost from t = "
+        f"{edges[2 * longest] / rate_hz:.2f} s on: the model runs through "
+        f"{gaps[longest] / rate_hz:.2f} s without measurements",
+    )
