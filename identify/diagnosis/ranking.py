@@ -147,17 +147,16 @@ def rank(
     ranked = []
     for one in every:
         places = list(one.places)
-        found = score(projected[:, places], left, lengths[places])
-        if len(places) == 1 and found.sizes[0] < causes[places[0]].least:
-            # nothing can have such a size
-            found = score(projected[:, :0], left, lengths[:0])
+        found = _possible_score(projected, left, lengths, places, causes)
         chance = min(1.0, len(every) * p_value_of(found, left, rows))
         worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
         ranked.append(Ranked(one, found, chance, worth))
     ranked.sort(key=lambda one: -one.worth)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)
-    alone = [place for place, one in enumerate(causes) if one.alone]
+    # causes that would need a size that nothing can have are left out
+    possible = {one.candidate.places for one in ranked if one.score.freedoms}
+    alone = [place for place, one in enumerate(causes) if one.alone and (place,) in possible]
     few, found = forward_selection(projected[:, alone], left, lengths[alone])
     chain = tuple(alone[place] for place in few)
     worth = found.statistic - len(chain) * (price + 2 * np.log(len(alone)))
@@ -167,6 +166,31 @@ def rank(
     first = next(one for one in ranked if one.candidate.places == chain[:1])
     first = replace(first, chance=min(first.chance, chance))
     return (first, *(one for one in ranked if one.candidate is not first.candidate))
+
+
+def _possible_score(
+    projected: Array, left: Array, lengths: Array, places: list[int], causes: Sequence[Cause]
+) -> Score:
+    """Return the score of causes at some places, without those whose sizes nothing can have.
+
+    projected (m, k): columns of all causes, projected. left (m,): projected residuals. lengths
+    (k,): lengths of the columns before.
+    """
+    inside = list(places)
+    while True:
+        found = score(projected[:, inside], left, lengths[inside])
+        least = np.array([causes[place].least for place in inside])
+        beyond = np.maximum(least - found.sizes, 0.0) * lengths[inside]
+        if not inside or not beyond.any():
+            break
+        # the one that is farthest beyond its least size, in units of the residuals
+        inside.pop(int(np.argmax(beyond)))
+    sizes = np.zeros(len(places))
+    by_directions = np.zeros((len(places), found.freedoms))
+    for k, place in enumerate(inside):
+        sizes[places.index(place)] = found.sizes[k]
+        by_directions[places.index(place)] = found.by_directions[k]
+    return replace(found, sizes=sizes, by_directions=by_directions)
 
 
 def forward_selection(
