@@ -29,13 +29,14 @@ from dynamics.errors import DynamicsError as DynamicsError
 if TYPE_CHECKING:
     from dynamics import closed_loop as closed_loop
     from dynamics.closed_loop import simulate_batch as simulate_batch
+    from dynamics.forward_dynamics import fast_forward_dynamics as fast_forward_dynamics
     from dynamics.robot import Robot as Robot
-    from dynamics.robot import fast_forward_dynamics as fast_forward_dynamics
     from dynamics.robot import load_robot as load_robot
     from dynamics.robot_file import built_in_robots as built_in_robots
 
 _HOME = {
-    **dict.fromkeys(("Robot", "fast_forward_dynamics", "load_robot"), "dynamics.robot"),
+    **dict.fromkeys(("Robot", "load_robot"), "dynamics.robot"),
+    "fast_forward_dynamics": "dynamics.forward_dynamics",
     "built_in_robots": "dynamics.robot_file",
     "simulate_batch": "dynamics.closed_loop",
 }

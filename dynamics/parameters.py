@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from dynamics.checks import Shape, floats
 from dynamics.errors import ParameterError
 from dynamics.legs.leg import Body, Leg
+from dynamics.parameter_units import PASSIVE_JOINT, unit_of
 from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL, INERTIAL, MOMENTS, PRODUCTS
 
 PLATFORM = Body("platform", MOMENTS)
@@ -25,9 +26,6 @@ SIGNED = (*FIRST_MOMENTS, *PRODUCTS)
 ALL_TEN = list(range(len(FULL_INERTIAL)))
 CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
 """Places of the parameters of a centred body among those of a full body."""
-
-PASSIVE_JOINT = "{}_joint"
-"""Name of a passive joint: that of the body outwards from it, such as link_joint."""
 
 PASSIVE_LAWS = ("coulomb", "viscous")
 
@@ -379,27 +377,3 @@ def parameter_layout(
         own_gains,
         tuple(name for name in possible if name in passive),
     )
-
-
-UNITS = (
-    {"mass": "kg"}
-    | dict.fromkeys(FIRST_MOMENTS, "kg m")
-    | dict.fromkeys((*MOMENTS, *PRODUCTS), "kg m^2")
-)
-REVOLUTE = {
-    "coulomb": "N m",
-    "viscous": "N m s/rad",
-    "lp": "N m/rad",
-    "li": "N m/(rad s)",
-    "ld": "N m s/rad",
-}
-PRISMATIC = {"coulomb": "N", "viscous": "N s/m", "lp": "N/m", "li": "N/(m s)", "ld": "N s/m"}
-
-
-def unit_of(name: str, prismatic: bool = False) -> str:
-    """Unit of a parameter name such as `crank1.mass` or `joint_pid.lp`."""
-    joint, _, entry = name.rpartition(".")
-    if joint.endswith(PASSIVE_JOINT.format("")):
-        # passive joints turn, whatever the actuators do
-        return REVOLUTE[entry]
-    return (UNITS | (PRISMATIC if prismatic else REVOLUTE))[name.rsplit(".", 1)[1]]

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import check_choice, check_type, flag, floats, shown
-from dynamics.errors import DynamicsError, RobotFileError, ShapeError, SingularPoseError
+from dynamics.checks import check_choice, check_type, flag, floats
+from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.geometry import RobotGeometry
 from dynamics.parameter_set import ParameterSet
 from dynamics.robot_dynamics import RobotDynamics
 from dynamics.robot_file import RobotDescription, read_robot_file
 from dynamics.robot_functions import CASADI, casadi_function
-
-StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -332,88 +329,3 @@ class Robot(RobotDynamics):
         if geometry is self.geometry:
             return self
         return Robot(RobotDescription(self.name, geometry, self.parameter_sets))
-
-
-def fast_forward_dynamics(
-    robot: Robot, parameters: np.ndarray | None = None
-) -> StateToAcceleration:
-    """Make a function for inner loops that computes the same as `Robot.forward_dynamics`.
-
-    The function is about 80 times faster than the method, because it does not check reach and
-    conditioning. It always returns the same array, which the next call overwrites, and is
-    therefore not thread safe. In a pose in which the platform can move although all cranks are
-    locked, eq. 40 holds, and the function returns the acceleration. `Robot.forward_dynamics`
-    refuses such a pose, because no controller can hold it.
-
-    Parameters
-    ----------
-    robot : Robot
-        Robot that moves.
-    parameters : ndarray, shape (p,), optional
-        Dynamic parameters, which are checked once. The default is `nominal_parameters`.
-
-    Returns
-    -------
-    callable
-        Function (pose (6,), twist (6,), torque (n,)) -> twist_dot (6,) of float64 arrays. It
-        raises ShapeError for other arrays. It raises SingularPoseError if the result is not
-        finite: out of reach, for a singular mass matrix, or for NaN in the input.
-
-    Raises
-    ------
-    DynamicsError, ParameterError
-        If an argument is not valid.
-
-    Examples
-    --------
-    >>> accelerate = fast_forward_dynamics(robot)
-    >>> accelerate(robot.home_pose, np.zeros(6), np.zeros(6)).shape
-    (6,)
-    """
-    check_type("robot", robot, Robot, DynamicsError)
-    if parameters is None:
-        parameters = robot.nominal_parameters
-    fixed = robot.layout.check(parameters)
-    joints = robot.layout.joints
-    function = robot.functions["forward_dynamics"]
-    result = np.zeros(6)
-    inputs = np.concatenate([np.zeros(12 + joints), fixed, function.constants])
-    # Assigning to a memoryview takes half the time of assigning to an array, and refuses other
-    # shapes and types. The type stubs of NumPy do not support it.
-    pose_in: Any = memoryview(inputs[0:6].data)
-    twist_in: Any = memoryview(inputs[6:12].data)
-    torque_in: Any = memoryview(inputs[12 : 12 + joints].data)
-    values = memoryview(result.data)
-    call = function.bound_to(inputs, result)
-
-    def forward_dynamics(
-        at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray
-    ) -> np.ndarray:
-        try:
-            pose_in[:] = at_pose
-            twist_in[:] = at_twist
-            torque_in[:] = at_torque
-        except (TypeError, ValueError):
-            _refuse(at_pose, at_twist, at_torque, joints)
-        call()
-        # The mass matrix couples all entries: if one is not finite, none is.
-        first = values[0]
-        if not first - first == 0.0:
-            raise SingularPoseError(
-                f"forward dynamics is not finite at pose {at_pose}, twist {at_twist}, torque "
-                f"{at_torque}"
-            )
-        return result
-
-    return forward_dynamics
-
-
-def _refuse(pose: object, twist: object, torque: object, joints: int) -> None:
-    """Raise ShapeError for the first argument that is not a float64 array of the right shape."""
-    given = {"pose": (pose, 6), "twist": (twist, 6), "torque": (torque, joints)}
-    for name, (value, size) in given.items():
-        if floats(name, value, (size,), finite=False) is not value:
-            raise ShapeError(
-                f"{name} must be a float64 array of shape ({size},), got {shown(value)}"
-            ) from None
-    raise ShapeError(f"pose and twist (6,) and torque ({joints},) must be float64 arrays") from None

@@ -171,8 +171,9 @@ def with_own_gains(robot: Robot, own: bool = True) -> Robot:
 def known_value(values: Mapping[str, float], name: str) -> float | None:
     """Return the value of a parameter by name, also of a robot whose parameters have another form.
 
-    A first moment, product of inertia or passive friction without a value is zero. The gain of one joint is the
-    shared gain. The shared gain is the mean of those of all joints. None: there is no value.
+    A first moment, product of inertia or passive friction without a value is zero. The gain of one
+    joint is the shared gain. The shared gain is the mean of those of all joints. None: there is no
+    value.
     """
     if name in values:
         return float(values[name])

@@ -14,7 +14,7 @@ A joint of two parallel bars counts twice.
 import casadi as ca
 
 from dynamics.geometry import AnyGeometry, RobotGeometry
-from dynamics.parameters import PASSIVE_JOINT
+from dynamics.parameter_units import PASSIVE_JOINT
 from dynamics.rigid_body.jacobians import platform_arms
 
 SLOW = 0.02

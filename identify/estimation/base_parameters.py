@@ -18,7 +18,8 @@ from scipy.linalg import orth, qr, subspace_angles
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.parameters import PASSIVE_JOINT, ParameterLayout, RigidGroups
+from dynamics.parameter_units import PASSIVE_JOINT
+from dynamics.parameters import ParameterLayout, RigidGroups
 from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL
 from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError

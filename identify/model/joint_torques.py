@@ -17,20 +17,23 @@ from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 
 
-def equivalent_commands(torques: Array, law: JointLaw, timing: FrameTiming) -> Array:
+def equivalent_commands(
+    torques: Array, latencies: Array, law: JointLaw, timing: FrameTiming
+) -> Array:
     """Return the changes (N, n), rad or m, of commands for which drives add torques (N, n).
 
-    The torques, N m or N, are those of the time in which each command acts: their mean for a held
-    command, and the torque at the end of a ramp. Before the first command there is none.
+    The torques, N m or N, are those at the frames. latencies (N,): time, s, from each frame to the
+    start of the action of its command. Before the first command there is no torque.
     """
     period = 1.0 / timing.frame_rate_hz
     ramp = timing.hold == "linear"
     by_rate = law.ld * law.rate_weight / period
     stiffness = law.lp + by_rate + law.li * period / 2
+    needed = _while_commands_act(torques, latencies, timing)
     commands = np.zeros_like(torques)
     integral = np.zeros(torques.shape[1])
     before = np.zeros(torques.shape[1])
-    for k, torque in enumerate(torques):
+    for k, torque in enumerate(needed):
         held = by_rate * before - law.li * (integral + ramp * period * before / 2)
         commands[k] = (torque + held) / stiffness
         integral = integral + period * (
@@ -40,10 +43,10 @@ def equivalent_commands(torques: Array, law: JointLaw, timing: FrameTiming) -> A
     return commands
 
 
-def while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
-    """Return values (N, n) of the frames at the times for which `equivalent_commands` needs them.
+def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
+    """Return values (N, n) of the frames for the time in which the command of each frame acts.
 
-    latencies (N,): time, s, from each frame to the start of the action of its command.
+    It is their mean for a held command, and the value at the end of a ramp.
     """
     period = 1.0 / timing.frame_rate_hz
     times = np.arange(len(values)) * period

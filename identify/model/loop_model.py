@@ -30,7 +30,7 @@ from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
-from identify.model.joint_torques import equivalent_commands, while_commands_act
+from identify.model.joint_torques import equivalent_commands
 from identify.record.checks import long_gap_warnings
 from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
 from identify.runtime import in_threads
@@ -261,16 +261,12 @@ class LoopModel:
         return self.settings.drives.joint_law(self.robot.layout.split(parameters)[3])
 
     def _commands(self, parameters: Array) -> Array:
-        """Return the commands (N, n) that drive the model, which are the logged ones at first.
-
-        They are changed by what the drives need for `torques`.
-        """
+        """Return the logged commands (N, n), changed by what the drives need for `torques`."""
         if self.torques is None:
             return self.logged
-        timing = self.settings.timing
         late = self.stated_latencies if self.latencies is None else self.latencies
-        needed = while_commands_act(self.torques, late, timing)
-        return self.logged - equivalent_commands(needed, self.drive_law(parameters), timing)
+        law = self.drive_law(parameters)
+        return self.logged - equivalent_commands(self.torques, late, law, self.settings.timing)
 
     def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
         """Return the robot that moves in a run, and its parameters (p,) with the known load."""
