@@ -25,19 +25,12 @@ contains the truth only if the interval of the guess does, and further records d
 The common factor can also rest on the prior. If poses show the platform's mass only in a sum with
 other heavy bodies, weighing the platform does not fix the factor. The gains reveal this, because
 poses determine them up to the common factor.
-
-Conditioning describes how differently well a record determines the parameters. The information is
-in units of the prior: an eigenvalue of one is a direction that the record determines as well as the
-initial guess does. The information with the prior covers all parameters. The information of the
-poses alone covers only the base parameters and the gains, because single parameters have none. The
-direction of the common factor is excluded, because poses never determine it (`prior`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 
 from dynamics import Robot
 from dynamics.parameters import ParameterLayout
@@ -50,6 +43,7 @@ from identify.estimation.base_parameters import (
 )
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.bounds import bounded_estimate, combined_std
+from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
@@ -220,82 +214,6 @@ def scale_warnings(
         "use identification.scale_anchor = joint_gain, or state further weighed masses in "
         "identification.prior",
     )
-
-
-POOR = 1e13
-"""Condition number of the poses' information above which double precision is not enough.
-
-With a resolution of 1.1e-16, the variance of the least known direction then has fewer than three
-correct digits.
-"""
-
-
-@dataclass(frozen=True)
-class Conditioning:
-    """Condition numbers of the scaled information, largest over smallest eigenvalue.
-
-    Attributes
-    ----------
-    with_guess : float
-        Condition number with the initial guess.
-    poses_alone : float
-        Condition number of the poses alone, infinite if rounding hides the smallest eigenvalue.
-    directions, unshown : int
-        Number of directions of base parameters and gains, and number of directions that the guess
-        determines better than the poses.
-    """
-
-    with_guess: float
-    poses_alone: float
-    directions: int
-    unshown: int
-
-    @property
-    def poor(self) -> bool:
-        """True if rounding affects the information about the least known direction."""
-        return self.poses_alone > POOR
-
-    def warnings(self) -> tuple[str, ...]:
-        """Return a warning if the record is poorly conditioned."""
-        if not self.poor:
-            return ()
-        number = (
-            f"{self.poses_alone:.1e}, more than {POOR:.0e}"
-            if np.isfinite(self.poses_alone)
-            else "beyond rounding"
-        )
-        return (
-            f"the record is poorly conditioned: of {self.directions} independent combinations of "
-            f"parameters and gains, {self.unshown} are known from the initial guess rather than "
-            f"from the poses (the condition number of the poses' information is {number}); move "
-            "the robot faster, farther or longer",
-        )
-
-
-def conditioning(
-    information: Array, known: Array, base: BaseParameters, guess: StartingGuess, estimate: Array
-) -> Conditioning:
-    """Return the conditioning of an estimate (p,).
-
-    information (p, p): information of the poses. known (p, p): information of the prior.
-    """
-    everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
-    count = base.combinations.shape[1]
-    # Gains that the law of the drives does not read have no information.
-    gains = count + np.flatnonzero(np.diag(information)[count:])
-    seen = np.concatenate([base.pivots, gains])
-    group_std = np.sqrt(base.combinations**2 @ guess.std[:count] ** 2)
-    size = np.concatenate([group_std, guess.std[gains]])
-    values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # A base parameter acts like its pivot, so it has the information of the pivot.
-    scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
-    # The direction of the common factor is the direction of the values. It is removed.
-    free = null_space((values / size)[None])
-    shown = np.linalg.eigvalsh(free.T @ scaled @ free)
-    smallest = float(shown[0])
-    alone = float(shown[-1]) / smallest if smallest > 0 else np.inf
-    with_guess = float(everything[-1] / everything[0])
-    return Conditioning(with_guess, alone, len(shown), int(np.sum(shown < 1)))
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,11 @@ from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.common_error_estimates import CommonErrorEstimates
+from identify.estimation.conditioning import Conditioning
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
-from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
+from identify.estimation.identifiability import RESTS_ON_PRIOR, GroupEstimates
 from identify.estimation.prior import ScaleAnchor, gains_among
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result

@@ -16,8 +16,8 @@ from dynamics.closed_loop.drives import joint_law
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import structure
+from identify.estimation.conditioning import POOR
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
-from identify.estimation.identifiability import POOR
 from identify.estimation.identification import identify
 from identify.estimation.prior import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance

@@ -18,12 +18,11 @@ from identify.estimation.base_parameters import (
     rank_by_threshold,
     structural_regressor,
 )
+from identify.estimation.conditioning import POOR, conditioning
 from identify.estimation.covariance import Uncertainty, correlation_matrix, strongest_pairs
 from identify.estimation.identifiability import (
-    POOR,
     RESTS_ON_PRIOR,
     Identifiability,
-    conditioning,
     group_estimates,
     group_rows,
     identifiability,
