@@ -14,8 +14,17 @@ from identify.commands.camera_calibration import calibrate
 from identify.commands.check import check
 from identify.commands.comparisons import estimators, variation
 from identify.commands.diagnosis import diagnose
+from identify.commands.gauntlet import gauntlet
 from identify.commands.geometry_run import geometry
-from identify.commands.help import BEYOND_LIMIT, NOT_DONE, Command, Commands, Judging, StudyCommand
+from identify.commands.help import (
+    BEYOND_LIMIT,
+    NOT_DONE,
+    Command,
+    Commands,
+    Judging,
+    RowsCommand,
+    StudyCommand,
+)
 from identify.commands.importing import imports
 from identify.commands.new import new
 from identify.commands.robot_pages import base_parameters, export, verify_model, workspace
@@ -159,5 +168,6 @@ app.add_typer(imports, name="import", rich_help_panel=ROBOTS)
 _add(SENSORS, acceptance, cls=Judging)
 _add(SENSORS, detectors, calibrate)
 _add(STUDIES, stoppable(study), cls=StudyCommand)
+_add(STUDIES, stoppable(gauntlet), cls=RowsCommand)
 app.add_typer(new, name="new", rich_help_panel=SETTING_UP)
 _add(SETTING_UP, warm_up)

@@ -45,6 +45,12 @@ class Judging(Command):
     statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, BEYOND_LIMIT, STOPPED)
 
 
+class RowsCommand(Command):
+    """Command whose rows can fail."""
+
+    statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, ROWS_FAILED, STOPPED)
+
+
 class StudyCommand(Command):
     """Command of studies. Rows can fail, and the expected laws are limits."""
 

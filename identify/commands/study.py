@@ -197,7 +197,7 @@ def study(
         progress = terminal_progress(quiet, rate="rows/s")
         # Figures are drawn at the end only, because drawing takes seconds.
         so_far = partial(_summary, chosen, folder, figures=False)
-        workers_there = _workers(scheduler, count, insecure)
+        workers_there = workers_of(scheduler, count, insecure)
         outcome = run_study(chosen, folder, progress, workers_there, so_far, shared)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
@@ -207,7 +207,11 @@ def study(
     _judge(outcome, summary["theory"])
 
 
-def _workers(scheduler: str | None, workers: int, insecure: bool) -> "Workers":
+def workers_of(scheduler: str | None, workers: int, insecure: bool) -> "Workers":
+    """Return the workers of a running cluster, of this machine, or this process if there are none.
+
+    Raises StudyError if Dask is missing.
+    """
     if scheduler is not None:
         try:
             from identify.studies.dask_cluster import running_cluster

@@ -48,6 +48,8 @@ class Finding:
     ----------
     name : str
         Name in plain words.
+    group : str
+        Name of the causes that this one is of a kind with.
     sizes : tuple of Size
         Size of each cause, fitted beside the parameters and all other findings.
     share : float
@@ -63,6 +65,7 @@ class Finding:
     """
 
     name: str
+    group: str
     sizes: tuple[Size, ...]
     share: float
     statistic: float
@@ -87,11 +90,13 @@ class Finding:
 class CandidateRow:
     """Candidate as it was ranked before any cause was fitted.
 
-    share: of the misfit that it alone explains. value and std: size of a single cause, to first
-    order, with its standard deviation by noise, or None for a group, and where nothing shows it.
+    group: name of the causes that it is of a kind with. share: of the misfit that it alone
+    explains. value and std: size of a single cause, to first order, with its standard deviation by
+    noise, or None for a group, and where nothing shows it.
     """
 
     name: str
+    group: str
     unit: str
     share: float
     statistic: float
@@ -232,6 +237,7 @@ def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | N
     share = excess / whole if excess > 0 else 1.0
     return Finding(
         name="noise of the sensor",
+        group="noise of the sensor",
         sizes=tuple(
             Size(name, "1", ratio, ratio / np.sqrt(6 * count))
             for name, ratio in zip(names, ratios, strict=True)
@@ -271,6 +277,7 @@ def _finding(
     name = own[0].name if len(own) == 1 else one.ranked.candidate.name
     return Finding(
         name=name,
+        group=causes[one.places[0]].group,
         # one that is there or not has no size to tell
         sizes=tuple(
             size for place, size in zip(one.places, own, strict=True) if causes[place].step
@@ -292,6 +299,7 @@ def _row(one: Ranked, causes: Sequence[Cause], whole: float) -> CandidateRow:
     alone = len(candidate.places) == 1 and one.score.freedoms == 1 and causes[first].step > 0
     return CandidateRow(
         name=candidate.name,
+        group=causes[first].group,
         unit=causes[first].unit,
         share=one.score.statistic / whole if whole > 0 else 0.0,
         statistic=one.score.statistic,

@@ -15,6 +15,7 @@ from identify.errors import StudyError
 from identify.own_parts import is_plugin_name, own_function
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.estimators import ESTIMATION
+from identify.studies.rows.gauntlet.row import GAUNTLET
 from identify.studies.rows.identified import IDENTIFICATION
 from identify.studies.rows.kind import Kind
 from identify.studies.rows.path_pose import PATH_POSE
@@ -23,7 +24,15 @@ from identify.studies.rows.tracking import TRACKING
 
 KINDS: dict[str, Kind] = {
     kind.name: kind
-    for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP, TRACKING)
+    for kind in (
+        STATIC_POSE,
+        PATH_POSE,
+        IDENTIFICATION,
+        ESTIMATION,
+        CLOSED_LOOP,
+        TRACKING,
+        GAUNTLET,
+    )
 }
 
 

@@ -87,4 +87,6 @@ def quantities(
             std = found.std[k]
             low, high = intervals[k]
             inside = bool(low <= true[k] <= high)
-            yield names[k], error / std, std / abs(true[k]), bool(found.identifiable[k]), inside
+            # a product of inertia can be zero
+            relative = std / abs(true[k]) if true[k] else np.inf
+            yield names[k], error / std, relative, bool(found.identifiable[k]), inside

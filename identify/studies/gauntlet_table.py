@@ -1,0 +1,288 @@
+"""Table and summary of a gauntlet: gauntlet.csv, gauntlet.json, gauntlet.md and gauntlet.html."""
+
+import html
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from identify.files.run_folder import save_files
+from identify.files.versions import versions
+from identify.studies.rows.gauntlet.catalogue import TROUBLES
+from identify.studies.rows.gauntlet.verdict import GROUPS
+from identify.studies.study_file import Study
+
+STEM = "gauntlet"
+"""Name of the files, before their suffix."""
+
+DOUBLED = 2.0
+"""Misfit from which on a trouble counts in the figures that are compared with goals."""
+
+LEVEL = 0.95
+"""Probability of the intervals of shares."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """Share of cases.
+
+    low, high: its interval, by the binomial distribution (Clopper and Pearson). goal: text.
+    """
+
+    what: str
+    right: int
+    cases: int
+    share: float
+    low: float
+    high: float
+    goal: str
+
+
+def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return one row for each case of a study's table of kind `gauntlet`, with names for numbers.
+
+    A row that could not be computed has the verdict "failed".
+    """
+    own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
+    kinds = [_name(TROUBLES, own[f"trouble_{place}"]) for place in (1, 2)]
+    numbers = {name: own[name] for name in _NEEDED if not name.startswith(("trouble_", "first_"))}
+    sort = np.select(
+        [own["outside"] == 1, own["troubles"] == 0, own["troubles"] == 1, own["troubles"] == 2],
+        ["outside", "none", "one", "two"],
+        "not computed",
+    )
+    verdict = np.select(
+        [own["right_intervals"] == 1, own["right_cause"] == 1],
+        ["right intervals", "right cause"],
+        "failed",
+    )
+    columns = {
+        "case": own["row"],
+        "wrong": sort,
+        "trouble_1": kinds[0],
+        "trouble_2": kinds[1],
+        "first_finding": _name(GROUPS, own["first_group"]),
+        "verdict": verdict,
+        **numbers,
+        "time_ratio": 1.0 + own["diagnosis_seconds"] / own["identification_seconds"],
+        "error": own["error"],
+    }
+    return pd.DataFrame(columns)
+
+
+_NEEDED = (
+    "trouble_1",
+    "trouble_2",
+    "first_group",
+    "troubles",
+    "outside",
+    *(f"{name}_{place}" for place in (1, 2) for name in ("size", "named", "together")),
+    "size_error_1",
+    "size_error_2",
+    "stopped",
+    "misfit",
+    "findings",
+    "none_of_these",
+    "explained_percent",
+    "right_cause",
+    "right_intervals",
+    "intervals",
+    "covered_percent",
+    "before_covered_percent",
+    "remedied_explained",
+    "identification_seconds",
+    "diagnosis_seconds",
+)
+
+
+def _name(names: tuple[str, ...], places: pd.Series) -> list[str]:
+    return ["" if not place >= 0 else names[int(place)] for place in places]
+
+
+def shares(cases: pd.DataFrame) -> list[Share]:
+    """Return the shares of right answers, each over the cases that it is about."""
+    shown = cases["misfit"] >= DOUBLED
+    # a case that stopped has no misfit, and counts
+    shown |= cases["stopped"] == 1
+    one, two = (cases[(cases["wrong"] == sort) & shown] for sort in ("one", "two"))
+    known = pd.concat([one, two])
+    errors = pd.concat([known["size_error_1"], known["size_error_2"]]).dropna()
+    within = errors.abs() <= 3.0
+    right = {
+        "one cause: it, or causes named together with it, first": (one["right_cause"], "≥ 95 %"),
+        "two causes: both among the first three": (two["right_cause"], "≥ 85 %"),
+        "nothing wrong: nobody accused": (_right(cases, "none"), "≥ 95 %"),
+        "outside the catalogue: none of these": (_right(cases, "outside"), "≥ 90 %"),
+        "size of a fitted cause within three deviations": (within, "≥ 95 %"),
+    }
+    return [_share(what, values, goal) for what, (values, goal) in right.items() if len(values)]
+
+
+def _right(cases: pd.DataFrame, sort: str) -> pd.Series:
+    return cases[cases["wrong"] == sort]["right_cause"]
+
+
+def _share(what: str, values: pd.Series, goal: str) -> Share:
+    right = int(values.sum())
+    band = binomtest(right, len(values)).proportion_ci(LEVEL)
+    share = right / len(values)
+    return Share(what, right, len(values), share, float(band.low), float(band.high), goal)
+
+
+def coverage(cases: pd.DataFrame) -> dict[str, float]:
+    """Return the share of intervals that hold where the cause was named, and its deviation.
+
+    The deviation comes from the spread from case to case, since intervals of a case depend on each
+    other. Empty if no cause was named.
+    """
+    named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
+    percent = named["covered_percent"].dropna()
+    if not len(percent):
+        return {}
+    std = float(percent.std(ddof=1) / np.sqrt(len(percent))) if len(percent) > 1 else float("nan")
+    found = {"cases": len(percent), "covered_percent": float(percent.mean())}
+    return found | ({"std_percent": std} if np.isfinite(std) else {})
+
+
+def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
+    """Yield each kind of trouble with its cases, how many are right, median misfit and coverage."""
+    single = cases[cases["wrong"].isin(["one", "outside"])]
+    for name in TROUBLES:
+        own = single[single["trouble_1"] == name]
+        if len(own):
+            yield (
+                name,
+                len(own),
+                int(own["right_cause"].sum()),
+                float(own["misfit"].median()),
+                float(own["covered_percent"].mean()),
+            )
+
+
+def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
+    """Write the files of a gauntlet into its folder, and return the content of gauntlet.json.
+
+    Raises WriteError.
+    """
+    cases = cases_of(frame)
+    ratio = cases["time_ratio"].median()
+    entry = {
+        "scenario": study.scenario,
+        "seed": study.seed,
+        "versions": versions(),
+        "cases": len(cases),
+        "verdicts": {str(key): int(n) for key, n in cases["verdict"].value_counts().items()},
+        "shares": [asdict(one) for one in shares(cases)],
+        "intervals_after_remedy": coverage(cases),
+        "time_ratio_median": None if np.isnan(ratio) else float(ratio),
+        "misses": [_miss(row) for _, row in cases[cases["verdict"] == "failed"].iterrows()],
+    }
+    lines = _markdown(entry, cases)
+    save_files(
+        folder,
+        {
+            f"{STEM}.csv": cases.to_csv(index=False, float_format="%.6g"),
+            f"{STEM}.json": entry,
+            f"{STEM}.md": "\n".join(lines) + "\n",
+            f"{STEM}.html": _html(entry, cases),
+        },
+    )
+    return entry
+
+
+def _miss(row: pd.Series) -> dict[str, Any]:
+    named = [row[f"trouble_{place}"] for place in (1, 2) if row[f"trouble_{place}"]]
+    said = row["first_finding"] or "nothing"
+    if row["none_of_these"] == 1:
+        said = f"none of these, first {said}"
+    if row["stopped"] == 1 or row["error"]:
+        said = row["error"] or "stopped with an error"
+    misfit = row["misfit"]
+    return {
+        "case": int(row["case"]),
+        "wrong": " and ".join(named) or "nothing",
+        "said": said,
+        "misfit": None if np.isnan(misfit) else float(misfit),
+    }
+
+
+def _tables(
+    entry: dict[str, Any], cases: pd.DataFrame
+) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Yield the tables of a gauntlet, each with its title, header and rows of text."""
+    rows = [
+        [
+            one["what"],
+            f"{one['right']} of {one['cases']}",
+            f"{100 * one['share']:.3g} %",
+            f"{100 * one['low']:.3g} to {100 * one['high']:.3g} %",
+            one["goal"],
+        ]
+        for one in entry["shares"]
+    ]
+    if covered := entry["intervals_after_remedy"]:
+        std = covered.get("std_percent")
+        band = "" if std is None else f"± {1.96 * std:.2g} %"
+        share = f"{covered['covered_percent']:.3g} %"
+        what = "95 % intervals that hold after the remedy"
+        rows.append([what, f"{covered['cases']} cases", share, band, "93 to 97 %"])
+    if (ratio := entry["time_ratio_median"]) is not None:
+        what = "time with diagnosis over time without, median"
+        rows.append([what, f"{len(cases)} cases", f"{ratio:.3g}", "", "≤ 2"])
+    header = ["what", "right", "share", "95 % interval", "goal"]
+    yield f"{len(cases)} cases", header, rows
+    yield (
+        "One trouble a case, by kind",
+        ["trouble", "cases", "right", "misfit, median", "intervals that hold"],
+        [
+            [name, str(count), str(right), f"{misfit:.3g}", f"{covered:.3g} %"]
+            for name, count, right, misfit, covered in kinds(cases)
+        ],
+    )
+    yield (
+        "Misses",
+        ["case", "what was wrong", "what the diagnosis said first", "misfit"],
+        [
+            [
+                str(one["case"]),
+                one["wrong"],
+                one["said"],
+                "" if one["misfit"] is None else f"{one['misfit']:.3g}",
+            ]
+            for one in entry["misses"]
+        ],
+    )
+
+
+NOTE = (
+    f"Shares of one and two causes are over cases whose misfit is at least {DOUBLED:g} times that "
+    "of noise."
+)
+
+
+def _markdown(entry: dict[str, Any], cases: pd.DataFrame) -> list[str]:
+    lines = [f"# Gauntlet of `{entry['scenario']}`, seed {entry['seed']}", "", NOTE]
+    for title, header, rows in _tables(entry, cases):
+        lines += ["", f"## {title}", "", f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+        lines += [f"| {' | '.join(row)} |" for row in rows]
+    return lines
+
+
+def _html(entry: dict[str, Any], cases: pd.DataFrame) -> str:
+    parts = []
+    for title, header, rows in _tables(entry, cases):
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in header)
+        body = "".join(
+            f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows
+        )
+        parts.append(f"<h2>{html.escape(title)}</h2><table><tr>{head}</tr>{body}</table>")
+    title = html.escape(f"Gauntlet of {entry['scenario']}, seed {entry['seed']}")
+    style = "body{font-family:sans-serif}td,th{padding:2px 8px;text-align:left}"
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{style}</style><h1>{title}</h1><p>{html.escape(NOTE)}</p>{''.join(parts)}</html>\n"
+    )

@@ -1,0 +1,249 @@
+"""One case of the gauntlet: record with a trouble, identification, diagnosis, remedy, and again."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import xarray as xr
+
+from dynamics import DynamicsError
+from identify.arrays import Array
+from identify.diagnosis.diagnose import diagnose
+from identify.diagnosis.diagnosis import Diagnosis, Finding
+from identify.errors import IdentifyError
+from identify.estimation.identification import identify
+from identify.estimation.result import IdentificationResult
+from identify.experiment.plant import Plant
+from identify.experiment.run import excitation_run
+from identify.random_streams import child, integer_seed
+from identify.scenario import Scenario, scenario_from_toml
+from identify.setup import Setup
+from identify.studies.rows.coverage import quantities
+from identify.studies.rows.gauntlet.catalogue import Wrong, drawn_troubles
+from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble
+from identify.studies.rows.identified import designed_trajectories, row_setup
+from identify.studies.rows.kind import robot_named
+from identify.studies.rows.row_sensor import DrawnSensor
+
+TROUBLE = 0
+RECORD = 1
+AGAIN = 2
+"""Streams of a case: its trouble, its record, and the record after something was mended."""
+
+DRAWS = 10
+"""Largest number of draws of a case until the robot can run."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Record of a case, the plant that made it, and what the estimator knows of its scenario."""
+
+    record: xr.Dataset
+    plant: Plant
+    scenario: Scenario
+
+
+@dataclass(frozen=True)
+class Case:
+    """Finished case.
+
+    Attributes
+    ----------
+    troubles : tuple of Trouble
+        What was wrong.
+    diagnosis : Diagnosis
+        What the diagnosis of the plain model said.
+    named : tuple of int
+        For each trouble, the place of the finding that names it, from 1 on, or 0.
+    together : tuple of bool
+        For each trouble, True if the finding names it as one that cannot be told from another.
+    size_errors : tuple of float
+        Error of each trouble's size in standard deviations, NaN where it was not fitted.
+    before, after : tuple of bool
+        Whether each interval contains the truth, with the plain model and after the remedy.
+    explained : bool
+        True if noise explains what the remedied model leaves of its record.
+    seconds : tuple of float
+        Time of the first identification and of the diagnosis, s.
+    """
+
+    troubles: tuple[Trouble, ...]
+    diagnosis: Diagnosis
+    named: tuple[int, ...]
+    together: tuple[bool, ...]
+    size_errors: tuple[float, ...]
+    before: tuple[bool, ...]
+    after: tuple[bool, ...]
+    explained: bool
+    seconds: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is wrong in a case, and its record.
+
+    again: seed of the record after something was mended. trajectory: seed of the exciting
+    trajectory.
+    """
+
+    scenario: Scenario
+    troubles: tuple[Trouble, ...]
+    made: Recorded
+    again: int
+    trajectory: int
+
+
+def drawn(scenario: Scenario, seed: np.random.SeedSequence, wrong: Wrong, trajectory: int) -> Drawn:
+    """Draw a case from its seed, and make its record.
+
+    Troubles with which the robot cannot follow its trajectory are drawn again, because a laboratory
+    would have no record of them. wrong: sort of case. trajectory: seed of the trajectory.
+
+    Raises the exceptions of the experiment if no draw gives a record.
+    """
+    rng = np.random.default_rng(child(seed, TROUBLE))
+    record, again = (integer_seed(child(seed, stream)) for stream in (RECORD, AGAIN))
+    lab = laboratory(scenario, trajectory)
+    for left in reversed(range(DRAWS)):
+        troubles = drawn_troubles(lab, rng, wrong)
+        try:
+            made = recorded(scenario, troubles, record, trajectory)
+        except DynamicsError:
+            if not left:
+                raise
+        else:
+            break
+    return Drawn(scenario, troubles, made, again, trajectory)
+
+
+def run_case(case: Drawn) -> Case:
+    """Identify from the record of a case, diagnose, remedy what was found, and identify again.
+
+    Raises EstimationError, and the exceptions of the model, unless they come after the remedy.
+    Then no interval holds.
+    """
+    scenario = case.scenario
+    made = case.made
+    plain = Setup(scenario, loaded=robot_named(scenario.robot)).robot
+    began = time.perf_counter()
+    result = identify(made.record, plain, scenario)
+    identified = time.perf_counter()
+    found = diagnose(made.record, result, plain, scenario)
+    seconds = (identified - began, time.perf_counter() - identified)
+    places = tuple(place_of(one, found) for one in case.troubles)
+    remedies = [
+        trouble.remedy(found.findings[place - 1]) if place else Remedied()
+        for trouble, (place, _) in zip(case.troubles, places, strict=True)
+    ]
+    before = held(result, made.plant)
+    after, explained = before, result.explained
+    if any(place for place, _ in places):
+        after, explained = after_remedies(case, remedies)
+    return Case(
+        troubles=case.troubles,
+        diagnosis=found,
+        named=tuple(place for place, _ in places),
+        together=tuple(alike for _, alike in places),
+        size_errors=tuple(size_error(one, found) for one in case.troubles),
+        before=before,
+        after=after,
+        explained=explained,
+        seconds=seconds,
+    )
+
+
+@lru_cache(maxsize=4)
+def _laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
+    """Return a laboratory. Its robot runs the exciting trajectory once, for its largest torque."""
+    scenario = scenario_from_toml(scenario_toml)
+    setup = row_setup(scenario, 0)
+    motion = designed_trajectories(setup, trajectory).excitation
+    times = scenario.timing.frame_times(scenario.excitation.duration_s)
+    run = setup.plant.run(motion.reference(times))
+    plant = setup.plant
+    dynamic = plant.parameters[plant.robot.layout.dynamic]
+    holding = max(float(np.abs(plant.robot.static_torque(one, dynamic)).max()) for one in run.pose)
+    peak = float(np.abs(run.torque).max())
+    return Laboratory(setup.robot, plant.parameters, scenario, peak, holding)
+
+
+def laboratory(scenario: Scenario, trajectory: int) -> Laboratory:
+    """Return the laboratory of a scenario without trouble. It is made once per process."""
+    return _laboratory(scenario.to_toml(), trajectory)
+
+
+def recorded(
+    scenario: Scenario, troubles: Sequence[Trouble], number: int, trajectory: int
+) -> Recorded:
+    """Make the record of a scenario with troubles, with a seed and the seed of its trajectory.
+
+    The record names the scenario without troubles, because an experimenter knows no other.
+    """
+    settings = {key: value for one in troubles for key, value in one.settings.items()}
+    setup = row_setup(scenario.with_overrides(settings), number)
+    plant = setup.plant
+    for one in troubles:
+        plant = one.plant(plant)
+    motion = designed_trajectories(row_setup(scenario, number), trajectory).excitation
+    covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
+    sensor = DrawnSensor(covariance, plant.runs.timing.dropout)
+    record = excitation_run(plant, sensor, motion, scenario.excitation, number).record
+    for one in troubles:
+        record = one.record(record)
+    return Recorded(record.assign_attrs(scenario=scenario.to_toml()), plant, scenario)
+
+
+def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[bool, ...], bool]:
+    """Return which intervals hold after the remedies of a case's troubles, as `Case` does, and
+    whether noise explains what is left.
+    """
+    left = [one for one, by in zip(case.troubles, remedies, strict=True) if not by.mended]
+    settings = {key: value for one in remedies for key, value in one.settings.items()}
+    made = case.made
+    try:
+        if len(left) < len(case.troubles):
+            made = recorded(case.scenario, left, case.again, case.trajectory)
+        known = case.scenario.with_overrides(settings)
+        record = made.record.assign_attrs(scenario=known.to_toml())
+        for one in remedies:
+            record = one.record(record)
+        robot = Setup(known, loaded=robot_named(known.robot)).robot
+        result = identify(record, robot, known)
+    except (IdentifyError, DynamicsError):
+        return (), False
+    return held(result, made.plant), result.explained
+
+
+def held(result: IdentificationResult, plant: Plant) -> tuple[bool, ...]:
+    """Return for each identified quantity whether its 95 % interval contains the truth."""
+    truth: Array = plant.parameters_of(result.layout)
+    return tuple(inside for *_, identified, inside in quantities(result, truth) if identified)
+
+
+def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:
+    """Return the place of the finding that names a trouble, and whether together with another.
+
+    The place is counted from 1, and 0 if none names it.
+    """
+    groups = {one.name: one.group for one in found.candidates}
+    for place, finding in enumerate(found.findings, start=1):
+        if finding.group in trouble.groups:
+            return place, False
+        if any(groups.get(name) in trouble.groups for name in finding.alike):
+            return place, True
+    return 0, False
+
+
+def size_error(trouble: Trouble, found: Diagnosis) -> float:
+    """Return the error of a fitted size in standard deviations, NaN if it was not fitted."""
+    for size in (size for finding in found.findings for size in finding.sizes):
+        if trouble.cause and size.name == trouble.cause and size.std > 0:
+            return (size.value - trouble.size) / size.std
+    return float("nan")
+
+
+def first_group(findings: Sequence[Finding]) -> str:
+    """Return the group of the first finding, or an empty text if there is none."""
+    return findings[0].group if findings else ""

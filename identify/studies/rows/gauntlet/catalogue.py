@@ -1,0 +1,69 @@
+"""Kinds of trouble that the gauntlet draws, and how it draws what is wrong in a case."""
+
+from typing import Literal
+
+import numpy as np
+
+from identify.studies.rows.gauntlet import measured, mechanical
+from identify.studies.rows.gauntlet.trouble import Draw, Laboratory, Trouble
+
+INSIDE: dict[str, Draw] = {
+    "zero of a joint": mechanical.zero,
+    "geometry": mechanical.number,
+    "command scale": measured.scale,
+    "latency": measured.latency,
+    "clock drift": measured.drift,
+    "unequal gains": mechanical.unequal_gains,
+    "cascade drives": mechanical.cascade,
+    "torque limit": mechanical.torque_limit,
+    "static friction": mechanical.static_friction,
+    "smooth friction": mechanical.smooth_friction,
+    "elastic joints": mechanical.springs,
+    "centre of mass": mechanical.centre_of_mass,
+    "products of inertia": mechanical.products_of_inertia,
+    "gross errors": measured.gross_errors,
+    "stated noise": measured.stated_noise,
+}
+"""Kinds of trouble that the diagnosis has causes for."""
+
+OUTSIDE: dict[str, Draw] = {"backlash": mechanical.backlash}
+"""Kinds of trouble outside the catalogue of the diagnosis."""
+
+TROUBLES: tuple[str, ...] = (*INSIDE, *OUTSIDE)
+"""Names of all kinds of trouble. Rows name a kind by its place here."""
+
+Wrong = Literal["drawn", "none", "one", "two", "outside"]
+
+SHARES: dict[Wrong, float] = {"one": 0.55, "two": 0.2, "none": 0.125, "outside": 0.125}
+"""Probability of each sort of case where it is drawn."""
+
+ALONE = ("stated noise",)
+"""Kinds that are never one of two, because their size shows only where nothing else is wrong."""
+
+
+def drawn_troubles(
+    lab: Laboratory, rng: np.random.Generator, wrong: Wrong = "drawn"
+) -> tuple[Trouble, ...]:
+    """Draw what is wrong in a case: nothing, one trouble, or two of different groups.
+
+    wrong: sort of case, or "drawn".
+    """
+    sort = str(rng.choice(list(SHARES), p=list(SHARES.values()))) if wrong == "drawn" else wrong
+    if sort == "none":
+        return ()
+    if sort == "outside":
+        return (OUTSIDE[str(rng.choice(list(OUTSIDE)))](lab, rng),)
+    if sort == "one":
+        return (INSIDE[str(rng.choice(list(INSIDE)))](lab, rng),)
+    kinds = [name for name in INSIDE if name not in ALONE]
+    while True:
+        first, second = (str(name) for name in rng.choice(kinds, size=2, replace=False))
+        pair = INSIDE[first](lab, rng), INSIDE[second](lab, rng)
+        # a robot has one law of friction, and its platform one inertia
+        if not (set(pair[0].groups) & set(pair[1].groups) or _clash(*pair)):
+            return pair
+
+
+def _clash(one: Trouble, other: Trouble) -> bool:
+    """Tell whether two troubles set the same key of the plant."""
+    return bool(set(one.settings) & set(other.settings))

@@ -1,0 +1,80 @@
+"""Plant whose joints follow their commands with play, which is outside the diagnosis' catalogue.
+
+A joint follows its command as soon as the command has crossed the play. That is the play operator
+with the output y of an input u and a width w: y is as near to its last value as |u - y| <= w / 2
+allows. The log holds the commands before the play. The servo is that of eq. 30, and sees its effect
+in the measured poses.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dynamics.closed_loop import IDEAL, ClosedLoopRun, Reference, Sensor, simulate_controller
+from dynamics.control.law import LawInLoop
+from identify.arrays import Array
+from identify.experiment.plant import Plant
+
+
+@dataclass(frozen=True, eq=False)
+class PlantWithPlay(Plant):
+    """Plant with play of a width, rad or m, between commands and drives."""
+
+    width: float = 0.0
+
+    def run(
+        self,
+        reference: Reference,
+        sensor: Sensor = IDEAL,
+        latencies: Array | None = None,
+        load: Array | None = None,
+        law: LawInLoop | None = None,
+    ) -> ClosedLoopRun:
+        """Follow a reference under the servo, as `Plant.run` does.
+
+        Raises the errors of `dynamics.closed_loop.simulate_controller`.
+        """
+        parameters = self.parameters if load is None else self.parameters + load
+        servo = _ServoWithPlay(self, reference)
+        run = simulate_controller(
+            self.robot,
+            parameters,
+            reference,
+            self.settings,
+            servo.follow,
+            sensor,
+            latencies=latencies,
+        )
+        return replace(run, command=np.array(servo.log))
+
+
+class _ServoWithPlay:
+    """Servo that remembers its commands, and sends them through the play."""
+
+    def __init__(self, plant: PlantWithPlay, reference: Reference) -> None:
+        start = reference.poses[0]
+        self._robot = plant.nominal
+        self._gains = plant.settings.servo
+        self._period = 1.0 / plant.settings.timing.frame_rate_hz
+        self._half = plant.width / 2
+        self._last = start
+        self._sent = self._robot.inverse_kinematics(start)
+        # the integral holds the robot at its first pose
+        jacobian = self._robot.pose_jacobian(start)
+        self._integral = np.linalg.lstsq(jacobian, self._sent / self._gains.ki, rcond=None)[0]
+        self.log: list[Array] = []
+
+    def follow(
+        self, frame: int, time: float, measured: Array, desired: Array, desired_rate: Array
+    ) -> Array:
+        """Return what the play leaves of the servo's command at a frame."""
+        error = desired - measured
+        self._integral = self._integral + self._period * error
+        rate = (measured - self._last) / self._period
+        self._last = measured
+        gains = self._gains
+        demand = gains.kp * error + gains.kd * (desired_rate - rate) + gains.ki * self._integral
+        command = self._robot.pose_jacobian(measured) @ demand
+        self._sent = np.clip(self._sent, command - self._half, command + self._half)
+        self.log.append(command)
+        return self._sent

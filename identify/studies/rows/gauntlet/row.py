@@ -1,0 +1,139 @@
+"""Rows of kind `gauntlet`: something is wrong, and the diagnosis shall find it.
+
+The trouble of a row is drawn from its seed, see `identify.studies.rows.gauntlet.catalogue`. The
+sensor adds noise of the stated covariance at the home pose. Figures of a row are numbers, so kinds
+of trouble are their places in `TROUBLES`, and groups of causes theirs in `GROUPS`.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from dynamics import DynamicsError
+from identify.errors import IdentifyError
+from identify.scenario import Scenario
+from identify.scenario.section import Section
+from identify.studies.rows.gauntlet.case import Case, drawn, first_group, run_case
+from identify.studies.rows.gauntlet.catalogue import TROUBLES, Wrong
+from identify.studies.rows.gauntlet.trouble import Trouble
+from identify.studies.rows.gauntlet.verdict import GROUPS, judge
+from identify.studies.rows.identified import READS, memory
+from identify.studies.rows.kind import Column, KeysRead, Kind, Row
+
+COLUMNS = {
+    "troubles": Column("1", "number of troubles"),
+    "outside": Column("1", "1 if the trouble is outside the catalogue of the diagnosis"),
+    **{
+        f"{name}_{place}": Column(unit, f"{what} of trouble {place}")
+        for place in (1, 2)
+        for name, unit, what in (
+            ("trouble", "1", "kind"),
+            ("size", "SI", "size"),
+            ("named", "1", "place of the finding that names it, 0 if none does,"),
+            ("together", "1", "1 if named as one that cannot be told from another, statement"),
+            ("size_error", "1", "error of the size in its standard deviations"),
+        )
+    },
+    "stopped": Column("1", "1 if experiment or identification stopped with an error"),
+    "misfit": Column(
+        "1", "mean squared residual of the plain model over that by noise alone", main=True
+    ),
+    "findings": Column("1", "number of findings"),
+    "first_group": Column("1", "group of causes of the first finding, -1 if there is none"),
+    "none_of_these": Column("1", "1 if the diagnosis says that no cause explains the misfit"),
+    "explained_percent": Column("%", "share of the misfit that all findings explain"),
+    "right_cause": Column("1", "1 if the diagnosis is right", main=True),
+    "right_intervals": Column("1", "1 if the intervals after the remedy hold, too", main=True),
+    "intervals": Column("1", "quantities that the record identifies after the remedy"),
+    "covered_percent": Column(
+        "%", "share of their 95 % intervals that contain the truth", main=True
+    ),
+    "before_covered_percent": Column("%", "the same share for the plain model"),
+    "remedied_explained": Column("1", "1 if noise explains what the remedied model leaves"),
+    "identification_seconds": Column("s", "time of the identification"),
+    "diagnosis_seconds": Column("s", "time of the diagnosis"),
+}
+
+
+class GauntletOptions(Section):
+    """Options of rows of kind `gauntlet`."""
+
+    wrong: Wrong = Field(
+        "drawn",
+        description="what is wrong: none, one, two, outside (outside the catalogue of the "
+        "diagnosis), or drawn from these",
+    )
+    trajectory_seed: int = Field(0, ge=0, description="seed of the exciting trajectory")
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: GauntletOptions) -> Row:
+    """Compute one row. A case that stops with a known error has failed."""
+    case = drawn(scenario, seed, options.wrong, options.trajectory_seed)
+    row = trouble_figures(case.troubles)
+    try:
+        return row | figures(run_case(case))
+    except (IdentifyError, DynamicsError):
+        return row | {"stopped": 1.0, "right_cause": 0.0, "right_intervals": 0.0}
+
+
+def trouble_figures(troubles: Sequence[Trouble]) -> Row:
+    """Return the figures of what is wrong."""
+    row: Row = {
+        "troubles": len(troubles),
+        "outside": float(any(not one.groups for one in troubles)),
+    }
+    for place, trouble in enumerate(troubles, start=1):
+        row |= {
+            f"trouble_{place}": TROUBLES.index(trouble.kind),
+            f"size_{place}": trouble.size,
+        }
+    return row
+
+
+def figures(case: Case) -> Row:
+    """Return the figures of a finished case. Those that it does not have are missing."""
+    found = case.diagnosis
+    row: dict[str, Any] = {"stopped": 0.0}
+    each = zip(case.named, case.together, case.size_errors, strict=True)
+    for place, (named, together, error) in enumerate(each, start=1):
+        row |= {
+            f"named_{place}": named,
+            f"together_{place}": together,
+            f"size_error_{place}": error,
+        }
+    verdict = judge(case)
+    group = first_group(found.findings)
+    row |= {
+        "misfit": found.misfit.found / found.misfit.expected,
+        "findings": len(found.findings),
+        "first_group": GROUPS.index(group) if group in GROUPS else -1,
+        "none_of_these": found.none_of_these,
+        "explained_percent": 100.0 * found.explained,
+        "right_cause": verdict != "failed",
+        "right_intervals": verdict == "right intervals",
+        "intervals": len(case.after),
+        "covered_percent": 100.0 * float(np.mean(case.after)) if case.after else math.nan,
+        "before_covered_percent": 100.0 * float(np.mean(case.before)) if case.before else math.nan,
+        "remedied_explained": case.explained,
+        "identification_seconds": case.seconds[0],
+        "diagnosis_seconds": case.seconds[1],
+    }
+    return {name: float(value) for name, value in row.items() if math.isfinite(value)}
+
+
+GAUNTLET = Kind(
+    "gauntlet",
+    compute,
+    "a record with something wrong, its diagnosis, and the parameters after the remedy",
+    COLUMNS,
+    GauntletOptions,
+    KeysRead(
+        READS.keys,
+        (*READS.excluding, "scenario.plant.", "scenario.validation.", "scenario.geometry."),
+        tuple(one for one in READS.ineffective if "options.sensor" not in one.where),
+    ),
+    memory=memory,
+)

@@ -1,0 +1,125 @@
+"""Trouble of a laboratory: what is wrong, what shall be found, and what a laboratory does then."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.diagnosis.diagnosis import Finding
+from identify.experiment.plant import Plant
+from identify.scenario import Scenario
+
+
+def unchanged_plant(plant: Plant) -> Plant:
+    """Return the same plant."""
+    return plant
+
+
+def unchanged_record(record: xr.Dataset) -> xr.Dataset:
+    """Return the same record."""
+    return record
+
+
+@dataclass(frozen=True)
+class Remedied:
+    """What a laboratory does about a finding.
+
+    Attributes
+    ----------
+    settings : mapping
+        Settings of the estimator by dotted path.
+    record : callable
+        Correction of the record.
+    mended : bool
+        True if the trouble is taken away, and the experiment repeated without it.
+    """
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    record: Callable[[xr.Dataset], xr.Dataset] = unchanged_record
+    mended: bool = False
+
+
+def mend(finding: Finding) -> Remedied:
+    """Take the trouble away, and repeat the experiment."""
+    return Remedied(mended=True)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What is wrong in a laboratory.
+
+    Attributes
+    ----------
+    kind : str
+        Name of the kind of trouble, see `identify.studies.rows.gauntlet.catalogue.TROUBLES`.
+    size : float
+        Size in the unit of the cause.
+    unit : str
+        Unit of the size.
+    groups : tuple of str
+        Groups of causes of the diagnosis, each of which is a right answer. Empty: the trouble is
+        outside the catalogue of the diagnosis, and "none of these" is right.
+    cause : str
+        Name of the cause of the diagnosis that has this size. Empty if it has no comparable size.
+    settings : mapping
+        Settings of the scenario of the plant by dotted path. The estimator does not see them.
+    plant : callable
+        Change of the plant.
+    record : callable
+        Change of the record.
+    remedy : callable
+        Function (finding) that returns what a laboratory does about the trouble, once it is found.
+    """
+
+    kind: str
+    size: float
+    unit: str
+    groups: tuple[str, ...]
+    cause: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    plant: Callable[[Plant], Plant] = unchanged_plant
+    record: Callable[[xr.Dataset], xr.Dataset] = unchanged_record
+    remedy: Callable[[Finding], Remedied] = mend
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """What a trouble is drawn for.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot as it is known.
+    parameters : ndarray, shape (p,)
+        True parameters without trouble.
+    scenario : Scenario
+        Scenario without trouble.
+    peak : float
+        Largest torque or force of a run without trouble, N m or N.
+    holding : float
+        Largest torque or force that holds the robot at rest at a pose of this run.
+    """
+
+    robot: Robot
+    parameters: Array
+    scenario: Scenario
+    peak: float
+    holding: float
+
+
+Draw = Callable[[Laboratory, np.random.Generator], Trouble]
+"""Function that draws a trouble at a workshop's size."""
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform between those of two bounds."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def sign(rng: np.random.Generator) -> float:
+    """Draw 1 or -1."""
+    return float(rng.choice([-1.0, 1.0]))

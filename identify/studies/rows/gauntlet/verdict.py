@@ -1,0 +1,77 @@
+"""Verdict on a case, and the groups of causes by which the diagnosis answers."""
+
+from typing import Literal
+
+import numpy as np
+
+from identify.diagnosis.geometry_causes import GROUPS as GEOMETRY
+from identify.diagnosis.loop_causes import FRICTION
+from identify.diagnosis.measurement_causes import KINDS
+from identify.studies.rows.gauntlet.case import Case
+
+GROUPS: tuple[str, ...] = (
+    "scale of the commands",
+    "latency of the commands",
+    "drift of the commands' clock",
+    "zeros of the joints",
+    *GEOMETRY.values(),
+    "gains that differ between joints",
+    FRICTION,
+    "elasticity of the joints",
+    "torque limit of the drives",
+    "law of the drives",
+    "steps of the model",
+    *(
+        f"{what} of {body}"
+        for body in ("the platform", "the cranks", "the links")
+        for what in ("centre of mass", "products of inertia")
+    ),
+    "friction of passive joints",
+    "friction that differs with direction",
+    *KINDS.values(),
+    "gross errors",
+    "noise of the sensor",
+)
+"""Names of groups of causes. Rows name a group by its place here."""
+
+HOLD = 0.5
+"""Least share of a case's intervals that hold where they count as right.
+
+The intervals of a case depend on each other. One in twenty right models is off by two deviations in
+the common scale of all parameters, which alone takes a third of the intervals from the truth. With
+a wrong model, nearly none hold, or nothing is identified. The share over all cases is judged apart.
+"""
+
+FIRST = 3
+"""Number of findings among which both of two troubles must be."""
+
+Verdict = Literal["right intervals", "right cause", "failed"]
+
+
+def rightly_named(case: Case) -> bool:
+    """Tell whether the diagnosis is right.
+
+    With one trouble, the first finding names it, alone or together with causes that cannot be told
+    from it. Two are both among the first findings. Nothing is found where nothing is wrong, and
+    "none of these" is the answer to a trouble outside the catalogue.
+    """
+    found = case.diagnosis
+    if any(not one.groups for one in case.troubles):
+        return found.none_of_these
+    if not case.troubles:
+        return not found.findings and not found.none_of_these
+    last = 1 if len(case.troubles) == 1 else FIRST
+    return all(0 < place <= last for place in case.named)
+
+
+def judge(case: Case) -> Verdict:
+    """Return the verdict on a case.
+
+    No remedy is known for a trouble outside the catalogue, so that its intervals are not judged.
+    """
+    if not rightly_named(case):
+        return "failed"
+    outside = any(not one.groups for one in case.troubles)
+    if outside or not case.after or np.mean(case.after) < HOLD:
+        return "right cause"
+    return "right intervals"
