@@ -91,7 +91,7 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
         and getattr(section, other) is not None
     ):
         raise ScenarioError(
-            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is for "
+            f"{type(section).__name__.lower()}.{other} = {getattr(section, other)} is for "
             f"actuators that {'turn' if robot.layout.prismatic else 'slide'}; the actuators of "
             f"{robot.name} {'slide' if robot.layout.prismatic else 'turn'}: set {own}"
         )

@@ -31,6 +31,7 @@ ENCODER_OFFSETS = 16  # offsets of the encoders
 ENCODERS = 17  # readings of the encoders
 STATIC_NOISE = 18  # noise of the measured static poses
 TRUE_GEOMETRY = 19  # true geometry, drawn about a calibrated geometry
+JOINT_ZEROS = 26  # true zeros of the joints, with the seed of the geometry
 EXPOSURES = 25  # true delay of the right camera's exposure
 
 # Children of the same seed. The number of the run is appended.

@@ -25,7 +25,13 @@ from identify.estimation.result import IdentificationResult
 from identify.excitation.constraints import MotionConstraints
 from identify.excitation.criteria import criterion_of
 from identify.excitation.design import Design, design_trajectories
-from identify.experiment.plant import KnownLoop, Plant, RunSettings, with_springs
+from identify.experiment.plant import (
+    KnownLoop,
+    Plant,
+    RunSettings,
+    with_command_errors,
+    with_springs,
+)
 from identify.experiment.run import excitation_run
 from identify.experiment.sensor_in_loop import SensorPlan, teach
 from identify.experiment.true_robot import true_parameters, true_robot, with_true_bodies
@@ -140,7 +146,12 @@ class Setup:
         robot = with_true_bodies(robot, self.in_file, switches)
         return Plant(
             nominal=self.robot,
-            settings=with_springs(settings, self.nominal, switches),
+            settings=with_command_errors(
+                with_springs(settings, self.nominal, switches),
+                self.nominal,
+                switches,
+                zeros=scenario.geometry.exact,
+            ),
             robot=robot,
             parameters=true_parameters(robot, switches),
             switches=switches,

@@ -23,6 +23,11 @@ kv = ld and ki = lx. In every law, a common factor of lp, li and ld is a factor 
 
 A law without an integral balances a load by an error: at rest, its command is the coordinate of the
 joint plus the torque over lp.
+
+A drive can receive another command than the one that was sent, by a wrong scale s, a wrong zero z
+of the joint, and steps q of a digital interface:
+
+    U = s q round(sent / q) + z
 """
 
 from collections.abc import Mapping
@@ -31,7 +36,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from dynamics.checks import check_choice, flag, real
+from dynamics.checks import check_choice, check_type, flag, real
 from dynamics.errors import SimulationError
 from dynamics.parameters import JOINT_PID
 
@@ -143,12 +148,18 @@ class Drives:
         Law by which drives follow joint commands.
     filter_time : float, optional
         Time constant of the filter of the law `pid_filtered`, s.
+    command_scale : float
+        Ratio s of the received to the sent commands.
+    joint_zeros : tuple of float
+        Zero z of each joint, rad or m: what the joint reads too little. The default is no error.
+    command_step : float, optional
+        Step q of the received commands, rad or m. The default is no steps.
 
     Raises
     ------
     SimulationError
-        If a limit or a time constant is not > 0, if the law is unknown, or if a filter is missing
-        or belongs to another law.
+        If a limit, a time constant, a scale or a step is not > 0, if a zero is not finite, if the
+        law is unknown, or if a filter is missing or belongs to another law.
 
     Examples
     --------
@@ -160,6 +171,9 @@ class Drives:
     torque_limit: float | None = None
     law: DriveName = "pid"
     filter_time: float | None = None
+    command_scale: float = 1.0
+    joint_zeros: tuple[float, ...] = ()
+    command_step: float | None = None
 
     def __post_init__(self) -> None:
         flag("torques", self.torques, SimulationError)
@@ -179,6 +193,39 @@ class Drives:
                 f"filter_time = {self.filter_time!r} belongs to the law `{FILTERED}`, not to "
                 f"`{self.law}`"
             )
+        real("scale of the commands", self.command_scale, SimulationError, above=0)
+        check_type("joint_zeros", self.joint_zeros, tuple, SimulationError)
+        for joint, zero in enumerate(self.joint_zeros, 1):
+            real(f"zero of joint {joint}", zero, SimulationError, unit=" rad or m")
+        if self.command_step is not None:
+            real("step of the commands", self.command_step, SimulationError, above=0)
+
+    def zeros(self, joints: int) -> np.ndarray:
+        """Zero of each of a number of joints (n,), rad or m.
+
+        Raises SimulationError if there are zeros of another number of joints.
+        """
+        if self.joint_zeros and len(self.joint_zeros) != joints:
+            raise SimulationError(
+                f"there are zeros of {len(self.joint_zeros)} joints, the robot has {joints}"
+            )
+        return np.array(self.joint_zeros) if self.joint_zeros else np.zeros(joints)
+
+    def interface(self, joints: int) -> dict[str, float | np.ndarray]:
+        """Scale, step (0: none) and zeros (n,) of the received commands, in the form of kernels.
+
+        Torques are commanded without an interface in between.
+        """
+        received = PID if self.torques else self
+        return {
+            "command_scale": received.command_scale,
+            "command_step": received.command_step or 0.0,
+            "joint_zero": received.zeros(joints),
+        }
+
+    def sent(self, received: np.ndarray) -> np.ndarray:
+        """Commands (n,) that were sent, from those that the drives received, without steps."""
+        return (received - self.zeros(len(received))) / self.command_scale
 
     def joint_law(self, gains: np.ndarray) -> JointLaw:
         """Law with the gains lp, li, ld of each joint (n, 3), or of all joints (3,)."""

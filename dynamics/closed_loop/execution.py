@@ -294,7 +294,7 @@ def _fill(
     rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
     law = settings.drives.joint_law(gains)
     task.gain_step = gains.shape[1] if problem.robot.layout.own_gains else 0
-    for name, value in law._asdict().items():
+    for name, value in (law._asdict() | settings.drives.interface(sizes.joints)).items():
         task[name] = value
     task.kp = settings.servo.kp
     task.kd = settings.servo.kd

@@ -184,6 +184,14 @@ def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
 
 
 @kernel
+def received(task: Record, command: float, joint: int) -> float:
+    """Command that a drive receives for the one that was sent. See `drives`."""
+    if task.command_step > 0:
+        command = task.command_step * np.rint(command / task.command_step)
+    return task.command_scale * command + task.joint_zero[joint]
+
+
+@kernel
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
@@ -194,23 +202,26 @@ def apply_command(
     """
     now.ramping = ramp < 1
     for i in range(len(now.command)):
-        value = command_of(start, commands, number, i)
-        before = command_of(start, commands, number - 1, i)
+        value = received(task, command_of(start, commands, number, i), i)
+        before = received(task, command_of(start, commands, number - 1, i), i)
         change = value - before
         now.command_rate[i] = change / task.period
         now.command[i] = before + ramp * change if now.ramping else value
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
+    scale = task.command_scale
     # the last entry has the derivatives of the commands from before the start
     rows = len(d.issued) - 1
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
     for i in range(len(now.command)):
         for k in range(now.width):
-            change = newer[i, k] - older[i, k]
+            before = scale * older[i, k]
+            value = scale * newer[i, k]
+            change = value - before
             d.command_rate[i, k] = change / task.period
-            d.command[i, k] = older[i, k] + ramp * change if now.ramping else newer[i, k]
+            d.command[i, k] = before + ramp * change if now.ramping else value
             d.command_slope[i, k] = d.command_rate[i, k] if now.ramping else 0.0
     copy_rows(d.command[:], d.acting[:], now.width)
 

@@ -223,6 +223,8 @@ def _problem(
     _check_reach(robot, reference)
     frames = len(reference.poses)
     parameters = checked_loop_parameters(robot, parameters, settings.drives.law)
+    # raises for zeros of another number of joints
+    settings.drives.zeros(robot.layout.joints)
     feedforward = _rows("feedforward", feedforward, (frames, robot.layout.joints))
     if latencies is not None:
         latencies = floats("latencies", latencies, (frames,), error=SimulationError)

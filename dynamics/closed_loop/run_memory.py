@@ -150,6 +150,9 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("lx_by", "joint", "gain"),
         reals("reads", "gain"),
         reals("rate_weight"),
+        # commands as the drives receive them
+        reals("command_scale command_step"),
+        reals("joint_zero", "joint"),
         # number of columns from the gains of a joint to those of the next
         integers("gain_step"),
         # servo, elastic joints, timing, limits

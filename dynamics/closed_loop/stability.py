@@ -103,8 +103,9 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
         slope = (newer - older) / period
         at_once = older + ramp * (newer - older)
         moving = slope if timing.hold == "linear" else 0 * slope
+        scale = settings.drives.command_scale
         state = expm(robot.motion * (end - begin))[:inner] @ np.vstack(
-            [state, at_once, moving, slope]
+            [state, scale * at_once, scale * moving, scale * slope]
         )
     return np.vstack([state, coordinates, integral - period * coordinates, *commands[:kept]])
 
@@ -187,7 +188,8 @@ def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: D
     jacobian = robot.coordinate_jacobian(pose)
     law = drives.joint_law(robot.layout.split(parameters)[3])
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
-    demand = np.linalg.solve(jacobian, law.held(holding, robot.inverse_kinematics(pose))[0])
+    held = law.held(holding, robot.inverse_kinematics(pose))[0]
+    demand = np.linalg.solve(jacobian, drives.sent(held))
     (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
     return _NearRest(_joint_loop(robot, parameters, pose, law), jacobian, turning)
 

@@ -218,7 +218,8 @@ def equilibrium(
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
-    command, integral = law.held(torque, angles)
+    held, integral = law.held(torque, angles)
+    command = drives.sent(held)
     by_command, by_integral = law.held_by_parameters(
         torque, angles, torque_map, robot.layout.own_gains
     )
@@ -227,7 +228,7 @@ def equilibrium(
     # the command comes from the servo's integral, unless it comes from a feedforward
     if servo.ki and not fed_forward:
         servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
-    moving = by_command if by_command.any() else None
+    moving = by_command / drives.command_scale if by_command.any() else None
     return StartState(
         pose, rest, integral, servo_integral, command[None], pose, by_integral, moving, **motors
     )

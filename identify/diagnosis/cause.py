@@ -83,6 +83,11 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
     return changed
 
 
+def prior_std(size: float) -> float:
+    """Return the standard deviation, a power of ten, with which a model allows for a size."""
+    return float(10.0 ** np.ceil(np.log10(max(abs(size), 1e-12))))
+
+
 def pose_columns(problem: OutputErrorProblem, parameters: Array, changes: Sequence[Array]) -> Array:
     """Return the columns (m, k) of changes (N, 6, k) of each run's poses against the measured."""
     known, _ = problem.known(parameters)

@@ -6,7 +6,7 @@ import numpy as np
 
 from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run
+from identify.diagnosis.cause import Cause, in_each_run, prior_std
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
@@ -36,8 +36,8 @@ def scales() -> tuple[Cause, ...]:
             change=in_each_run(scaled),
             step=SCALE_STEP,
             remedy=lambda size: (
-                f"multiply the logged commands by {1 + size:.6g}, or mend the ratio of the gears "
-                "or the encoders"
+                f"--set model.command_scale_std={prior_std(size):g}, or mend the ratio of the "
+                "gears or the encoders"
             ),
         ),
     )

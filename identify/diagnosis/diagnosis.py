@@ -287,8 +287,12 @@ def _finding(
         freedoms=one.ranked.score.freedoms,
         chance=one.ranked.chance,
         alike=one.alike,
+        # causes of a group can have the same remedy
         remedies=tuple(
-            causes[place].remedy(size.value) for place, size in zip(one.places, own, strict=True)
+            dict.fromkeys(
+                causes[place].remedy(size.value)
+                for place, size in zip(one.places, own, strict=True)
+            )
         ),
     )
 

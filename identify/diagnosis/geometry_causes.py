@@ -18,7 +18,7 @@ import numpy as np
 
 from dynamics.closure import Closure
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run, pose_columns, with_geometry
+from identify.diagnosis.cause import Cause, in_each_run, pose_columns, prior_std, with_geometry
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.runtime import in_threads
@@ -71,9 +71,8 @@ def _zero(joint: int, unit: str) -> Cause:
         change=in_each_run(shifted),
         step=STEPS[unit],
         remedy=lambda size: (
-            f"set the zero of joint {joint + 1} anew: it reads {abs(size):.3g} {unit} too "
-            f"{'little' if size > 0 else 'much'}; cmmsim geometry finds all zeros from poses at "
-            "rest"
+            f"--set model.joint_zero_std_{unit}={prior_std(size):g}; cmmsim geometry finds all "
+            "zeros from poses at rest"
         ),
         quick=(geometry_columns, joint),
     )

@@ -65,7 +65,7 @@ def most_likely_of(modes: Array, missed: Array) -> Array:
 def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
     """Return the most likely errors (k,) of each run of a problem `with_common_errors`.
 
-    Only errors that a model can contain are returned: errors of the poses, and the latency.
+    Only errors that a model can contain are returned: errors of the poses, and of the loop.
     """
     return [
         np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]

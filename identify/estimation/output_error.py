@@ -52,11 +52,11 @@ class OutputErrorProblem:
     def bends(self) -> bool:
         """True if the model is not linear in its common errors.
 
-        The model is nonlinear if the servo measures poses with these errors, or if the latency is
-        one of the errors.
+        The model is nonlinear if the servo measures poses with these errors, or if there are errors
+        in the loop.
         """
         return any(
-            run.common.latency_std or (run.common.names and not run.driven)
+            run.common.loop_std or (run.common.names and not run.driven)
             for run in self.runs
             if run.marginal
         )

@@ -17,11 +17,14 @@ gains. It is therefore the sum of its derivatives with respect to the gains, tim
 derivatives of a cascade depend on ratios of the gains, which are taken from the previous fit.
 
 A common error of the poses or of the geometry shifts theta by e for one standard deviation. An
-error of the latency shifts U by its motion in that time. In the equation these shifts are
+error of the latency shifts U by its motion in that time, and errors of zeros and scale shift U. In
+the equation these shifts are
 multiplied by lp, and their integrals by li. With the gains of the initial guess, the errors of the
 rows are lp0 e and li0 integral(e). They last for the whole run, and are marginalised
 (`record.stored_common_errors`).
 """
+
+from collections.abc import Mapping
 
 import numpy as np
 import scipy
@@ -38,7 +41,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import ScaleAnchor, StartingGuess
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
-from identify.record.stored_common_errors import Marginal
+from identify.record.stored_common_errors import LATENCY, SCALE, Marginal
 from identify.scenario import Filter
 
 EDGE_FRACTION = 0.02
@@ -136,15 +139,28 @@ def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> A
         moved.append(run.robot.pose_jacobian(run.reference.poses) @ common.modes)
     if common.geometry:
         moved.append(common.geometry.joints(run.without_gaps()))
-    if common.latency_std:
-        _, rate, _ = effective_command(run, low_pass)
-        moved.append(common.latency_std * rate[:, :, None])
+    if common.loop_std:
+        command, rate, _ = effective_command(run, low_pass)
+        moved.append(_moved_commands(common.loop_std, command, rate))
     if not moved:
         return np.zeros((*run.logged.shape, 0))
     lp, li, _ = guess.layout.split(guess.values)[3].T[:, :, None]
     angle = np.concatenate(moved, axis=2)
     integral = running_integral(angle, run.settings.timing.frame_rate_hz)
     return np.concatenate([lp * angle, li * integral], axis=2)
+
+
+def _moved_commands(stds: Mapping[str, float], command: Array, rate: Array) -> Array:
+    """Return the changes (N, n, k) of commands (N, n) by one standard deviation of each error.
+
+    The errors are those of latency, zeros and scale. rate (N, n): rate of the commands.
+    """
+    zeros = iter(np.eye(command.shape[1]))
+    changes = [
+        std * (rate if name == LATENCY else command if name == SCALE else 0 * command + next(zeros))
+        for name, std in stds.items()
+    ]
+    return np.stack(changes, axis=2)
 
 
 def joint_balance(

@@ -150,7 +150,9 @@ def measure_joints(
     """
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle = truth[at_encoder].values
-    command = record["command"].values
+    zeros = truth["joint_zero_error"].values if "joint_zero_error" in truth else 0.0
+    # commands as the drives receive them, about the true zeros
+    command = zeros + record["command"].values * truth.attrs.get("plant_command_scale", 1.0)
     known = true_parameters(truth)
     joints = range(1, command.shape[1] + 1)
     names = [f"joint{joint}.{gain}" for joint in joints for gain in JOINT_PID]
@@ -164,7 +166,7 @@ def measure_joints(
     at_jump = np.array([law.lp, law.ld * (0.0 if law.filter_time else law.rate_weight)])
     torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
-    read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
+    read = angle - zeros + instruments.encoder_noise * rng.standard_normal(angle.shape)
     step = instruments.encoder_resolution
     read = step * np.round(read / step) if step else read
     values = {"joint_torque": torque, "joint_angle": read}

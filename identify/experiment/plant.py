@@ -29,6 +29,7 @@ from dynamics.control.law import LawInLoop
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import ScenarioError
+from identify.experiment.true_robot import true_zeros
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
 from identify.model.from_record import ModelSide
@@ -254,8 +255,9 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        # These are already among the parameters.
+        # These are already among the parameters or variables.
         among = {"drive_gains", "values", "inertia", "gains", "passive_friction"}
+        among |= {"joint_zero_error_rad", "joint_zero_error_m"}
         switches = self.switches.model_dump(exclude_none=True, exclude=among)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
@@ -268,6 +270,8 @@ class Plant:
             found["platform_joint_error"] = geometry.platform_joints - known.platform_joints
         if run.motor_angle is not None:
             found["motor_angle"] = run.motor_angle
+        if self.settings.drives.joint_zeros:
+            found["joint_zero_error"] = np.array(self.settings.drives.joint_zeros)
         return found
 
     def _settings_at(self, parameters: Array, pose: Array) -> LoopSettings:
@@ -279,6 +283,24 @@ class Plant:
         period = self.runs.timing.frame_period_s
         needed = springs.steps_needed(self.robot, parameters, pose, period, settings.friction)
         return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))
+
+
+def with_command_errors(
+    settings: LoopSettings, nominal: Robot, switches: PlantSwitches, zeros: bool
+) -> LoopSettings:
+    """Return the settings of a loop with the commands that the drives of a plant receive.
+
+    zeros: False if the true geometry contains the zeros of the joints, as that of a plant whose
+    geometry is calibrated. Raises the ScenarioErrors of `true_zeros`.
+    """
+    off = true_zeros(nominal, switches)
+    drives = replace(
+        settings.drives,
+        joint_zeros=tuple(off.tolist()) if zeros and off.any() else (),
+        command_scale=switches.command_scale,
+        command_step=of_actuators(nominal, switches, "command_quantum"),
+    )
+    return replace(settings, drives=drives)
 
 
 def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches) -> LoopSettings:

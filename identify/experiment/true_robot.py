@@ -19,10 +19,11 @@ from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess
 from identify.loop_parameters import in_form, of_actuators
-from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
+from identify.random_streams import ENCODER_OFFSETS, JOINT_ZEROS, TRUE_GEOMETRY, child
 from identify.record.known_geometry import KnownGeometry
 from identify.record.run_error_covariance import factor
 from identify.scenario import Plant as PlantSwitches
+from identify.scenario.section import ACTUATOR_KEYS
 from identify.scenario.sections import Geometry
 
 
@@ -102,6 +103,24 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
     return values
 
 
+def true_zeros(robot: Robot, switches: PlantSwitches) -> Array:
+    """Return what each joint (n,) of a plant reads too little, rad or m.
+
+    Raises ScenarioError for a list of a wrong length.
+    """
+    error = of_actuators(robot, switches, "joint_zero_error")
+    joints = robot.layout.joints
+    if isinstance(error, list):
+        if len(error) != joints:
+            raise ScenarioError(
+                f"plant.joint_zero_error_{robot.layout.joint_unit} has {len(error)} values, but "
+                f"{robot.name} has {joints} joints"
+            )
+        return np.array(error, dtype=float)
+    rng = np.random.default_rng(child(switches.geometry_seed, JOINT_ZEROS))
+    return np.asarray(error * rng.standard_normal(joints))
+
+
 def true_robot(
     nominal: Robot, switches: PlantSwitches, calibration: Geometry, known: KnownGeometry, seed: int
 ) -> Robot:
@@ -117,10 +136,13 @@ def true_robot(
         return misplaced(nominal, switches)
     if calibration.known == "calibrated":
         return nominal.moved(true_deviations(nominal, switches, calibration, seed))
-    for name in ("geometry_error_m", "length_error_m", "axis_error_rad"):
+    for name in (
+        *("geometry_error_m", "length_error_m", "axis_error_rad"),
+        *ACTUATOR_KEYS["joint_zero_error"],
+    ):
         if getattr(switches, name):
             raise ScenarioError(
-                f"plant.{name} = {getattr(switches, name):g} with geometry.known = "
+                f"plant.{name} = {getattr(switches, name)} with geometry.known = "
                 f"{calibration.known!r}: the true geometry is drawn from the covariance of "
                 "that calibration; set only one of the two"
             )
@@ -133,13 +155,15 @@ def true_deviations(
 ) -> Array:
     """Return the deviations (g,) of the true from the nominal geometric numbers, m and rad.
 
-    They include the offsets of the encoders, which are drawn with the seed.
+    They include the zeros of the joints, and the offsets of the encoders, which are drawn with the
+    seed.
     """
     drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
     true = misplaced(robot, switches).geometry
     offset = of_actuators(robot, calibration, "encoder_offset")
     # An offset of an encoder is the opposite shift of its joint.
-    return true.shifted(-offset * drawn).deviations_from(robot.geometry)
+    zeros = true_zeros(robot, switches)
+    return true.shifted(zeros - offset * drawn).deviations_from(robot.geometry)
 
 
 def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:

@@ -47,6 +47,7 @@ MISMATCH: Variables = {
         "m",
         "true minus nominal joint centre A on the platform",
     ),
+    "joint_zero_error": (("joint",), "rad", "what each joint reads too little"),
     "motor_angle": (
         ("time", "joint"),
         "rad",

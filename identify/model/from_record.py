@@ -12,6 +12,7 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
 from identify.errors import EstimationError
 from identify.loop_parameters import drives_of, in_form, loop_settings
+from identify.model.loop_errors import loop_error_stds
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
@@ -32,7 +33,7 @@ from identify.record.conditions import (
 )
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.recording import poses, recorded_reference
-from identify.record.stored_common_errors import CommonErrors, read_common_errors
+from identify.record.stored_common_errors import LATENCY, CommonErrors, read_common_errors
 from identify.scenario import Filter, Model, Scenario, Timing
 from identify.scenario.plant_sections import DriveName
 
@@ -169,6 +170,9 @@ def _common_errors(record: xr.Dataset, side: ModelSide, run: LoopModel) -> Commo
     covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
     if covariance is not None:
         geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
-    latency_std = side.timing.latency_std_s if "latency" in kinds else 0.0
+    stds = loop_error_stds(run.robot, side.model, side.timing.latency_std_s, kinds)
+    if takes_torques(record):
+        # no zero and no scale of joint commands acts under torques
+        stds = {name: std for name, std in stds.items() if name == LATENCY}
     of_poses = read_common_errors(record, kinds)
-    return replace(of_poses, latency_std=latency_std, geometry=geometry, whitener=run.whitener)
+    return replace(of_poses, loop_std=stds, geometry=geometry, whitener=run.whitener)

@@ -4,7 +4,6 @@ The model is driven by its own servo or by the logged commands. Its residuals ar
 covariance of the sensor's noise and of the errors that all measured poses have in common.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,10 +29,11 @@ from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
+from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
+from identify.model.loop_errors import lowest_errors, settings_with_errors
 from identify.record.checks import long_gap_warnings
-from identify.record.stored_common_errors import NONE, CommonErrors, Marginal
-from identify.runtime import in_threads
+from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Marginal
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ class LoopModel:
     def having(self, drawn: Array) -> "LoopModel":
         """Return a copy of the model that contains these common errors (k,).
 
-        The errors are in standard deviations. They are limited so that no latency is negative.
+        The errors are in standard deviations. They are limited so that the loop is possible.
         """
-        contained = np.maximum(drawn, self._lowest) if len(drawn) else None
+        contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         return replace(self, drawn=contained, marginal=None)
 
     def with_common_errors(self, parameters: Array) -> "LoopModel":
@@ -125,48 +125,13 @@ class LoopModel:
         appears in the measured poses.
         """
         if not self.driven:
-            return self._apart(parameters, lambda run: run.measured)
-        return self._apart(
-            parameters, lambda run: run.pose, self.common.modes if self.common.names else 0.0
-        )
+            return error_modes(self, parameters, lambda run: run.measured)
+        given = self.common.modes if self.common.names else 0.0
+        return error_modes(self, parameters, lambda run: run.pose, given)
 
     def pose_modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the platform by one standard deviation of each error."""
-        return self._apart(parameters, lambda run: run.pose, 0.0 if self.driven else None)
-
-    def _apart(
-        self,
-        parameters: Array,
-        shown: Callable[[ClosedLoopRun], Array],
-        beside: Array | float | None = None,
-    ) -> Array:
-        """Return central differences (N, 6, k) of poses of a run, per unit of each common error.
-
-        shown: function that returns the poses (N, 6) of a run. beside (N, 6, k): given columns for
-        the errors of measured poses. If it is given, these errors are not simulated.
-        """
-        drawn = self.errors_had
-        modes = np.zeros((*self.measured.shape, len(drawn)))
-        count = len(self.common.names)
-        if beside is not None:
-            modes[:, :, :count] = beside
-        moving = [] if beside is not None else list(range(count))[: self.common.noticed]
-        moving += range(count, len(drawn))
-        ends = [
-            np.maximum(drawn + sign * np.eye(len(drawn))[k], self._lowest)
-            for k in moving
-            for sign in (1.0, -1.0)
-        ]
-        found = in_threads(lambda end: shown(self.having(end).simulate(parameters)), ends)
-        for place, k in enumerate(moving):
-            more, less = found[2 * place : 2 * place + 2]
-            high, low = ends[2 * place : 2 * place + 2]
-            # The distance is less than two units if the lower end would be a negative latency.
-            modes[:, :, k] = (more - less) / (high[k] - low[k])
-        if (geometry := self.common.geometry) is None:
-            return modes
-        by_geometry = geometry.modes(lambda robot: self.simulate(parameters, robot=robot).pose)
-        return np.concatenate([modes, by_geometry], axis=2)
+        return error_modes(self, parameters, lambda run: run.pose, 0.0 if self.driven else None)
 
     @property
     def stated_latencies(self) -> Array:
@@ -181,25 +146,31 @@ class LoopModel:
 
         They include the common error of the latency that the model contains.
         """
-        if self.drawn is None or not self.common.latency_std:
+        errors = self._loop_errors
+        if LATENCY not in errors:
             return self.acted
-        return np.maximum(
-            self.stated_latencies + self.common.latency_std * float(self.drawn[-1]), 0.0
-        )
+        return np.maximum(self.stated_latencies + errors[LATENCY], 0.0)
 
     @property
-    def _lowest(self) -> Array:
-        """Smallest allowed values (k,) of the common errors, by which no latency is negative."""
-        lowest = np.full(len(self.common.names) + bool(self.common.latency_std), -np.inf)
-        if self.common.latency_std:
-            mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
-            lowest[-1] = -mean / self.common.latency_std
-        return lowest
+    def _loop_errors(self) -> dict[str, float]:
+        """Errors in the loop that the model contains, by name and in their units."""
+        if self.drawn is None:
+            return {}
+        own = self.drawn[len(self.common.names) :].tolist()
+        stds = self.common.loop_std.items()
+        return {name: std * value for (name, std), value in zip(stds, own, strict=True)}
+
+    @property
+    def lowest_drawn(self) -> Array:
+        """Smallest allowed values (k,) of the common errors, see `lowest_errors`."""
+        mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
+        free = np.full(len(self.common.names), -np.inf)
+        return np.concatenate([free, lowest_errors(self.common.loop_std, float(mean))])
 
     @property
     def errors_had(self) -> Array:
-        """Common errors (k,) that the model contains: errors of the poses, then of the latency."""
-        count = len(self.common.names) + bool(self.common.latency_std)
+        """Common errors (k,) that the model contains: errors of the poses, then of the loop."""
+        count = len(self.common.names) + len(self.common.loop_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
     def simulate(
@@ -227,7 +198,7 @@ class LoopModel:
         LoopFailure
             The run is unstable.
         """
-        given = *self._moving(parameters, robot or self.robot), self.reference, self.settings
+        given = *self._moving(parameters, robot or self.robot), self.reference, self._loop
         sensor = IdealSensor(self._lost, self._sensed(noise))
         late = self.latencies
         if self.driven:
@@ -249,7 +220,7 @@ class LoopModel:
         returned in place of the run.
         """
         sensed = np.asarray(self._sensed(noises))
-        given = *self._moving(parameters, self.robot), self.reference, self.settings
+        given = *self._moving(parameters, self.robot), self.reference, self._loop
         if self.driven:
             return repeat_commands(
                 *given, self._commands(parameters), sensed, latencies=self.latencies
@@ -271,6 +242,11 @@ class LoopModel:
     def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
         """Return the robot that moves in a run, and its parameters (p,) with the known load."""
         return robot, parameters + self.payload
+
+    @property
+    def _loop(self) -> LoopSettings:
+        """Settings of the loop with the errors of zeros and scale that the model contains."""
+        return settings_with_errors(self.settings, self._loop_errors)
 
     @property
     def _lost(self) -> NDArray[np.bool_] | None:

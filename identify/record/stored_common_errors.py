@@ -15,7 +15,7 @@ can depend on d, for example for a latency, or for cameras within a servo. The m
 the most likely d, and M is evaluated there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -31,6 +31,8 @@ from identify.record.run_error_covariance import covariance_fault, factor, notic
 CHANGES = "common_error"
 COVARIANCE = "common_error_covariance"
 LATENCY = "timing.latency_s"
+ZERO = "zeros.joint"
+SCALE = "scale.commands"
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,9 @@ class CommonErrors:
         Change of the measured poses per unit of each error.
     covariance : ndarray, shape (k, k)
         Covariance of the true values about the known values.
-    latency_std : float
-        Standard deviation of the mean latency of the frames, s. Its effect on the poses needs a
+    loop_std : dict of str to float
+        Standard deviations of errors in the loop by name: of the mean latency of the frames, s, of
+        the zero of each joint, and of the scale of the commands. Their effect on the poses needs a
         model of the loop.
     geometry : GeometryErrors, optional
         Errors of the robot's geometry. Their effect needs a model of the loop, too. None if the
@@ -59,29 +62,28 @@ class CommonErrors:
     names: tuple[str, ...]
     changes: Array
     covariance: Array
-    latency_std: float = 0.0
+    loop_std: dict[str, float] = field(default_factory=dict)
     geometry: GeometryErrors | None = None
     whitener: Array | None = None
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors: errors of the poses, then the latency, then the geometry."""
-        latency = (LATENCY,) if self.latency_std else ()
-        return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
+        """Names of all errors: errors of the poses, then of the loop, then of the geometry."""
+        return (*self.names, *self.loop_std, *(self.geometry.names if self.geometry else ()))
 
     @property
     def whole_factor(self) -> Array:
         """`factor` of all errors, in the order of `all_names`."""
-        latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
         geometry = [self.geometry.factor] if self.geometry else []
-        return np.asarray(block_diag(self.factor, *latency, *geometry))
+        loop = [np.full((1, 1), std) for std in self.loop_std.values()]
+        return np.asarray(block_diag(self.factor, *loop, *geometry))
 
     def known_as(self, other: "CommonErrors") -> bool:
         """Return whether other errors have the same names and covariances."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
-        same = self.all_names == other.all_names and self.latency_std == other.latency_std
+        same = self.all_names == other.all_names and self.loop_std == other.loop_std
         return same and all(np.array_equal(*pair) for pair in pairs)
 
     def by_kind(self, modes: Array) -> dict[str, Array]:
@@ -220,11 +222,13 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 
 def kind_of(name: str) -> str:
-    """Return the kind of a common error: rig, teaching, exposure, latency or geometry."""
+    """Return the kind of a common error, as `identification.nuisances` names it."""
     kinds = {
         "taught": "teaching",
         "exposure": "exposure",
         "timing": "latency",
         "geometry": "geometry",
+        "zeros": "zeros",
+        "scale": "scale",
     }
     return kinds.get(name.split(".")[0], "rig")

@@ -39,6 +39,9 @@ They are the paper's PID, parts of it, a P-PI cascade, and a PID with a filtered
 
 FILTERED: DriveName = "pid_filtered"
 
+LARGEST_ZERO = 0.1
+"""Largest error of the zero of a joint, rad or m."""
+
 AUTO = "auto"
 """Drive of a model whose law is determined from the record."""
 
@@ -192,6 +195,26 @@ class Plant(_Side):
         description="gains of the drives, instead of those of the parameter set, in the same "
         "units; { lp = 10.5, li = 30.0, ld = 0.3 }",
     )
+    joint_zero_error_rad: float | list[float] = Field(
+        0.0,
+        description="what each joint reads too little, rad: a list with one value per joint, or "
+        "the standard deviation of values that are drawn with geometry_seed",
+        json_schema_extra={"unit": "rad"},
+    )
+    joint_zero_error_m: float | list[float] = Field(
+        0.0,
+        description="the same for actuators that slide, m",
+        json_schema_extra={"unit": "m"},
+    )
+    command_scale: float = quantity(
+        1.0, "1", "ratio of the commands that the drives receive to those sent", ge=0.5, le=2
+    )
+    command_quantum_rad: float | None = quantity(
+        None, "rad", "steps to which the drives round the commands", gt=0, le=0.1
+    )
+    command_quantum_m: float | None = quantity(
+        None, "m", "the same for actuators that slide", gt=0, le=0.01
+    )
     steps_per_frame: int = quantity(
         16, "1", "integration steps per frame; elastic joints take more", ge=1, le=10_000
     )
@@ -244,6 +267,15 @@ class Plant(_Side):
         """Law of the drives."""
         return self.drive
 
+    @field_validator("joint_zero_error_rad", "joint_zero_error_m")
+    @classmethod
+    def _zeros_are_small(cls, error: float | list[float]) -> float | list[float]:
+        for value in error if isinstance(error, list) else [error]:
+            least = 0.0 if error is value else -LARGEST_ZERO
+            if not least <= value <= LARGEST_ZERO:
+                raise ValueError(f"{value:g} is not from {least:g} to {LARGEST_ZERO:g}")
+        return error
+
     @model_validator(mode="after")
     def _gains_are_those_of_the_law(self) -> "Plant":
         check_filter(self.drive, self.derivative_filter_s)
@@ -276,6 +308,23 @@ class Model(_Side):
         "time constant of the drive pid_filtered; auto considers this drive only if it is stated",
         gt=0,
         le=1,
+    )
+    joint_zero_std_rad: float = quantity(
+        0.0,
+        "rad",
+        "standard deviation of the zero of each joint, which is estimated beside the parameters; a "
+        "calibrated geometry states its own",
+        ge=0,
+        le=0.1,
+    )
+    joint_zero_std_m: float = quantity(0.0, "m", "the same for actuators that slide", ge=0, le=0.1)
+    command_scale_std: float = quantity(
+        0.0,
+        "1",
+        "standard deviation of the ratio of the commands that the drives receive to those logged, "
+        "which is estimated beside the parameters",
+        ge=0,
+        le=0.1,
     )
     steps_per_frame: int = quantity(4, "1", "integration steps per frame", ge=1, le=10_000)
 

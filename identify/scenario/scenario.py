@@ -114,11 +114,23 @@ class Scenario(Section):
     def _fits_together(self) -> "Scenario":
         self._complete_from_the_sensor()
         self.timing.check()
+        self._check_zeros()
         self._check_filter()
         self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
         self._check_whole_frames("validation.duration_s", self.validation.duration_s)
         return self
+
+    def _check_zeros(self) -> None:
+        """Check that the zeros of the joints are not stated twice."""
+        for name in ("joint_zero_std_rad", "joint_zero_std_m"):
+            value = getattr(self.model, name)
+            if value and not self.geometry.exact:
+                raise ValueError(
+                    f"model.{name} = {value:g} with geometry.known = {self.geometry.known!r}: the "
+                    "covariance of that calibration contains the zeros of the joints; set only one "
+                    "of the two"
+                )
 
     def _complete_from_the_sensor(self) -> None:
         """Fill in the timing and the note that the scenario does not state from its sensor."""

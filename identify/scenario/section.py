@@ -28,6 +28,9 @@ ACTUATOR_KEYS = {
     "encoder_noise": ("encoder_noise_rad", "encoder_noise_m"),
     "encoder_resolution": ("encoder_resolution_rad", "encoder_resolution_m"),
     "encoder_offset": ("encoder_offset_rad", "encoder_offset_m"),
+    "joint_zero_std": ("joint_zero_std_rad", "joint_zero_std_m"),
+    "joint_zero_error": ("joint_zero_error_rad", "joint_zero_error_m"),
+    "command_quantum": ("command_quantum_rad", "command_quantum_m"),
     "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }

@@ -230,10 +230,11 @@ class Identification(Section):
         description="parameters that are known better than the initial guess: { name = { value, "
         "std } }",
     )
-    nuisances: list[Literal["rig", "teaching", "exposure", "latency", "geometry"]] = Field(
-        ["rig", "teaching", "exposure", "latency", "geometry"],
-        description="errors common to all poses of a record that are estimated beside the "
-        "parameters",
+    nuisances: list[
+        Literal["rig", "teaching", "exposure", "latency", "zeros", "scale", "geometry"]
+    ] = Field(
+        ["rig", "teaching", "exposure", "latency", "zeros", "scale", "geometry"],
+        description="errors common to all poses that are estimated beside the parameters",
     )
     physical_consistency: bool = Field(
         False,

@@ -10,13 +10,16 @@ import dynamics
 from dynamics import Robot, closed_loop
 from dynamics.closed_loop import Drives, FrameTiming, LoopSettings, ServoGains, stability
 from dynamics.closed_loop.drives import JointLaw, gain_columns, joint_law
+from dynamics.control.feedforward import feedforward
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.mjcf_import import robot_of_mjcf
 from dynamics.errors import RobotFileError, SimulationError
+from dynamics.parameter_set import ParameterSet
 from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from identify.verification.against_mujoco import compare_engines
 from tests.dynamics.conftest import Loop, assert_same, at_rest
+from tests.dynamics.test_control import FAST, NOISE, follow, size
 from tests.dynamics.test_sensitivities import _assert_derivative
 
 SHARES = np.array([[1.0, 0.9, 1.1], [1.1, 1.2, 0.9], [0.85, 1.0, 1.2]])
@@ -221,6 +224,24 @@ def test_the_linear_loop_agrees_with_that_of_shared_gains_and_differs_with_unequ
     radius = stability.spectral_radius(robot, shared, settings, home)
     assert stability.spectral_radius(own.robot, equal, settings, home) == radius
     assert stability.spectral_radius(own.robot, own.parameters, settings, home) != radius
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["pid", "cascade"])
+def test_feedforward_and_observer_know_the_gains_of_each_joint(robot, drive):
+    """As the test of shared gains. A feedforward that takes the mean of the gains misses."""
+    own = robot.with_own_gains()
+    true = ParameterSet(robot.parameter_sets["identified"].dynamic, unequal(robot)[64:])
+    own.parameter_sets = own.parameter_sets | {"identified": true}
+    given = {"noise": 0 * NOISE, "observer": False, "drive": drive}
+    alone = size(follow(own, FAST, None, noise=0 * NOISE, drive=drive)[1])
+    fed = size(follow(own, FAST, feedforward, **given)[1])
+    assert fed < alone / 1000
+    mean = np.append(true.dynamic, np.tile(true.joint_pid.reshape(6, 3).mean(axis=0), 6))
+    assert size(follow(own, FAST, feedforward, known=mean, **given)[1]) > 10 * fed
+    run, _, expected = follow(own, FAST, feedforward, drive=drive)
+    missed = np.array([one.coordinates for one in expected]) - run.pose
+    assert size(missed) < 1.4 * np.sqrt(NOISE[0, 0])
 
 
 def test_gain_columns_are_those_of_the_own_joint():

@@ -18,7 +18,7 @@ CHILDREN = (
         "DESIGN",
         "LOAD",
     ),
-    *("CALIBRATION", "MEAN_LATENCY", "EXPOSURES"),
+    *("CALIBRATION", "MEAN_LATENCY", "EXPOSURES", "JOINT_ZEROS"),
     *("STATIC_POSES", "UNSEEN_POSES", "ENCODER_OFFSETS", "ENCODERS", "STATIC_NOISE"),
 )
 MIXED = ("UNCERTAINTY", "INSTRUMENTS", "RESAMPLING", "SAMPLED_POINTS")
@@ -62,7 +62,7 @@ def test_numbers_are_those_of_every_version():
         "PREDICTION": 6, "DESIGN": 7, "LOAD": 8, "CALIBRATION": 9, "MEAN_LATENCY": 10, "UNCERTAINTY": 5,
         "INSTRUMENTS": 20, "ROUTES_UNCERTAINTY": 21, "DISTURBED_COPIES": 22, "STATIC_POSES": 14, "UNSEEN_POSES": 15,
         "TRUE_GEOMETRY": 19, "ENCODER_OFFSETS": 16, "ENCODERS": 17, "STATIC_NOISE": 18, "SAMPLED_POINTS": 1,
-        "RESAMPLING": 301, "TRACKED": 24, "EXPOSURES": 25,
+        "RESAMPLING": 301, "TRACKED": 24, "EXPOSURES": 25, "JOINT_ZEROS": 26,
     }  # fmt: skip
     assert mixed_generator(21).integers(2**63) == np.random.default_rng(21).integers(2**63)
     assert mixed_generator(20, 7).integers(2**63) == np.random.default_rng([7, 20]).integers(2**63)
