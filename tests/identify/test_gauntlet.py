@@ -13,7 +13,7 @@ from dynamics import DynamicsError
 from dynamics.closed_loop import simulate_commands
 from dynamics.pseudo_inertia import body_fault
 from identify.diagnosis.diagnosis import CandidateRow, Diagnosis, Finding
-from identify.errors import EstimationError
+from identify.errors import EstimationError, ScenarioError
 from identify.estimation.explanation import Misfit
 from identify.record.recording import poses, recorded_reference
 from identify.scenario import load_scenario
@@ -35,7 +35,7 @@ from identify.studies.rows.gauntlet.play import PlantWithPlay
 from identify.studies.rows.gauntlet.trouble import Trouble
 from identify.studies.rows.gauntlet.typed import stated, typed
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge
-from tests.identify.commands import command, one_line
+from tests.identify.commands import command, one_line, refusal
 
 SHORT = {"excitation.duration_s": 10.0, "excitation.candidates": 4}
 
@@ -112,6 +112,10 @@ def test_two_troubles_must_both_be_found():
     other = finding("latency of the commands", "latency of the commands")
     assert judge(case([ZERO, LATE], diagnosis(other, finding()))) == "right intervals"
     assert judge(case([ZERO, LATE], diagnosis(other))) == "failed"
+    # one finding is one cause, whatever it cannot be told from
+    alike = finding("link length", "lengths of the links", alike=["one of zeros of the joints"])
+    link = replace(LATE, groups=("lengths of the links",))
+    assert judge(case([ZERO, link], diagnosis(alike))) == "failed"
 
 
 def test_nobody_is_to_be_accused_where_nothing_is_wrong():
@@ -235,6 +239,11 @@ def test_drives_act_on_what_the_play_leaves_of_the_logged_commands():
     logged = record["command"].values
     run = simulate_commands(plant.robot, plant.parameters, reference, plant.settings, logged)
     assert np.sqrt(np.mean(((run.pose - poses(record, "measured")) / noise) ** 2)) > 2.0
+
+
+def test_a_scale_that_needs_a_second_record_is_refused():
+    payload = scenario().with_overrides({"identification.scale_anchor": "payload"})
+    assert "scale_anchor = 'payload'" in refusal(ScenarioError, laboratory, payload, 0)
 
 
 def test_a_case_that_stops_has_failed_and_keeps_what_was_wrong(monkeypatch):

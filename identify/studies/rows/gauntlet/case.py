@@ -12,7 +12,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.diagnose import diagnose
 from identify.diagnosis.diagnosis import Diagnosis, Finding
-from identify.errors import IdentifyError
+from identify.errors import IdentifyError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
@@ -156,8 +156,16 @@ def run_case(case: Drawn) -> Case:
 
 @lru_cache(maxsize=4)
 def _laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
-    """Return a laboratory. Its robot runs the exciting trajectory once, for its largest torque."""
+    """Return a laboratory. Its robot runs the exciting trajectory once, for its largest torque.
+
+    Raises ScenarioError if the scale needs a second record.
+    """
     scenario = scenario_from_toml(scenario_toml)
+    if scenario.identification.scale_anchor == "payload":
+        raise ScenarioError(
+            "identification.scale_anchor = 'payload' needs a second record, and a case of the "
+            "gauntlet has one"
+        )
     setup = row_setup(scenario, 0)
     motion = designed_trajectories(setup, trajectory).excitation
     times = scenario.timing.frame_times(scenario.excitation.duration_s)

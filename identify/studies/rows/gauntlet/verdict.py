@@ -52,8 +52,8 @@ def rightly_named(case: Case) -> bool:
     """Tell whether the diagnosis is right.
 
     With one trouble, the first finding names it, alone or together with causes that cannot be told
-    from it. Two are both among the first findings. Nothing is found where nothing is wrong, and
-    "none of these" is the answer to a trouble outside the catalogue.
+    from it. Two are both among the first findings, each by one of its own. Nothing is found where
+    nothing is wrong, and "none of these" is the answer to a trouble outside the catalogue.
     """
     found = case.diagnosis
     if any(not one.groups for one in case.troubles):
@@ -61,7 +61,8 @@ def rightly_named(case: Case) -> bool:
     if not case.troubles:
         return not found.findings and not found.none_of_these
     last = 1 if len(case.troubles) == 1 else FIRST
-    return all(0 < place <= last for place in case.named)
+    apart = len(set(case.named)) == len(case.named)
+    return apart and all(0 < place <= last for place in case.named)
 
 
 def judge(case: Case) -> Verdict:
