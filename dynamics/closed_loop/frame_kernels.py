@@ -45,7 +45,9 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
     if task.sensitivities:
         copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.parameters)
         copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
-        copy_rows(plan.start_command_sensitivity, d.issued[len(d.issued) - 1], now.parameters)
+        issued = d.issued[len(d.issued) - 1]
+        copy_rows(plan.start_command_sensitivity, issued, now.parameters)
+        scale_received(task, issued, now.parameters)
         # at a start at rest, the command comes from the integral of the servo
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
@@ -173,7 +175,9 @@ def issue_command(
     if len(plan.feedforward) > 0:
         add(plan.feedforward[k], record.command[row])
     if task.sensitivities:
-        copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
+        issued = d.issued[k % (len(d.issued) - 1)]
+        copy_rows(d.last_command[:], issued, now.width)
+        scale_received(task, issued, now.width)
     return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
 
 
@@ -189,6 +193,15 @@ def received(task: Record, command: float, joint: int) -> float:
     if task.command_step > 0:
         command = task.command_step * np.rint(command / task.command_step)
     return task.command_scale * command + task.joint_zero[joint]
+
+
+@kernel
+def scale_received(task: Record, rows: Array, width: int) -> None:
+    """Scale the derivatives of sent commands to those of received commands."""
+    if task.command_scale != 1.0:
+        for i in range(len(rows)):
+            for k in range(width):
+                rows[i, k] *= task.command_scale
 
 
 @kernel
@@ -210,18 +223,15 @@ def apply_command(
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
-    scale = task.command_scale
     # the last entry has the derivatives of the commands from before the start
     rows = len(d.issued) - 1
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]
     for i in range(len(now.command)):
         for k in range(now.width):
-            before = scale * older[i, k]
-            value = scale * newer[i, k]
-            change = value - before
+            change = newer[i, k] - older[i, k]
             d.command_rate[i, k] = change / task.period
-            d.command[i, k] = before + ramp * change if now.ramping else value
+            d.command[i, k] = older[i, k] + ramp * change if now.ramping else newer[i, k]
             d.command_slope[i, k] = d.command_rate[i, k] if now.ramping else 0.0
     copy_rows(d.command[:], d.acting[:], now.width)
 

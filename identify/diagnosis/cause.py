@@ -83,9 +83,12 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
     return changed
 
 
-def prior_std(size: float) -> float:
-    """Return the standard deviation, a power of ten, with which a model allows for a size."""
-    return float(10.0 ** np.ceil(np.log10(max(abs(size), 1e-12))))
+def prior_std(size: float, least: float) -> float:
+    """Return the standard deviation, a power of ten, with which a model allows for a size.
+
+    It is at least that of an ordinary workshop, so that several causes of a kind have the same.
+    """
+    return float(10.0 ** np.ceil(np.log10(max(abs(size), least))))
 
 
 def pose_columns(problem: OutputErrorProblem, parameters: Array, changes: Sequence[Array]) -> Array:

@@ -13,6 +13,9 @@ from identify.model.loop_model import LoopModel
 CLOCK_STEP_S = 1e-4
 """Change of a latency for differences."""
 
+SCALE_STD = 1e-3
+"""Standard deviation of the scale of commands in an ordinary workshop."""
+
 SCALE_STEP = 1e-4
 """Change of the scale of commands for differences."""
 
@@ -36,8 +39,8 @@ def scales() -> tuple[Cause, ...]:
             change=in_each_run(scaled),
             step=SCALE_STEP,
             remedy=lambda size: (
-                f"--set model.command_scale_std={prior_std(size):g}, or mend the ratio of the "
-                "gears or the encoders"
+                f"--set model.command_scale_std={prior_std(size, SCALE_STD):g}, or mend the ratio "
+                "of the gears or the encoders"
             ),
         ),
     )

@@ -26,6 +26,9 @@ from identify.runtime import in_threads
 STEPS = {"m": 1e-5, "rad": 1e-4}
 """Change of a number for differences, by its unit."""
 
+ZERO_STDS = {"m": 1e-4, "rad": 1e-3}
+"""Standard deviation of the zero of a joint in an ordinary workshop, by its unit."""
+
 ZEROS = ("crank_zero", "zero_length")
 """Numbers that are zeros of joints, which a shift of the commands stands for."""
 
@@ -71,8 +74,8 @@ def _zero(joint: int, unit: str) -> Cause:
         change=in_each_run(shifted),
         step=STEPS[unit],
         remedy=lambda size: (
-            f"--set model.joint_zero_std_{unit}={prior_std(size):g}; cmmsim geometry finds all "
-            "zeros from poses at rest"
+            f"--set model.joint_zero_std_{unit}={prior_std(size, ZERO_STDS[unit]):g}; cmmsim "
+            "geometry finds all zeros from poses at rest"
         ),
         quick=(geometry_columns, joint),
     )
