@@ -149,6 +149,7 @@ def test_settings_are_typed_as_the_remedy_says_and_the_last_one_stands():
         "model.drive": "cascade",
         "model.inertia": {"platform": "full", "link": "full"},
     }
+    assert typed(finding(remedies=["change leg1.crank_length by 1e-4 m"])).mended
     limit = stated(finding(remedies=["state control.torque_limit_N_m = 2.5 with the record: so"]))
     assert limit.settings == {"control.torque_limit_N_m": 2.5}
 

@@ -16,6 +16,7 @@ from identify.studies.rows.gauntlet.trouble import (
     log_uniform,
     sign,
 )
+from identify.studies.rows.gauntlet.typed import typed
 
 LATENCY_STD_S = 1e-3
 """Standard deviation with which a laboratory states a latency that a diagnosis has found.
@@ -90,18 +91,14 @@ def drift(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 def scale(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw a ratio of gears or encoders that is off: joints go further than the log says."""
     size = sign(rng) * log_uniform(rng, 1e-3, 6e-3)
-
-    def logged(record: xr.Dataset) -> xr.Dataset:
-        command = record["command"]
-        return record.assign(command=(command.dims, command.values / (1.0 + size)))
-
     return Trouble(
         kind="command scale",
         size=size,
         unit="1",
         groups=("scale of the commands",),
         cause="scale of the commands",
-        record=logged,
+        settings={"plant.command_scale": 1.0 + size},
+        remedy=typed,
     )
 
 

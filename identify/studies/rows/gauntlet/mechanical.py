@@ -38,13 +38,15 @@ def zero(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     layout = lab.robot.layout
     joint = int(rng.integers(layout.joints))
     size = sign(rng) * log_uniform(rng, *ZERO[layout.joint_unit])
+    errors = (size * np.eye(layout.joints)[joint]).tolist()
     return Trouble(
         kind="zero of a joint",
         size=size,
         unit=layout.joint_unit,
         groups=("zeros of the joints",),
         cause=f"zero of joint {joint + 1}",
-        plant=_moved_by(lambda geometry: geometry.shifted(size * np.eye(layout.joints)[joint])),
+        settings={f"plant.joint_zero_error_{layout.joint_unit}": errors},
+        remedy=typed,
     )
 
 

@@ -17,7 +17,8 @@ STATED = re.compile(r"\b([a-z_]+\.\w+) = ([-+.\de]*\d)")
 def typed(finding: Finding) -> Remedied:
     """Set what the remedies of a finding say. Where one line names an alternative, the first.
 
-    A later remedy replaces an earlier one.
+    A later remedy replaces an earlier one. A finding without settings names the trouble only as one
+    that cannot be told from its own cause, and the trouble is mended.
     """
     settings: dict[str, Any] = {}
     for remedy in finding.remedies:
@@ -25,7 +26,7 @@ def typed(finding: Finding) -> Remedied:
         for quoted, plain in SETTING.findall(line):
             key, _, value = (quoted or plain).partition("=")
             settings = settings | with_table(settings, key, _value(value))
-    return Remedied(settings)
+    return Remedied(settings, mended=not settings)
 
 
 def stated(finding: Finding) -> Remedied:
