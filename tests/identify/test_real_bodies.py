@@ -56,7 +56,7 @@ def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
     exact = there.simulate(same, sensitivities=True).pose_sensitivity
     base, found = run.model_poses(parameters), {}
     for cause in body_causes(problem, parameters):
-        if "platform" in cause.name:
+        if cause.group.endswith("of the platform"):
             size = 1e-3 if cause.unit == "m" else 1e-4
             moved = cause.change(problem, size).runs[0].model_poses(parameters)
             found[cause.name.split(", ")[1]] = (moved - base) / size
