@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from identify.estimation.prior import ScaleAnchor as ScaleAnchor
     from identify.estimation.prior import store_anchor as store_anchor
     from identify.estimation.result import IdentificationResult as IdentificationResult
-    from identify.record.conditions import payload_vector as payload_vector
-    from identify.record.conditions import store_payload as store_payload
+    from identify.record.load import payload_vector as payload_vector
+    from identify.record.load import store_payload as store_payload
     from identify.record.recording import build_record as build_record
     from identify.reporting.pictures import run_figures as run_figures
     from identify.scenario import Scenario as Scenario
@@ -60,8 +60,8 @@ _HOME = {
     "build_record": "identify.record.recording",
     "ScaleAnchor": "identify.estimation.prior",
     "store_anchor": "identify.estimation.prior",
-    "payload_vector": "identify.record.conditions",
-    "store_payload": "identify.record.conditions",
+    "payload_vector": "identify.record.load",
+    "store_payload": "identify.record.load",
     "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
     "diagnose": "identify.diagnosis.diagnose",

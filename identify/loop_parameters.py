@@ -19,6 +19,7 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Timing
+from identify.scenario.payload import Payload
 from identify.scenario.plant_sections import FILTERED, Control, Servo
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
@@ -131,6 +132,17 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
     ]
     names = [body for body, form in zip(layout.bodies, forms, strict=True) if form == "full"]
     return _with_full_bodies(robot, tuple(names))
+
+
+def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
+    """Return the robot with a full platform if it carries a load off the origin of its frame.
+
+    anchor: scale anchor. Only with the anchor payload there is a load.
+    """
+    full = robot.layout.full_bodies
+    if anchor != "payload" or not load.off_origin or "platform" in full:
+        return robot
+    return _with_full_bodies(robot, (*full, "platform"))
 
 
 @lru_cache(maxsize=16)

@@ -37,7 +37,7 @@ from identify.experiment.sensor_in_loop import SensorPlan, teach
 from identify.experiment.true_robot import true_parameters, true_robot, with_true_bodies
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
-from identify.loop_parameters import in_form, loop_settings
+from identify.loop_parameters import carrying, in_form, loop_settings
 from identify.model.from_record import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
@@ -110,8 +110,10 @@ class Setup:
 
     @cached_property
     def in_file(self) -> Robot:
-        """The robot as its file describes it."""
-        return self.loaded or load_robot(self.scenario.robot)
+        """The robot as its file describes it, with a full platform where the load needs one."""
+        scenario = self.scenario
+        robot = self.loaded or load_robot(scenario.robot)
+        return carrying(robot, scenario.payload, scenario.identification.scale_anchor)
 
     @cached_property
     def nominal(self) -> Robot:

@@ -258,8 +258,8 @@ def _uneven_friction(runs: Sequence[LoopModel], motions: Sequence[RunMotion]) ->
             layout.unit("joint1.coulomb"),
             "friction that differs with direction",
             tuple(np.where(one, np.eye(layout.joints)[joint], 0.0) for one in moving),
-            "no model here has friction that differs with direction: look for a load on one side, or "
-            "a drive that is worn",
+            "no model here has friction that differs with direction: look for a load on one side, "
+            "or a drive that is worn",
         )
         for joint in range(layout.joints)
     ]

@@ -141,7 +141,7 @@ def estimate_uncertainty(
             for run, one in zip(runs, shown, strict=True)
         )
         scores = scores + misfit.share_of_model * model
-    if any(run.payload_std.any() for run in runs):
+    if any(run.payload_errors.any() for run in runs):
         moved = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
         scores = scores + load_score_covariance(runs, moved)
     beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
@@ -205,9 +205,12 @@ def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array
     """
     shown: dict[tuple[float, ...], Array] = {}
     for run, one in zip(runs, information, strict=True):
-        load = (*run.payload, *run.payload_std)
+        load = (*run.payload, *run.payload_errors.ravel())
         shown[load] = shown.get(load, np.zeros_like(one)) + one
-    spread = [total * np.array(load[total.shape[1] :]) for load, total in shown.items()]
+    spread = [
+        total @ np.array(load[total.shape[1] :]).reshape(total.shape[1], -1)
+        for load, total in shown.items()
+    ]
     return np.asarray(sum(one @ one.T for one in spread), dtype=float)
 
 

@@ -33,11 +33,12 @@ from identify.experiment.true_robot import true_zeros
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
 from identify.model.from_record import ModelSide
-from identify.record.conditions import payload_vector
+from identify.record.load import load_errors, load_parameters
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing
+from identify.scenario.payload import Payload
 from identify.scenario.plant_sections import Control
-from identify.scenario.sections import Payload, Rig
+from identify.scenario.sections import Rig
 
 
 @dataclass(frozen=True)
@@ -315,12 +316,17 @@ def with_springs(settings: LoopSettings, nominal: Robot, switches: PlantSwitches
 
 @dataclass(frozen=True)
 class PlatformLoad:
-    """Load on the platform, as changes of the parameters (p,).
+    """Load on the platform.
 
-    ``stated`` are the stated values, ``std`` their standard deviations, and ``true`` the true
-    values.
+    ``figures`` and ``figures_std`` (7,) are the stated figures of `record.load` and their standard
+    deviations, and ``true_figures`` (7,) the true ones. ``stated`` and ``true`` are the changes of
+    the parameters (p,) by the stated and the true load, and ``std`` (p,) the standard deviations of
+    these changes.
     """
 
+    figures: Array
+    figures_std: Array
+    true_figures: Array
     stated: Array
     std: Array
     true: Array
@@ -330,13 +336,25 @@ def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator)
     """Draw a known load.
 
     The true values scatter about the stated values with the stated standard deviations. Draws with
-    a negative value are repeated.
+    a negative mass or moment are repeated. Raises the RecordError of `load_parameters`.
     """
-    stated = payload_vector(layout, load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
-    std = payload_vector(
-        layout, load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2)
+    figures = np.array(load.figures)
+    std = np.array(load.figures_std)
+
+    def drawn() -> Array:
+        # so many numbers, in this order, that seeds give the same loads as ever
+        numbers = rng.standard_normal(len(layout.names))
+        return figures + std * numbers[[0, 4, 5, 6, 1, 2, 3]]
+
+    true = drawn()
+    while (true[[0, 4, 5, 6]] < 0).any():
+        true = drawn()
+    spread = np.linalg.norm(load_errors(layout, figures, std), axis=1)
+    return PlatformLoad(
+        figures,
+        std,
+        true,
+        load_parameters(layout, figures),
+        spread,
+        load_parameters(layout, true),
     )
-    true = stated + std * rng.standard_normal(stated.shape)
-    while (true < 0).any():
-        true = stated + std * rng.standard_normal(stated.shape)
-    return PlatformLoad(stated, std, true)

@@ -29,12 +29,14 @@ from identify.random_streams import (
     stream_seed,
 )
 from identify.record import recording
-from identify.record.conditions import SERVO, store_finding, store_law, store_payload
+from identify.record.conditions import SERVO, store_finding, store_law
 from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.load import store_load
 from identify.record.provenance import store_robot
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.scenario import Excitation, Timing
-from identify.scenario.sections import Payload, Rig
+from identify.scenario.payload import Payload
+from identify.scenario.sections import Rig
 from identify.trajectory import FourierTrajectory, check_travel
 
 PAYLOAD_RUN = 1_000_000
@@ -167,8 +169,8 @@ def run_plant(
         record, measured_anchor(runs.anchor, runs.anchor_std, layout, plant.parameters, rng)
     )
     if load is not None:
-        store_payload(record, layout, load.stated, load.std)
-        store_payload(truth, layout, load.true)
+        store_load(record, load.figures, load.figures_std)
+        store_load(truth, load.true_figures, 0.0 * load.figures_std)
     return Experiment(record, truth)
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
 from identify.errors import EstimationError
-from identify.loop_parameters import drives_of, in_form, loop_settings
+from identify.loop_parameters import carrying, drives_of, in_form, loop_settings
 from identify.model.loop_errors import loop_error_stds
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
@@ -25,13 +25,9 @@ from identify.record.checks import (
     checked_covariance,
     fewest_frames,
 )
-from identify.record.conditions import (
-    drift_warnings,
-    logged_latencies,
-    recorded_payload,
-    takes_torques,
-)
+from identify.record.conditions import drift_warnings, logged_latencies, takes_torques
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
+from identify.record.load import recorded_payload
 from identify.record.recording import poses, recorded_reference
 from identify.record.stored_common_errors import LATENCY, CommonErrors, read_common_errors
 from identify.scenario import Filter, Model, Scenario, Timing
@@ -83,7 +79,8 @@ def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
     Raises the ScenarioErrors of `in_form` and `loop_settings`.
     """
     model = scenario.model
-    robot = in_form(robot, model)
+    anchor = scenario.identification.scale_anchor
+    robot = carrying(in_form(robot, model), scenario.payload, anchor)
     timing = scenario.timing
     return ModelSide(
         robot=robot,
@@ -145,7 +142,7 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     robot = side.robot
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok, drift_warnings([record]))
-    load, load_std = recorded_payload(record, robot.layout)
+    load, load_errors = recorded_payload(record, robot.layout)
     run = LoopModel(
         robot=robot,
         settings=side.settings,
@@ -155,7 +152,7 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         covariance=checked_covariance(record["measured_covariance"].values, ok),
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
-        payload_std=load_std,
+        payload_errors=load_errors,
         acted=logged_latencies(record, side.timing),
     )
     # Common errors are added to the model afterwards, because they need its whitener.

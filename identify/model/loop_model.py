@@ -48,8 +48,8 @@ class LoopModel:
         Covariance of one measured pose.
     logged : ndarray, shape (N, n)
         Logged commands of the joints.
-    payload, payload_std : ndarray, shape (p,)
-        Change of the parameters by a known load on the platform, and its standard deviations.
+    payload, payload_errors : ndarray, shapes (p,) and (p, 7)
+        Change of the parameters by a known load on the platform, and its `load_errors`.
     common : CommonErrors
         Errors that all measured poses have in common.
     driven : bool
@@ -76,7 +76,7 @@ class LoopModel:
     covariance: Array
     logged: Array
     payload: Array
-    payload_std: Array
+    payload_errors: Array
     common: CommonErrors = NONE
     driven: bool = False
     acted: Array | None = None

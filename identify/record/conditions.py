@@ -10,12 +10,6 @@ different loop. If a record holds no such times, the model uses the latency of t
 are readings of one clock. They do not show the error of the stated mean latency
 (`timing.latency_std_s`).
 
-Load. A known load on the platform determines the scale of all parameters, if the same motion is
-made with and without it. The load is a rigid body with its centre of mass in the origin of the
-platform frame. Its mass and its principal moments of inertia add to those of the platform. A record
-holds the experimenter's values of these figures and their standard deviations. Records that state
-the same figures were made with the same load.
-
 Drift. The drift watch reports whether the cameras drifted during the run.
 """
 
@@ -28,11 +22,9 @@ import xarray as xr
 
 from dynamics.closed_loop import Drives
 from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
-from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
-from identify.files.dataset import Variables, as_number, check_variables, shown
-from identify.scenario.sections import check_load_std, check_moments
+from identify.files.dataset import Variables, check_variables
 from identify.scenario.timing import Timing
 
 SERVO = "pid"
@@ -153,78 +145,6 @@ def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
             f"{MAX_DELAY_FRAMES} frames are possible"
         )
     return None if np.abs(latencies - timing.latency_s).max() <= SAME_S else latencies
-
-
-ADDED = {
-    "payload_mass": ("platform.mass", "kg"),
-    "payload_Ixx": ("platform.Ixx", "kg m2"),
-    "payload_Iyy": ("platform.Iyy", "kg m2"),
-    "payload_Izz": ("platform.Izz", "kg m2"),
-}
-"""Attributes of a record, with the parameter to which each adds, and its unit.
-
-The standard deviation of each attribute has the same name with `_std` at the end.
-"""
-
-
-def payload_vector(
-    layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
-) -> Array:
-    """Return the change (p,) of a robot's parameters by a load.
-
-    For the standard deviations of the figures, it returns the standard deviations of the change.
-    """
-    added = np.zeros(len(layout.names))
-    for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
-        added[layout.names.index(parameter)] = value
-    return added
-
-
-def store_payload(
-    record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None
-) -> None:
-    """Store a load (p,) with the record made under it.
-
-    std (p,): standard deviations of the load. If None, the load is known exactly.
-    """
-    deviations = np.zeros(len(layout.names)) if std is None else std
-    for name, (parameter, _) in ADDED.items():
-        place = layout.names.index(parameter)
-        record.attrs |= {name: float(payload[place]), f"{name}_std": float(deviations[place])}
-
-
-def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
-    """Return the load (p,) of a record and its standard deviations (p,), zero without a load.
-
-    Raises RecordError if a figure is missing, a figure or its standard deviation is not a finite
-    number >= 0, no body has these moments, or a standard deviation exceeds its figure.
-    """
-    load = np.zeros(len(layout.names))
-    std = np.zeros(len(layout.names))
-    stated = record.attrs
-    # A record that states one figure must state all of them.
-    if not any(name in stated or f"{name}_std" in stated for name in ADDED):
-        return load, std
-    try:
-        for name, (parameter, unit) in ADDED.items():
-            place = layout.names.index(parameter)
-            load[place] = _not_negative(name, stated.get(name), unit)
-            std[place] = _not_negative(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
-            check_load_std(f"{name}_std", std[place], name, load[place], unit)
-        check_moments({name: float(stated[name]) for name in ADDED if name != "payload_mass"})
-    except ValueError as error:
-        raise RecordError(f"the record's attribute {error}") from None
-    return load, std
-
-
-def _not_negative(name: str, value: object, unit: str) -> float:
-    """Return an attribute's value, which must be a finite number >= 0."""
-    number = as_number(value)
-    if not 0 <= number < 1e6:
-        raise RecordError(
-            f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}"
-        )
-    return number
 
 
 DRIFT = "drift_watch"

@@ -7,7 +7,6 @@ identification and payload are used. Its additional table `[record]` holds furth
 The template for a user's record is a table with two example rows, and its TOML file.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -20,18 +19,18 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
-from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.conditions import payload_vector, store_payload
 from identify.record.csv_record import RULES, Table, columns_of, read_table
+from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import build_record, read
 from identify.scenario import Scenario
+from identify.scenario.payload import Payload
 from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.section import Section, quantity
-from identify.scenario.sections import LOAD_UNITS, Identification, Payload
+from identify.scenario.sections import Identification
 from identify.scenario.settings_file import one_line, starting_toml
 
 DESCRIPTION = "record"
@@ -121,7 +120,7 @@ def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     record.attrs["title"] = f"Record of {path.name}"
     _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:
-        _state_payload(record, robot.layout, scenario.payload)
+        _state_payload(record, scenario.payload)
     return record, scenario
 
 
@@ -228,14 +227,9 @@ def _state_anchor(
     }
 
 
-def _state_payload(record: xr.Dataset, layout: ParameterLayout, payload: Payload) -> None:
+def _state_payload(record: xr.Dataset, payload: Payload) -> None:
     """Store with a record the load on the platform and its standard deviations."""
-    load: Mapping[str, Any] = payload.model_dump()
-    vectors = []
-    for std in ("", "_std"):
-        mass, *moments = (load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items())
-        vectors.append(payload_vector(layout, mass, (moments[0], moments[1], moments[2])))
-    store_payload(record, layout, *vectors)
+    store_load(record, np.array(payload.figures), np.array(payload.figures_std))
 
 
 SCHEMA = Path(__file__).parent / "record.schema.json"

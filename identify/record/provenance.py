@@ -19,7 +19,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
-from identify.record.conditions import ADDED, OPTIONAL
+from identify.record.conditions import OPTIONAL
+from identify.record.load import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
 from identify.scenario import Scenario, scenario_from_toml
 

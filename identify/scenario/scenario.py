@@ -14,6 +14,7 @@ from dynamics.files import Name
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
+from identify.scenario.payload import Payload
 from identify.scenario.plant_sections import Control, DriveName, Model, Plant, Servo
 from identify.scenario.section import Section
 from identify.scenario.sections import (
@@ -23,7 +24,6 @@ from identify.scenario.sections import (
     Filter,
     Geometry,
     Identification,
-    Payload,
     Rig,
     Validation,
 )

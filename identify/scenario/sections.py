@@ -3,7 +3,6 @@
 Each field states its unit and its limits. A section checks only its own values.
 """
 
-from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -11,36 +10,6 @@ from pydantic import Field, field_validator, model_validator
 from dynamics.checks import Within
 from identify.own_parts import CRITERIA, LAWS, check_choice
 from identify.scenario.section import Section, quantity
-
-ROUNDING = 1e-9
-"""Relative tolerance for the moments of a flat body, whose largest moment is the sum of the
-others.
-"""
-
-
-def check_moments(moments: Mapping[str, float]) -> None:
-    """Check the three principal moments of inertia [kg m2] of one body, by their names.
-
-    Raises ValueError if one exceeds the sum of the other two, which no distribution of mass has.
-    """
-    # A late import: dynamics loads CasADi, which the help of the command line does not need.
-    from dynamics.pseudo_inertia import moments_fault
-
-    fault = moments_fault(moments, ROUNDING)
-    if fault:
-        raise ValueError(f"{fault} kg m2, which no rigid body can have")
-
-
-def check_load_std(name: str, std: float, load_name: str, load: float, unit: str) -> None:
-    """Check the standard deviation of a figure of a known load.
-
-    Raises ValueError if it exceeds the figure itself.
-    """
-    if std > load:
-        raise ValueError(
-            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: such a load is not "
-            "known"
-        )
 
 
 class Excitation(Section):
@@ -261,55 +230,6 @@ class Identification(Section):
             raise ValueError(
                 f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no "
                 f"parameter{hint}"
-            )
-        return self
-
-
-LOAD_UNITS = {"mass": "kg", "Ixx": "kg_m2", "Iyy": "kg_m2", "Izz": "kg_m2"}
-"""Figures of a load, with the units at the end of their keys."""
-
-
-class Payload(Section):
-    """Known load of the platform in the second run, if the scale anchor is a payload.
-
-    If the load is one per cent heavier than stated, all parameters are one per cent too small, and
-    no residual shows this. The standard deviations state how well the load is known. They widen the
-    intervals, and a synthetic experiment draws its true load from them.
-    """
-
-    mass_kg: float = quantity(
-        8.0, "kg", "mass; its centre is in the origin of the platform frame", gt=0
-    )
-    Ixx_kg_m2: float = quantity(
-        0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0
-    )
-    Iyy_kg_m2: float = quantity(
-        0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0
-    )
-    Izz_kg_m2: float = quantity(
-        0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0
-    )
-    mass_std_kg: float = quantity(
-        0.0, "kg", "standard deviation of the mass; 0 means exactly known", ge=0
-    )
-    Ixx_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
-    Iyy_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
-    Izz_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Izz_kg_m2", ge=0)
-
-    @model_validator(mode="after")
-    def _can_exist(self) -> "Payload":
-        check_moments(
-            {name: getattr(self, name) for name in ("Ixx_kg_m2", "Iyy_kg_m2", "Izz_kg_m2")}
-        )
-        return self
-
-    @model_validator(mode="after")
-    def _is_known(self) -> "Payload":
-        for figure, unit in LOAD_UNITS.items():
-            name = f"{figure}_{unit}"
-            std = f"{figure}_std_{unit}"
-            check_load_std(
-                std, getattr(self, std), name, getattr(self, name), unit.replace("_", " ")
             )
         return self
 

@@ -331,7 +331,7 @@ def test_records_that_share_a_draw_do_not_average_it():
                 all_names=common.all_names),
             driven=True,
             ok=np.ones(frames, dtype=bool),
-            payload_std=np.zeros(size),
+            payload_errors=np.zeros((size, 7)),
         )  # fmt: skip
 
     def covariance(second):

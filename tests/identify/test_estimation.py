@@ -25,7 +25,7 @@ from identify.experiment.plant import drawn_load
 from identify.loop_parameters import choose_parameters
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
-from identify.record.conditions import store_payload
+from identify.record.load import store_payload
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs

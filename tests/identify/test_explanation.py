@@ -104,7 +104,7 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
             common=NONE,
             driven=True,
             ok=np.ones(frames, dtype=bool),
-            payload_std=np.zeros(size),
+            payload_errors=np.zeros((size, 7)),
         )
         guess = SimpleNamespace(rows=np.eye(size))
         problem = SimpleNamespace(

@@ -18,7 +18,7 @@ from identify.estimation.prior import ScaleAnchor, store_anchor
 from identify.experiment.plant import drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
-from identify.record.conditions import store_payload
+from identify.record.load import store_payload
 from identify.record.recording import poses
 from identify.studies.rows.row_sensor import DrawnSensor
 from tests.identify.synthetic import (

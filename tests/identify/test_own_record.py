@@ -14,7 +14,8 @@ from identify.commands.help import NOT_DONE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
 from identify.model.from_record import identified_model
-from identify.record.conditions import OPTIONAL, recorded_payload
+from identify.record.conditions import OPTIONAL
+from identify.record.load import recorded_payload
 from identify.record.own_record import read_own_records
 from identify.record.recording import VARIABLES, poses, read
 from tests.identify.commands import command, one_line
@@ -141,8 +142,8 @@ def test_a_second_table_may_be_of_the_robot_under_a_known_load(mine, record):
         )
     (free, loaded), scenario = read_own_records([mine, mine.with_name("loaded.csv")])
     assert not recorded_payload(free, LAYOUT)[0].any()
-    load, std = recorded_payload(loaded, LAYOUT)
-    assert (load[index_of("platform.mass")], std[index_of("platform.mass")]) == (5.0, 0.01)
+    load, errors = recorded_payload(loaded, LAYOUT)
+    assert (load[index_of("platform.mass")], errors[index_of("platform.mass"), 0]) == (5.0, 0.01)
     assert load[index_of("platform.Izz")] == scenario.payload.Izz_kg_m2
     assert free.attrs["scale_anchor"] == "payload"
 

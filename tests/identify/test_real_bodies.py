@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+import dynamics
 import identify
 from identify.diagnosis.body_causes import body_causes
-from identify.errors import ScenarioError
+from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import asked_of, output_error_problem
+from identify.record.load import load_errors, load_parameters
 
 pytestmark = pytest.mark.slow
 
@@ -52,7 +54,7 @@ def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
     full = run.robot.with_full_bodies(["platform"])
     layout, count = full.layout, len(run.robot.parameter_names)
     same = np.append(run.robot.layout.converted(parameters[:count], layout), parameters[count:])
-    there = replace(run, robot=full, payload=0 * same, payload_std=0 * same)
+    there = replace(run, robot=full, payload=0 * same, payload_errors=np.zeros((len(same), 7)))
     exact = there.simulate(same, sensitivities=True).pose_sensitivity
     base, found = run.model_poses(parameters), {}
     for cause in body_causes(problem, parameters):
@@ -112,6 +114,69 @@ def test_possible_bodies_are_found_in_log_cholesky_coordinates():
     platform = np.flatnonzero([name.startswith("platform") for name in free.names])
     off = np.abs(physical.estimate - free.estimate)[platform]
     assert (off < 0.2 * free.std[platform]).all()
+
+
+LOAD = {
+    "mass_kg": 8.0,
+    "z_m": 0.13,
+    "Ixx_kg_m2": 0.02,
+    "Iyy_kg_m2": 0.02,
+    "Izz_kg_m2": 0.04,
+    "mass_std_kg": 0.004,
+    "z_std_m": 0.0005,
+}
+
+
+def test_a_load_on_the_top_plane_fixes_the_scale():
+    """8 kg, 0.13 m above the joint plane: the gains, which poses know up to the scale, to 0.5 %."""
+    scenario = identify.load_scenario(
+        "quick",
+        renderer="statistical",
+        identification={"scale_anchor": "payload"},
+        payload=LOAD,
+        plant={"values": {**uneven((0.0, 0.0, 0.03)), "platform.mass": MASS}},
+    )
+    setup = identify.set_up(scenario, 1)
+    records = [setup.run(), setup.run(payload=True)]
+    assert records[1].attrs["payload_z"] == 0.13
+    assert records[1].attrs["payload_z_std"] == 0.0005
+    result = identify.identify(records)
+    table = result.table(truth=records[0].truth)
+    assert result.explained
+    lp = table.loc["joint_pid.lp"]
+    assert abs(lp.estimate / lp.true - 1) < 0.005
+    held = table[table.identifiable].holds
+    assert held.sum() >= binom.ppf(1e-4, len(held), 0.95)
+
+
+def test_changes_by_a_load_are_those_of_its_body_put_on_the_platform():
+    """Points of mass on a platform: their sums are the parameters of the load about its frame; its
+    errors are differences.
+    """
+    layout = dynamics.load_robot("rss6").with_full_bodies(["platform"]).layout
+    figures = np.array([8.0, 0.02, -0.01, 0.13, 0.02, 0.03, 0.04])
+    second = figures[4:].sum() / 2 - figures[4:]
+    ends = [
+        sign * np.sqrt(1.5 * one / 4.0) * way
+        for one, way in zip(second, np.eye(3), strict=True)
+        for sign in (1, -1)
+    ]
+    points, mass = figures[1:4] + np.array(ends), np.full(6, 8.0 / 6)
+    expected = [8.0, *(mass @ points)]
+    square = sum(
+        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(mass, points, strict=True)
+    )
+    expected += [*np.diagonal(square), square[0, 1], square[0, 2], square[1, 2]]
+    np.testing.assert_allclose(load_parameters(layout, figures)[:10], expected, atol=1e-12)
+    std = np.array([0.01, 1e-3, 2e-3, 3e-3, 1e-3, 1e-3, 1e-3])
+    errors = load_errors(layout, figures, std)
+    for place, one in enumerate(1e-6 * np.eye(7)):
+        slope = load_parameters(layout, figures + one) - load_parameters(layout, figures - one)
+        np.testing.assert_allclose(errors[:, place], std[place] * slope / 2e-6, atol=1e-9)
+    with pytest.raises(
+        RecordError, match="origin of the platform frame, but the platform is centred"
+    ):
+        load_parameters(dynamics.load_robot("rss6").layout, figures)
 
 
 def test_bodies_and_values_that_there_are_not_are_refused_in_one_line():

@@ -21,7 +21,7 @@ from identify.files.run_folder import load_result, save_result
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
-from identify.record.conditions import recorded_payload
+from identify.record.load import recorded_payload
 from identify.record.provenance import check_robot
 from identify.record.recording import (
     build_model_run,
