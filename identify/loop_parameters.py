@@ -5,15 +5,23 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import ceil
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from dynamics import Robot
-from dynamics.closed_loop import Drives, FrameTiming, FrictionLaw, LoopSettings, ServoGains
+from dynamics.closed_loop import (
+    Drives,
+    FrameTiming,
+    FrictionLaw,
+    LoopSettings,
+    ServoGains,
+    stability,
+)
 from dynamics.closed_loop.drives import DRIVES, DriveName
-from dynamics.errors import ParameterError
+from dynamics.errors import DynamicsError, ParameterError
 from dynamics.parameters import JOINT_PID, may_be_absent
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
@@ -33,7 +41,8 @@ def loop_settings(
     """Return the settings of the loop around the plant or the model.
 
     The latency is the mean latency. Friction law, drive law and integration steps come from `side`,
-    the plant or the model. Only the torque limit comes from `control`.
+    the plant or the model. A model takes more steps if the robot needs them. Only the torque limit
+    comes from `control`.
 
     Raises ScenarioError if only the key for sliding actuators is set but the robot's actuators
     turn, or the reverse.
@@ -44,9 +53,34 @@ def loop_settings(
         servo=ServoGains(servo.kp, servo.kd, servo.ki),
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
         friction=FrictionLaw(side.friction, smoothing, side.static_ratio, stribeck),
-        steps_per_frame=side.steps_per_frame,
+        steps_per_frame=_steps_per_frame(robot, side, timing.frame_period_s),
         drives=drives_of(side, of_actuators(robot, control, "torque_limit")),
     )
+
+
+LONGEST_STEP = 0.3
+"""Longest integration step of a model, as a multiple of the time constant of its fastest motion."""
+
+
+def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:
+    """Return the integration steps per frame of length `period`, s.
+
+    A model has as many as the fastest motion of the robot needs at home, with its initial guess.
+    """
+    if not isinstance(side, Model) or side.start_parameters not in robot.parameter_sets:
+        return side.steps_per_frame
+    try:
+        rate = _fastest_rate(robot, side.start_parameters, drives_of(side, None))
+    except DynamicsError:
+        # the same error is raised where the model is run, with all that is known there
+        return side.steps_per_frame
+    return max(side.steps_per_frame, ceil(rate * period / LONGEST_STEP))
+
+
+@lru_cache(maxsize=64)
+def _fastest_rate(robot: Robot, set_name: str, drives: Drives) -> float:
+    parameters = robot.parameter_sets[set_name].vector
+    return stability.fastest_rate(robot, parameters, drives, robot.home_pose)
 
 
 def drives_of(side: Plant | Model, torque_limit: float | None) -> Drives:

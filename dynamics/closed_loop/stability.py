@@ -44,6 +44,15 @@ def frame_map(
     return _frame_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
+def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.ndarray) -> float:
+    """Magnitude, 1/s, of the fastest eigenvalue of the robot under its drives at a pose (6,).
+
+    Raises the same errors as `closed_loop.equilibrium`.
+    """
+    near = _near_rest(robot, parameters, pose, drives)
+    return float(np.abs(np.linalg.eigvals(near.motion)).max())
+
+
 def pose_response(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> Callable[[float], np.ndarray]:

@@ -326,7 +326,13 @@ class Model(_Side):
         ge=0,
         le=0.1,
     )
-    steps_per_frame: int = quantity(4, "1", "integration steps per frame", ge=1, le=10_000)
+    steps_per_frame: int = quantity(
+        4,
+        "1",
+        "least integration steps per frame; a robot with faster motion has more",
+        ge=1,
+        le=10_000,
+    )
 
     @property
     def drive_law(self) -> DriveName:
