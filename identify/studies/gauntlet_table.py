@@ -137,15 +137,21 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
     """Return the share of intervals that hold where the cause was named, and its deviation.
 
     The deviation comes from the spread from case to case, since intervals of a case depend on each
-    other. Empty if no cause was named.
+    other. Cases in which nothing is identified after the remedy are counted apart. Empty if no
+    cause was named.
     """
     named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
     percent = named["covered_percent"].dropna()
     if not len(percent):
         return {}
-    std = float(percent.std(ddof=1) / np.sqrt(len(percent))) if len(percent) > 1 else float("nan")
-    found = {"cases": len(percent), "covered_percent": float(percent.mean())}
-    return found | ({"std_percent": std} if np.isfinite(std) else {})
+    found = {
+        "cases": len(percent),
+        "cases_without_intervals": len(named) - len(percent),
+        "covered_percent": float(percent.mean()),
+    }
+    if len(percent) == 1:
+        return found
+    return found | {"std_percent": float(percent.std(ddof=1) / np.sqrt(len(percent)))}
 
 
 def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
@@ -228,8 +234,9 @@ def _tables(
         std = covered.get("std_percent")
         band = "" if std is None else f"± {1.96 * std:.2g} %"
         share = f"{covered['covered_percent']:.3g} %"
-        what = "95 % intervals that hold after the remedy"
-        rows.append([what, f"{covered['cases']} cases", share, band, "93 to 97 %"])
+        what = "95 % intervals that hold after the remedy, where any are identified"
+        named = covered["cases"] + covered["cases_without_intervals"]
+        rows.append([what, f"{covered['cases']} of {named} cases", share, band, "93 to 97 %"])
     if (ratio := entry["time_ratio_median"]) is not None:
         what = "time with diagnosis over time without, median"
         rows.append([what, f"{len(cases)} cases", f"{ratio:.3g}", "", "≤ 2"])
@@ -239,7 +246,13 @@ def _tables(
         "One trouble a case, by kind",
         ["trouble", "cases", "right", "misfit, median", "intervals that hold"],
         [
-            [name, str(count), str(right), f"{misfit:.3g}", f"{covered:.3g} %"]
+            [
+                name,
+                str(count),
+                str(right),
+                f"{misfit:.3g}",
+                "none" if np.isnan(covered) else f"{covered:.3g} %",
+            ]
             for name, count, right, misfit, covered in kinds(cases)
         ],
     )
