@@ -18,8 +18,12 @@ from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whit
 if TYPE_CHECKING:
     import pandas as pd
 
-MOST_OF_IT = 0.5
-"""Share of the misfit that the causes must explain for it to count as explained."""
+MOST_OF_IT = 0.9
+"""Share of the misfit that the causes must explain for it to count as explained.
+
+A cause that is there leaves noise once it is fitted. Groups of many numbers can take up most of the
+effect of a cause outside the catalogue.
+"""
 
 
 NAMED = 3
@@ -135,7 +139,7 @@ class Diagnosis:
 
     @property
     def none_of_these(self) -> bool:
-        """True if the model misses the record, and the findings explain less than half of that."""
+        """True if the model misses the record, and the findings leave more than a tenth of that."""
         return self.misfit.significant and self.explained < MOST_OF_IT
 
     def __str__(self) -> str:

@@ -180,7 +180,10 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
 
 
 def torque_limit(run: LoopModel, peak: float) -> Cause:
-    """Return a limit of the torques below that of the model. peak: its largest torque."""
+    """Return a limit of the torques below that of the model. peak: its largest torque.
+
+    Where a robot carries its weight, motion adds only a few per cent to the torque.
+    """
     layout = run.robot.layout
     unit = layout.unit("joint1.coulomb")
     key = unit.replace(" ", "_")
@@ -200,7 +203,7 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
             f"drives cut {100 * size:.3g} % of the largest torque"
         ),
         least=0.0,
-        tried=(0.05, 0.15, 0.35),
+        tried=(0.003, 0.01, 0.03, 0.1, 0.3),
     )
 
 
