@@ -208,7 +208,8 @@ def test_bodies_that_exist_are_identified_as_such(seed):
     well. Its intervals hold what those without bounds hold, which a linearisation predicts to a
     fifth of a standard deviation."""
     flat = truth()
-    flat[LAYOUT.rigid] = physical_inertias(LAYOUT, flat, allow_changes=True).values.ravel()
+    bodies = physical_inertias(LAYOUT, flat, allow_changes=True).values
+    flat[LAYOUT.rigid] = LAYOUT.rigid_of(bodies)
     # just below Ixx + Iyy, as of a plate
     flat[NAMES.index("platform.Izz")] = 0.999 * flat[1:3].sum()
     scenario = quick(**{"identification.method": "command_driven"})
