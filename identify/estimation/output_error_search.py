@@ -112,13 +112,13 @@ class InCoordinates:
 
     def cost(self, parameters: Array) -> float:
         """Return the cost at coordinates (p,)."""
-        # far steps in logarithms of a body can make it larger than any number
-        with np.errstate(over="ignore"):
-            return self.problem.cost(self.bounds.parameters(parameters))
+        return self.problem.cost(self.bounds.parameters(parameters))
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
         """Return cost and linearisation at coordinates (p,)."""
-        cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
+        # far steps in logarithms of a body can make it larger than any number
+        with np.errstate(over="ignore"):
+            cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
         return cost, factor @ self.bounds.slope(parameters), residual
 
 
