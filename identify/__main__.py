@@ -1,5 +1,7 @@
 """Entry point of the command ``cmmsim``. It handles Ctrl-C even while the libraries are loaded."""
 
+import atexit
+import signal
 import sys
 
 from identify.runtime import STOPPED, interruptible, interruptible_imports
@@ -19,6 +21,8 @@ def main() -> None:
         # If Ctrl-C came in code that Python compiled from a string, Python would end itself by the
         # signal and ignore the exit status. Running another string makes it forget that.
         exec("")
+        # The work is done. Ctrl-C while Python shuts down must not change the exit status.
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
 
 if __name__ == "__main__":
