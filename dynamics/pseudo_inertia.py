@@ -49,22 +49,23 @@ def from_log_cholesky(coordinates: np.ndarray) -> np.ndarray:
     The pseudo-inertia is U U^T with the upper triangular matrix U = exp(alpha) times
     [[exp(d1), s1, s2, t1], [0, exp(d2), s3, t2], [0, 0, exp(d3), t3], [0, 0, 0, 1]].
     """
+    factor = np.exp(coordinates[0]) * _unit_factor(coordinates)
+    return inertial_parameters(factor @ factor.T)
+
+
+def _unit_factor(coordinates: np.ndarray) -> np.ndarray:
+    """Factor U (4, 4) of log-Cholesky coordinates (10,), without its scale exp(alpha)."""
     factor = np.eye(4)
     factor[range(3), range(3)] = np.exp(coordinates[1:4])
     for place, (row, column) in enumerate(PAIRS, 4):
         factor[row, column] = coordinates[place]
     factor[:3, 3] = coordinates[7:]
-    factor *= np.exp(coordinates[0])
-    return inertial_parameters(factor @ factor.T)
+    return factor
 
 
 def log_cholesky_slope(coordinates: np.ndarray) -> np.ndarray:
     """Derivatives (10, 10) of the full body with respect to its log-Cholesky coordinates (10,)."""
-    factor = np.eye(4)
-    factor[range(3), range(3)] = np.exp(coordinates[1:4])
-    for place, (row, column) in enumerate(PAIRS, 4):
-        factor[row, column] = coordinates[place]
-    factor[:3, 3] = coordinates[7:]
+    factor = _unit_factor(coordinates)
     scale = np.exp(coordinates[0])
     changes = np.zeros((10, 4, 4))
     changes[0] = factor
@@ -112,11 +113,6 @@ def full_body(mass: float, centre: np.ndarray, inertia: np.ndarray) -> np.ndarra
 def is_centred(body: np.ndarray) -> bool:
     """Return True if first moments and products of inertia of a full body (10,) are zero."""
     return not body[1:4].any() and not body[7:].any()
-
-
-def principal_moments(body: np.ndarray) -> np.ndarray:
-    """Principal moments of inertia (3,) about the centre of mass, in ascending order."""
-    return np.linalg.eigvalsh(about_centre(body)[1])
 
 
 def body_fault(body: np.ndarray, smallest: float = 0.0) -> str:

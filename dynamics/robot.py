@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -255,8 +256,12 @@ class Robot(RobotDynamics):
         """
         return self._in_form(own_gains=flag("own", own, DynamicsError))
 
+    @lru_cache(maxsize=64)  # noqa: B019 - users ask for the same few forms of a few robots
     def _in_form(self, **form: Any) -> Robot:
-        """Robot with another form of its parameters, which are fields of its geometry."""
+        """Robot with another form of its parameters, which are fields of its geometry.
+
+        It is kept, because results such as base parameters are kept by robot.
+        """
         geometry = replace(self.geometry, **form)
         own = self.layout
         other = geometry.layout

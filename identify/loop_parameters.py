@@ -143,7 +143,7 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
     robot = _with_gains(robot, side)
     if side.passive_friction is not None:
         try:
-            robot = _with_passive_friction(robot, tuple(side.passive_friction))
+            robot = robot.with_passive_friction(side.passive_friction)
         except ParameterError as error:
             raise ScenarioError(
                 f"{type(side).__name__.lower()}.passive_friction: {error}"
@@ -165,7 +165,7 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
         for body, kind, full in zip(layout.bodies, kinds, layout.full, strict=True)
     ]
     names = [body for body, form in zip(layout.bodies, forms, strict=True) if form == "full"]
-    return _with_full_bodies(robot, tuple(names))
+    return robot.with_full_bodies(names)
 
 
 def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
@@ -176,13 +176,7 @@ def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
     full = robot.layout.full_bodies
     if anchor != "payload" or not load.off_origin or "platform" in full:
         return robot
-    return _with_full_bodies(robot, (*full, "platform"))
-
-
-@lru_cache(maxsize=16)
-def _with_full_bodies(robot: Robot, names: tuple[str, ...]) -> Robot:
-    """Return `Robot.with_full_bodies`, from a cache, because base parameters are kept by robot."""
-    return robot.with_full_bodies(names)
+    return robot.with_full_bodies((*full, "platform"))
 
 
 def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
@@ -205,12 +199,6 @@ def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
                 f"{where}.gains = 'shared', but the parameter set {set_name!r} of robot "
                 f"{robot.name} has {' and '.join(names)}: set {where}.gains = 'each'"
             )
-    return with_own_gains(robot, own)
-
-
-@lru_cache(maxsize=16)
-def with_own_gains(robot: Robot, own: bool = True) -> Robot:
-    """Return `Robot.with_own_gains`, from a cache, because base parameters are kept by robot."""
     return robot.with_own_gains(own)
 
 
@@ -241,12 +229,6 @@ def known_value(values: Mapping[str, float], name: str) -> float | None:
 def is_gain(name: str) -> bool:
     """Return True for a gain of the joint PID, shared or of one joint."""
     return name.rpartition(".")[2] in JOINT_PID
-
-
-@lru_cache(maxsize=16)
-def _with_passive_friction(robot: Robot, names: tuple[str, ...]) -> Robot:
-    """Return `Robot.with_passive_friction`, from a cache."""
-    return robot.with_passive_friction(names)
 
 
 @dataclass(frozen=True)

@@ -213,7 +213,8 @@ class RssLeg(Leg):
 
     def driven_inertia(self, body: np.ndarray) -> float:
         """Inertia of the crank about its axis."""
-        mass, along, izz = body[0], body[1], body[6]
+        mass, along, *_ = body
+        izz = body[6]
         return float(izz + along * self.crank_length + mass * self.crank_length**2 / 4)
 
     def segments(self) -> list[Segment]:

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from dynamics import Robot
+from dynamics.closed_loop import ClosedLoopRun
 from dynamics.expressions import function
 from dynamics.geometry import RobotGeometry
 from dynamics.parameters import parameter_layout, passive_parameters
@@ -22,6 +23,7 @@ from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, pose_columns
+from identify.diagnosis.loop_causes import joint_rates
 from identify.estimation.output_error import OutputErrorProblem
 from identify.filtering import spline_derivatives
 from identify.model.loop_model import LoopModel
@@ -53,23 +55,29 @@ class Needed:
 class RunMotion:
     """Motion of a run of the model at its frames.
 
-    poses, twists, twist_dots (N, 6). torque_maps (N, n, 6): torques of the joints by a wrench on
-    the platform.
+    poses, twists, twist_dots (N, 6). joint_rates (N, n). torque_maps (N, n, 6): torques of the
+    joints by a wrench on the platform.
     """
 
     poses: Array
     twists: Array
     twist_dots: Array
+    joint_rates: Array
     torque_maps: Array
 
 
-def body_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the causes in bodies and joints of a problem at its optimum (p,)."""
-    motions = [run_motion(run, parameters) for run in problem.runs]
+def body_causes(
+    problem: OutputErrorProblem, parameters: Array, runs: Sequence[ClosedLoopRun]
+) -> tuple[Cause, ...]:
+    """Return the causes in bodies and joints of a problem at its optimum (p,).
+
+    runs: those of the model.
+    """
+    motions = [run_motion(run, found) for run, found in zip(problem.runs, runs, strict=True)]
     needed = [
         *_uneven_bodies(problem.runs[0].robot, parameters, motions),
         *_passive_friction(problem.runs[0].robot, motions),
-        *_uneven_friction(problem.runs, motions),
+        *_uneven_friction(problem.runs[0].robot, motions),
     ]
 
     def columns(changed: OutputErrorProblem, at: Array) -> Array:
@@ -90,9 +98,8 @@ def body_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, 
     )
 
 
-def run_motion(run: LoopModel, parameters: Array) -> RunMotion:
-    """Return the motion of a run of the model at parameters (p,)."""
-    found = run.simulate(parameters)
+def run_motion(run: LoopModel, found: ClosedLoopRun) -> RunMotion:
+    """Return the motion of the model in a run."""
     robot = run.robot
     chart = robot.geometry.chart
     poses = chart.pose(chart.coordinates(found.pose))
@@ -101,7 +108,13 @@ def run_motion(run: LoopModel, parameters: Array) -> RunMotion:
     free = chart.basis
     jacobians = robot.joint_jacobian(poses) @ free
     maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
-    return RunMotion(poses, robot.twist(poses, rates), robot.twist_dot(poses, rates, gains), maps)
+    return RunMotion(
+        poses=poses,
+        twists=robot.twist(poses, rates),
+        twist_dots=robot.twist_dot(poses, rates, gains),
+        joint_rates=joint_rates(run, found),
+        torque_maps=maps,
+    )
 
 
 def _added(one: Needed) -> Change:
@@ -243,13 +256,10 @@ def _passive_function(geometry: RobotGeometry) -> ca.Function:
     return function("passive_friction", given, [passive_friction_columns(geometry, *given)])
 
 
-def _uneven_friction(runs: Sequence[LoopModel], motions: Sequence[RunMotion]) -> list[Needed]:
+def _uneven_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
     """Return the half differences of the dry friction of each joint between its two directions."""
-    layout = runs[0].robot.layout
-    rates = [
-        np.einsum("kij,kj->ki", run.robot.joint_jacobian(one.poses), one.twists)
-        for run, one in zip(runs, motions, strict=True)
-    ]
+    layout = robot.layout
+    rates = [one.joint_rates for one in motions]
     typical = np.sqrt(np.mean(np.concatenate(rates) ** 2, axis=0))
     moving = [np.abs(rate) > MOVING * typical for rate in rates]
     return [

@@ -16,12 +16,13 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
 
     Companions of others stand behind them all.
     """
+    runs = [run.simulate(parameters) for run in problem.runs]
     causes = (
         *command_causes(problem),
         *geometry_causes(problem),
         *gain_causes(problem, parameters),
-        *loop_causes(problem, parameters),
-        *body_causes(problem, parameters),
+        *loop_causes(problem, parameters, runs),
+        *body_causes(problem, parameters, runs),
         *measurement_causes(problem, parameters),
     )
     return (*causes, *(one.companion for one in causes if one.companion is not None))

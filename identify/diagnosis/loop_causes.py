@@ -8,7 +8,7 @@ A joint whose motor drives the body through a spring is behind its motor by the 
 stiffness. To first order that is a shift of its command.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,9 +33,10 @@ DEFLECTION = {"rad": 1e-4, "m": 1e-5}
 """Deflection at the largest torque for differences, by the unit of joint coordinates."""
 
 
-def loop_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the causes in the loop of a problem at its optimum (p,)."""
-    runs = [run.simulate(parameters) for run in problem.runs]
+def loop_causes(
+    problem: OutputErrorProblem, parameters: Array, runs: Sequence[ClosedLoopRun]
+) -> tuple[Cause, ...]:
+    """Return the causes in the loop of a problem at its optimum (p,). runs: those of the model."""
     rates = [joint_rates(run, found) for run, found in zip(problem.runs, runs, strict=True)]
     typical = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
     peak = max(float(np.abs(found.torque).max()) for found in runs)
@@ -133,7 +134,7 @@ def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
 def elasticity(
     problem: OutputErrorProblem,
     parameters: Array,
-    runs: list[ClosedLoopRun],
+    runs: Sequence[ClosedLoopRun],
     rates: list[Array],
 ) -> Cause:
     """Return the compliance of the joints, the same for all, at an optimum (p,).

@@ -136,7 +136,7 @@ class ParameterBounds:
 
     @property
     def _signed(self) -> NDArray[np.bool_]:
-        """Which parameters (p,) may be negative."""
+        """Return which parameters (p,) may be negative."""
         gains = len(self.layout.names) - len(self.layout.signed)
         return np.append(self.layout.signed, np.zeros(gains, dtype=bool))
 

@@ -113,7 +113,7 @@ def identifiability(
     unsaid = np.where(friction(layout), held, 1.0)
     uneven = ASYMMETRY_SHARE * asymmetry(robot, guess.values)
     unsaid[layout.inertial] = np.where(layout.signed[layout.inertial], uneven, 1.0)
-    unsaid[layout.passive] = FRICTION_SHARE * passive_torque(robot, held / FRICTION_SHARE)
+    unsaid[layout.passive] = passive_torque(robot, held)
     sizes = np.where(guess.values != 0, np.abs(guess.values), unsaid)
     return Identifiability(guess.std, sizes, model_holds)
 

@@ -9,7 +9,6 @@ from dynamics.closed_loop import ClosedLoopRun
 from dynamics.closed_loop.drives import JointLaw
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
-from identify.loop_parameters import with_own_gains
 from identify.model.loop_model import LoopModel
 
 
@@ -27,7 +26,7 @@ class UnequalGains(LoopModel):
 
     def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
         dynamic = (parameters + self.payload)[robot.layout.dynamic]
-        return with_own_gains(robot), np.concatenate([dynamic, self._gains(parameters).ravel()])
+        return robot.with_own_gains(), np.concatenate([dynamic, self._gains(parameters).ravel()])
 
     def drive_law(self, parameters: Array) -> JointLaw:
         """Return the law of the drives with the gains of each joint."""

@@ -43,7 +43,7 @@ def load_errors(layout: ParameterLayout, figures: Array, std: Array) -> Array:
 
     They are of first order. Raises the RecordError of `load_parameters`.
     """
-    mass, (x, y, z) = figures[0], figures[CENTRE]
+    mass, x, y, z = figures[:4]
     square = [y * y + z * z, x * x + z * z, x * x + y * y]
     slopes = np.zeros((7, 10))
     slopes[0] = [1, x, y, z, *square, -x * y, -x * z, -y * z]

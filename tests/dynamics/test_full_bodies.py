@@ -14,6 +14,7 @@ from dynamics.pseudo_inertia import (
     full_body,
     inertial_parameters,
     log_cholesky,
+    log_cholesky_slope,
     nearest_body,
     pseudo_inertia,
 )
@@ -231,6 +232,12 @@ def test_a_body_exists_where_its_mass_can_be_made_of_points():
         np.testing.assert_allclose(inertial_parameters(pseudo_inertia(body)), body, atol=1e-12)
         np.testing.assert_allclose(from_log_cholesky(log_cholesky(body)), body, atol=1e-11)
         np.testing.assert_allclose(full_body(body[0], *about_centre(body)), body, atol=1e-12)
+        at = log_cholesky(body)
+        slopes = [
+            (from_log_cholesky(at + step) - from_log_cholesky(at - step)) / 2e-6
+            for step in 1e-6 * np.eye(10)
+        ]
+        np.testing.assert_allclose(log_cholesky_slope(at), np.transpose(slopes), atol=1e-7)
         assert body_fault(body) == ""
         assert np.linalg.eigvalsh(pseudo_inertia(from_log_cholesky(rng.standard_normal(10))))[0] > 0
         impossible = body + 3 * np.abs(body) * (np.arange(10) == 4 + rng.integers(3))

@@ -15,6 +15,12 @@ from identify.studies.rows.row_sensor import rms_um
 from identify.validation.unseen import PosePrediction
 
 
+def intervals_hold(result: IdentificationResult, plant: Plant) -> tuple[bool, ...]:
+    """Return for each identified quantity whether its 95 % interval contains the truth."""
+    truth = plant.parameters_of(result.layout)
+    return tuple(inside for *_, identified, inside in quantities(result, truth) if identified)
+
+
 def coverage(
     result: IdentificationResult,
     plant: Plant,
@@ -41,11 +47,7 @@ def coverage(
         truth, share of true coordinates on the validation trajectories within their predicted
         interval, and rms error of the predicted positions.
     """
-    held = [
-        inside
-        for *_, identified, inside in quantities(result, plant.parameters_of(result.layout))
-        if identified
-    ]
+    held = intervals_hold(result, plant)
     errors = np.concatenate(
         [true_poses(one.truth) - of.poses for one, of in zip(unseen, predicted, strict=True)]
     )

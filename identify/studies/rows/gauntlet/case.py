@@ -9,18 +9,16 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError
-from identify.arrays import Array
 from identify.diagnosis.diagnose import diagnose
 from identify.diagnosis.diagnosis import Diagnosis, Finding
 from identify.errors import IdentifyError, ScenarioError
 from identify.estimation.identification import identify
-from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
 from identify.experiment.run import excitation_run
 from identify.random_streams import child, integer_seed
 from identify.scenario import Scenario, scenario_from_toml
 from identify.setup import Setup
-from identify.studies.rows.coverage import quantities
+from identify.studies.rows.coverage import intervals_hold
 from identify.studies.rows.gauntlet.catalogue import Wrong, drawn_troubles
 from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble
 from identify.studies.rows.identified import designed_trajectories, row_setup
@@ -82,7 +80,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is wrong in a case, and its record.
+    """Troubles of a case, and its record.
 
     again: seed of the record after something was mended. trajectory: seed of the exciting
     trajectory.
@@ -137,8 +135,9 @@ def run_case(case: Drawn) -> Case:
         trouble.remedy(found.findings[place - 1]) if place else Remedied()
         for trouble, (place, _) in zip(case.troubles, places, strict=True)
     ]
-    before = held(result, made.plant)
-    after, explained = before, result.explained
+    before = intervals_hold(result, made.plant)
+    after = before
+    explained = result.explained
     if any(place for place, _ in places):
         after, explained = after_remedies(case, remedies)
     return Case(
@@ -221,13 +220,7 @@ def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[boo
         result = identify(record, robot, known)
     except (IdentifyError, DynamicsError):
         return (), False
-    return held(result, made.plant), result.explained
-
-
-def held(result: IdentificationResult, plant: Plant) -> tuple[bool, ...]:
-    """Return for each identified quantity whether its 95 % interval contains the truth."""
-    truth: Array = plant.parameters_of(result.layout)
-    return tuple(inside for *_, identified, inside in quantities(result, truth) if identified)
+    return intervals_hold(result, made.plant), result.explained
 
 
 def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:

@@ -26,7 +26,7 @@ def unchanged_record(record: xr.Dataset) -> xr.Dataset:
 
 @dataclass(frozen=True)
 class Remedied:
-    """What a laboratory does about a finding.
+    """Remedy of a laboratory for a finding.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ def mend(finding: Finding) -> Remedied:
 
 @dataclass(frozen=True)
 class Trouble:
-    """What is wrong in a laboratory.
+    """Something wrong in a laboratory.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Trouble:
 
 @dataclass(frozen=True)
 class Laboratory:
-    """What a trouble is drawn for.
+    """Laboratory for which troubles are drawn.
 
     Attributes
     ----------
