@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynamics import Robot
 from dynamics.files import read_bytes
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
+from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
 RULES = """\
 A record begins at rest: before its first row the robot has stood still at the first reference pose,
@@ -33,9 +35,6 @@ Without rate columns, rates are computed from a spline through the reference.
 
 LARGEST = 200_000_000
 """Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes."""
-
-TIME_ROUNDING = 1e-3
-"""Largest error of the time between two rows, as a share of the frame period."""
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
@@ -95,22 +94,54 @@ class Table:
     groups: Mapping[str, Array]
     lines: tuple[int, ...]
 
-    def check_times(self, rate_hz: float) -> None:
-        """Check that the rows are one frame of this rate apart.
+    def telemetry(self) -> Telemetry:
+        """Return the logs of the table, whose rows hold a pose, a command and a reference each.
 
-        Raises RecordError with the line and the times.
+        Raises RecordError with the line if the times do not increase, or `measured_ok` is wrong.
         """
-        times = self.groups["time"][:, 0]
-        frames = np.diff(times) * rate_hz
-        wrong = np.flatnonzero(~(np.abs(frames - 1) <= TIME_ROUNDING))
-        if len(wrong):
-            row = int(wrong[0])
-            raise RecordError(
-                f"{self.path} line {self.lines[row + 1]}: time_s is {times[row + 1]:g} after "
-                f"{times[row]:g} in the row before, which is {frames[row]:.4g} frames of "
-                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a lost frame must have a row "
-                "with empty measured columns"
-            )
+        start = self.groups["time"][0, 0]
+        time = self.groups["time"][:, 0] - start
+        rows = Rows(str(self.path), self.lines)
+        ok = self._measured_ok()
+        written = self.groups.get("command_time")
+        # Poses in rows that are marked as lost are ignored.
+        poses = np.where(ok[:, None], self.groups["measured"], np.nan)
+        return Telemetry(
+            PoseLog(time, poses, ok, rows, self._covariances()),
+            CommandLog(
+                time,
+                self.groups["command"],
+                rows,
+                None if written is None else written[:, 0] - start,
+            ),
+            ReferenceLog(time, self.groups["reference"], rows, self.groups.get("rate")),
+        )
+
+    def _measured_ok(self) -> NDArray[np.bool_]:
+        """Return whether the pose of each row (N,) was measured.
+
+        Such a row has no empty measured cell. If the table has a column measured_ok, it is 1.
+        """
+        whole = np.asarray(np.isfinite(self.groups["measured"]).all(axis=1))
+        if "ok" not in self.groups:
+            return whole
+        stated = self.groups["ok"][:, 0]
+        for wrong, why in (
+            (~np.isin(stated, (0, 1)), "measured_ok must be 1 or 0"),
+            ((stated == 1) & ~whole, "measured_ok is 1, but a measured column is empty"),
+        ):
+            if wrong.any():
+                raise RecordError(f"{self.path} line {self.lines[int(np.argmax(wrong))]}: {why}")
+        return whole & (stated == 1)
+
+    def _covariances(self) -> Array | None:
+        """Return the covariances (N, 6, 6) of the measured poses, or None without such columns."""
+        if "covariance" not in self.groups:
+            return None
+        rows, columns = np.triu_indices(len(POSE))
+        values = np.empty((len(self.lines), 6, 6))
+        values[:, rows, columns] = values[:, columns, rows] = self.groups["covariance"]
+        return values
 
 
 def read_table(path: Path, robot: Robot) -> Table:

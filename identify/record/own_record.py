@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.interpolate import make_interp_spline
 
@@ -21,11 +20,11 @@ from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import POSE
-from identify.record.csv_record import RULES, Table, columns_of, read_table
+from identify.record.csv_record import RULES, columns_of, read_table
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import build_record, read
+from identify.record.telemetry import ReferenceLog, Telemetry
 from identify.scenario import Scenario
 from identify.scenario.payload import Payload
 from identify.scenario.scenario import SCENARIOS, scenario_schema
@@ -96,32 +95,44 @@ def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
 def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
     scenario, measured = read_description(description_file(path), path)
     robot = load_robot(scenario.robot)
-    table = read_table(path, robot)
-    table.check_times(scenario.timing.frame_rate_hz)
-    poses = table.groups["measured"]
-    ok = _measured_ok(table)
-    start = table.groups["time"][0, 0]
-    acted = table.groups.get("command_time")
+    telemetry = read_table(path, robot).telemetry()
+    record = _record(telemetry, robot, scenario, measured, path)
+    _state_anchor(record, scenario.identification, measured, description_file(path))
+    if measured.under_payload:
+        _state_payload(record, scenario.payload)
+    return record, scenario
+
+
+def _record(
+    telemetry: Telemetry, robot: Robot, scenario: Scenario, measured: Measured, path: Path
+) -> xr.Dataset:
+    """Return the record of a log. Raises RecordError if its times are not those of frames."""
+    poses = telemetry.poses
+    poses.check_grid(scenario.timing.frame_rate_hz)
+    reference = telemetry.reference
+    if reference is None or not telemetry.is_one_table:
+        raise RecordError(
+            f"{path}: each row must hold a pose, a command and a reference of the same time"
+        )
+    covariance = poses.covariance
     record = build_record(
-        time=table.groups["time"][:, 0] - start,
-        reference_pose=table.groups["reference"],
-        reference_rate=_rates(table, scenario.timing.frame_period_s),
-        # Poses in rows that are marked as lost are ignored.
-        measured_pose=np.where(ok[:, None], poses, np.nan),
-        measured_covariance=_covariances(table, measured, ok),
-        measured_ok=ok,
-        command=table.groups["command"],
-        command_time=None if acted is None else acted[:, 0] - start,
+        time=poses.time,
+        reference_pose=reference.pose,
+        reference_rate=_rates(reference, scenario.timing.frame_period_s),
+        measured_pose=poses.pose,
+        measured_covariance=_stated(measured, path, len(poses.ok))
+        if covariance is None
+        else covariance,
+        measured_ok=poses.ok,
+        command=telemetry.commands.command,
+        command_time=telemetry.commands.written,
         robot=robot.name,
         scenario_toml=scenario.to_toml(),
         frame_rate_hz=scenario.timing.frame_rate_hz,
         prismatic=robot.layout.prismatic,
     )
     record.attrs["title"] = f"Record of {path.name}"
-    _state_anchor(record, scenario.identification, measured, description_file(path))
-    if measured.under_payload:
-        _state_payload(record, scenario.payload)
-    return record, scenario
+    return record
 
 
 def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
@@ -159,52 +170,28 @@ def record_schema() -> dict[str, Any]:
     return schema
 
 
-def _measured_ok(table: Table) -> NDArray[np.bool_]:
-    """Return which rows (N,) hold a measured pose.
-
-    Such a row has no empty measured cell. If the table has a column measured_ok, it is 1.
-    """
-    whole = np.asarray(np.isfinite(table.groups["measured"]).all(axis=1))
-    if "ok" not in table.groups:
-        return whole
-    stated = table.groups["ok"][:, 0]
-    for wrong, why in (
-        (~np.isin(stated, (0, 1)), "measured_ok must be 1 or 0"),
-        ((stated == 1) & ~whole, "measured_ok is 1, but a measured column is empty"),
-    ):
-        if wrong.any():
-            raise RecordError(f"{table.path} line {table.lines[int(np.argmax(wrong))]}: {why}")
-    return whole & (stated == 1)
-
-
-def _rates(table: Table, frame_period_s: float) -> Array:
-    """Return the rates (N, 6) of the reference, from the table or from a spline through it."""
-    poses = table.groups["reference"]
+def _rates(reference: ReferenceLog, frame_period_s: float) -> Array:
+    """Return the rates (N, 6) of the reference, from the log or from a spline through it."""
+    if reference.rate is not None:
+        return reference.rate
     # A record that is too short for a spline is refused later, by the check of its length.
-    if "rate" in table.groups or len(poses) < 6:
-        return table.groups.get("rate", np.zeros_like(poses))
-    times = np.arange(len(poses)) * frame_period_s
-    return np.asarray(make_interp_spline(times, poses, k=5).derivative()(times), dtype=float)
+    if len(reference.pose) < 6:
+        return np.zeros_like(reference.pose)
+    times = np.arange(len(reference.pose)) * frame_period_s
+    spline = make_interp_spline(times, reference.pose, k=5)
+    return np.asarray(spline.derivative()(times), dtype=float)
 
 
-def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Array:
-    """Return the covariances (N, 6, 6) of the measured poses.
-
-    They come from the table, or from the standard deviations in the description.
-    """
-    if "covariance" in table.groups:
-        rows, columns = np.triu_indices(len(POSE))
-        values = np.empty((len(ok), 6, 6))
-        values[:, rows, columns] = values[:, columns, rows] = table.groups["covariance"]
-        return values
+def _stated(measured: Measured, path: Path, count: int) -> Array:
+    """Return the covariances (N, 6, 6) of measured poses that the description states."""
     if measured.position_std_m is None or measured.orientation_std_rad is None:
         raise RecordError(
-            f"{table.path} has no covariance columns, so {description_file(table.path)} must state "
+            f"{path} has no covariance columns, so {description_file(path)} must state "
             f"position_std_m and orientation_std_rad in [{DESCRIPTION}], the standard deviations "
             "of a measured pose"
         )
     std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
-    return np.tile(np.diag(std**2), (len(ok), 1, 1))
+    return np.tile(np.diag(std**2), (count, 1, 1))
 
 
 def _state_anchor(

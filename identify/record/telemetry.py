@@ -1,0 +1,152 @@
+"""Logs of a run: poses, commands and the reference, each with times of its own.
+
+Readers of files make a Telemetry, whatever the columns are called in a file. Units are m, rad and
+s, and the conventions are those of records. Times count from the first pose of the record. Commands
+can be logged at another rate than poses, and begin before them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identify.arrays import Array
+from identify.errors import RecordError
+
+TIME_ROUNDING = 1e-3
+"""Largest error of the time between two frames, as a share of the frame period."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Places of rows in a file, which messages name."""
+
+    source: str
+    """File, or file and topic."""
+
+    numbers: Sequence[int]
+    """Number of each row, counted from 1."""
+
+    word: str = "line"
+    """What a row is called: line or message."""
+
+    def place(self, row: int) -> str:
+        """Return where a row, counted from 0, is found: ``mine.csv line 12``."""
+        return f"{self.source} {self.word} {self.numbers[row]}"
+
+
+@dataclass(frozen=True)
+class PoseLog:
+    """Measured poses (N, 6), NaN where lost, and the times (N,) at which they were seen.
+
+    Raises RecordError with the row if the times do not increase.
+    """
+
+    time: Array
+    pose: Array
+    ok: NDArray[np.bool_]
+    """(N,): true where the pose was measured."""
+
+    rows: Rows
+    covariance: Array | None = None
+    """(N, 6, 6): covariances of the poses, or None if the file holds none."""
+
+    def __post_init__(self) -> None:
+        check_increasing(self.time, self.rows)
+
+    def check_grid(self, rate_hz: float) -> None:
+        """Check that the rows are one frame of this rate apart.
+
+        Raises RecordError with the row and the times.
+        """
+        frames = np.diff(self.time) * rate_hz
+        wrong = np.flatnonzero(~(np.abs(frames - 1) <= TIME_ROUNDING))
+        if len(wrong):
+            row = int(wrong[0])
+            raise RecordError(
+                f"{self.rows.place(row + 1)}: time_s is {self.time[row + 1]:g} after "
+                f"{self.time[row]:g} in the row before, which is {frames[row]:.4g} frames of "
+                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a lost frame must have a row "
+                "with empty measured columns"
+            )
+
+
+@dataclass(frozen=True)
+class CommandLog:
+    """Joint commands (M, n) and the times (M,) of their rows.
+
+    Raises RecordError with the row if the times do not increase.
+    """
+
+    time: Array
+    command: Array
+    rows: Rows
+    written: Array | None = None
+    """(M,): times at which the commands were written to the drives, NaN where none was.
+
+    None if they are not logged. A command then acts the latency of the timing after its row. In a
+    table of commands alone, these are the times of the rows.
+    """
+
+    def __post_init__(self) -> None:
+        check_increasing(self.time, self.rows)
+
+
+@dataclass(frozen=True)
+class ReferenceLog:
+    """Desired poses (R, 6) and the times (R,) of their rows.
+
+    Raises RecordError with the row if the times do not increase.
+    """
+
+    time: Array
+    pose: Array
+    rows: Rows
+    rate: Array | None = None
+    """(R, 6): time derivatives of the poses, or None if they are not logged."""
+
+    def __post_init__(self) -> None:
+        check_increasing(self.time, self.rows)
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """Logs of one run. The reference is None if the file holds none."""
+
+    poses: PoseLog
+    commands: CommandLog
+    reference: ReferenceLog | None = None
+
+    @property
+    def is_one_table(self) -> bool:
+        """Whether each row holds a pose, a command and a reference of the same time."""
+        times = [self.commands.time]
+        times += [] if self.reference is None else [self.reference.time]
+        return all(np.array_equal(time, self.poses.time) for time in times)
+
+
+def check_increasing(time: Array, rows: Rows) -> None:
+    """Check that the times (N,) of rows increase. Raises RecordError with the first that does not.
+
+    Examples
+    --------
+    >>> check_increasing(np.array([0.0, 0.1, 0.1]), Rows("mine.csv", [2, 3, 4]))
+    Traceback (most recent call last):
+    identify.errors.RecordError: mine.csv line 4: its time 0.1 s is also that of line 3
+    """
+    strange = np.flatnonzero(~np.isfinite(time))
+    if len(strange):
+        raise RecordError(f"{rows.place(int(strange[0]))}: its time is not a finite number")
+    back = np.flatnonzero(np.diff(time) <= 0)
+    if not len(back):
+        return
+    row = int(back[0]) + 1
+    before = f"{rows.word} {rows.numbers[row - 1]}"
+    said = (
+        f"its time {time[row]:.9g} s is also that of {before}"
+        if time[row] == time[row - 1]
+        else f"its time {time[row]:.9g} s is before {time[row - 1]:.9g} s of {before}"
+    )
+    more = f"; the same in {len(back)} rows" if len(back) > 1 else ""
+    raise RecordError(f"{rows.place(row)}: {said}{more}")
