@@ -8,25 +8,23 @@ commands (`identify.model.joint_torques`). Before the motion begins, the drives 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-import casadi as ca
 import numpy as np
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
-from dynamics.expressions import function
-from dynamics.geometry import RobotGeometry
 from dynamics.parameters import parameter_layout, passive_parameters
-from dynamics.rigid_body.passive_friction import passive_friction_columns
-from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, pose_columns
-from identify.diagnosis.loop_causes import joint_rates
 from identify.estimation.output_error import OutputErrorProblem
-from identify.filtering import spline_derivatives
-from identify.model.loop_model import LoopModel
+from identify.model.body_torques import (
+    RunMotion,
+    by_the_joints,
+    full_regressor,
+    passive_columns,
+    run_motion,
+)
 from identify.runtime import in_threads
 
 PROBED = 1e-5
@@ -49,21 +47,6 @@ class Needed:
     torques: tuple[Array, ...]
     remedy: str
     least: float = -np.inf
-
-
-@dataclass(frozen=True)
-class RunMotion:
-    """Motion of a run of the model at its frames.
-
-    poses, twists, twist_dots (N, 6). joint_rates (N, n). torque_maps (N, n, 6): torques of the
-    joints by a wrench on the platform.
-    """
-
-    poses: Array
-    twists: Array
-    twist_dots: Array
-    joint_rates: Array
-    torque_maps: Array
 
 
 def body_causes(
@@ -95,25 +78,6 @@ def body_causes(
             quick=(columns, place),
         )
         for place, one in enumerate(needed)
-    )
-
-
-def run_motion(run: LoopModel, found: ClosedLoopRun) -> RunMotion:
-    """Return the motion of the model in a run."""
-    robot = run.robot
-    chart = robot.geometry.chart
-    poses = chart.pose(chart.coordinates(found.pose))
-    rates = chart.lifted(chart.coordinates(found.pose_rate))
-    gains, _ = spline_derivatives(rates, run.settings.timing.frame_rate_hz)
-    free = chart.basis
-    jacobians = robot.joint_jacobian(poses) @ free
-    maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
-    return RunMotion(
-        poses=poses,
-        twists=robot.twist(poses, rates),
-        twist_dots=robot.twist_dot(poses, rates, gains),
-        joint_rates=joint_rates(run, found),
-        torque_maps=maps,
     )
 
 
@@ -155,7 +119,7 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
     """
     layout = robot.layout
     whole = parameter_layout(robot.geometry.legs, ("all",))
-    regressors = [_full_regressor(robot.geometry, one) for one in motions]
+    regressors = [full_regressor(robot.geometry, one) for one in motions]
     masses = layout.bodies_of(parameters[layout.rigid])[:, 0]
     found = []
     for kind in dict.fromkeys(one.name for one in layout.kinds):
@@ -178,35 +142,12 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
                 ]
                 weights = masses[own] if unit == "m" else np.ones(len(own))
                 torques = tuple(
-                    _by_the_joints(one, regressor[:, :, columns] @ weights)
+                    by_the_joints(one, regressor[:, :, columns] @ weights)
                     for one, regressor in zip(motions, regressors, strict=True)
                 )
                 axis = name[-1] if unit == "m" else name
                 found.append(Needed(f"{group}, {axis}", unit, group, torques, remedy))
     return found
-
-
-def _by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
-    """Return torques (N, n) of the joints for wrenches (N, 6), less those before the motion.
-
-    Before a motion begins, the drives hold the robot in equilibrium.
-    """
-    torques = np.einsum("kij,kj->ki", motion.torque_maps, wrenches)
-    return np.asarray(torques - torques[0])
-
-
-@lru_cache(maxsize=8)
-def _regressor_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the regressor (6, r) of a geometry with full bodies, as a CasADi function."""
-    given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
-    return function("regressor", given, [rigid_body_regressor(geometry, *given)])
-
-
-def _full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
-    """Return the regressor (N, 6, r) of full bodies along a motion."""
-    regressor = _regressor_function(replace(geometry, full_bodies=("all",)))
-    found = regressor(motion.poses.T, motion.twists.T, motion.twist_dots.T).full()
-    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
 def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
@@ -216,13 +157,13 @@ def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed
     """
     geometry = robot.geometry
     names = passive_parameters(geometry.legs)
-    columns = [_passive_columns(geometry, one) for one in motions]
+    columns = [passive_columns(geometry, one) for one in motions]
     found = []
     for place, name in enumerate(names):
         if name in robot.layout.passive_names:
             continue
         torques = tuple(
-            _by_the_joints(one, wrenches[:, :, place])
+            by_the_joints(one, wrenches[:, :, place])
             for one, wrenches in zip(motions, columns, strict=True)
         )
         joint, law = name.split(".")
@@ -240,20 +181,6 @@ def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed
             )
         )
     return found
-
-
-def _passive_columns(geometry: RobotGeometry, motion: RunMotion) -> Array:
-    """Return the wrenches (N, 6, k) of all parameters of passive friction along a motion."""
-    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
-    found = _passive_function(whole)(motion.poses.T, motion.twists.T).full()
-    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
-
-
-@lru_cache(maxsize=8)
-def _passive_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the wrenches (6, k) of passive friction of a geometry, as a CasADi function."""
-    given = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
-    return function("passive_friction", given, [passive_friction_columns(geometry, *given)])
 
 
 def _uneven_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:

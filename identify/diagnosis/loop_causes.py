@@ -18,6 +18,7 @@ from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
+from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel
 
 SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
@@ -47,11 +48,6 @@ def loop_causes(
         *laws(problem.runs[0].settings),
         finer_steps(problem.runs[0].settings),
     )
-
-
-def joint_rates(run: LoopModel, found: ClosedLoopRun) -> Array:
-    """Return the velocities (N, n) of the joints in a run of the model."""
-    return np.einsum("nij,nj->ni", run.robot.pose_jacobian(found.pose), found.pose_rate)
 
 
 def in_settings(change: Callable[[LoopSettings, float], LoopSettings]) -> Change:

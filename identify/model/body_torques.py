@@ -1,0 +1,101 @@
+"""Torques that bodies and passive joints need along a motion, for a unit of what a model lacks.
+
+The torques of bodies are columns of the regressor of full bodies, and those of passive joints are
+the columns of `dynamics.rigid_body.passive_friction`. Both are evaluated without compiling them, so
+that a robot in another form costs no time.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from dynamics.closed_loop import ClosedLoopRun
+from dynamics.expressions import function
+from dynamics.geometry import RobotGeometry
+from dynamics.parameters import passive_parameters
+from dynamics.rigid_body.passive_friction import passive_friction_columns
+from dynamics.rigid_body.virtual_work import rigid_body_regressor
+from identify.arrays import Array
+from identify.filtering import spline_derivatives
+
+if TYPE_CHECKING:
+    from identify.model.loop_model import LoopModel
+
+
+@dataclass(frozen=True)
+class RunMotion:
+    """Motion of a run of the model at its frames.
+
+    poses, twists, twist_dots (N, 6). joint_rates (N, n). torque_maps (N, n, 6): torques of the
+    joints by a wrench on the platform.
+    """
+
+    poses: Array
+    twists: Array
+    twist_dots: Array
+    joint_rates: Array
+    torque_maps: Array
+
+
+def run_motion(run: "LoopModel", found: ClosedLoopRun) -> RunMotion:
+    """Return the motion of the model in a run."""
+    robot = run.robot
+    chart = robot.geometry.chart
+    poses = chart.pose(chart.coordinates(found.pose))
+    rates = chart.lifted(chart.coordinates(found.pose_rate))
+    gains, _ = spline_derivatives(rates, run.settings.timing.frame_rate_hz)
+    free = chart.basis
+    jacobians = robot.joint_jacobian(poses) @ free
+    maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
+    return RunMotion(
+        poses=poses,
+        twists=robot.twist(poses, rates),
+        twist_dots=robot.twist_dot(poses, rates, gains),
+        joint_rates=joint_rates(run, found),
+        torque_maps=maps,
+    )
+
+
+def joint_rates(run: "LoopModel", found: ClosedLoopRun) -> Array:
+    """Return the velocities (N, n) of the joints in a run of the model."""
+    return np.einsum("nij,nj->ni", run.robot.pose_jacobian(found.pose), found.pose_rate)
+
+
+def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
+    """Return torques (N, n) of the joints for wrenches (N, 6), less those before the motion.
+
+    Before a motion begins, the drives hold the robot in equilibrium.
+    """
+    torques = np.einsum("kij,kj->ki", motion.torque_maps, wrenches)
+    return np.asarray(torques - torques[0])
+
+
+@lru_cache(maxsize=8)
+def _regressor_function(geometry: RobotGeometry) -> ca.Function:
+    """Return the regressor (6, r) of a geometry with full bodies, as a CasADi function."""
+    given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
+    return function("regressor", given, [rigid_body_regressor(geometry, *given)])
+
+
+def full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
+    """Return the regressor (N, 6, r) of full bodies along a motion."""
+    regressor = _regressor_function(replace(geometry, full_bodies=("all",)))
+    found = regressor(motion.poses.T, motion.twists.T, motion.twist_dots.T).full()
+    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+
+
+def passive_columns(geometry: RobotGeometry, motion: RunMotion) -> Array:
+    """Return the wrenches (N, 6, k) of all parameters of passive friction along a motion."""
+    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
+    found = _passive_function(whole)(motion.poses.T, motion.twists.T).full()
+    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+
+
+@lru_cache(maxsize=8)
+def _passive_function(geometry: RobotGeometry) -> ca.Function:
+    """Return the wrenches (6, k) of passive friction of a geometry, as a CasADi function."""
+    given = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
+    return function("passive_friction", given, [passive_friction_columns(geometry, *given)])
