@@ -151,7 +151,7 @@ def read_table(path: Path, robot: Robot) -> Table:
     number, or there are no rows.
     """
     groups = columns_of(robot)
-    lines = _lines(path)
+    lines = lines_of(path)
     number, header = next(lines, (0, []))
     present = _checked_header(path, number, header, groups)
     rows = [(number, _numbers(path, number, header, cells)) for number, cells in lines]
@@ -164,18 +164,25 @@ def read_table(path: Path, robot: Robot) -> Table:
     return Table(path, taken, tuple(number for number, _ in rows))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each line that is neither empty nor a comment."""
+def lines_of(path: Path, separators: str = ",") -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each line that is neither empty nor a comment.
+
+    Of several separators of cells, the one that the first line with any of them has most is valid.
+    """
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
     # Spreadsheets write a byte order mark at the beginning, which utf-8-sig removes.
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RecordError(f"cannot read record {path}: {error}") from error
+    separator = separators[0]
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
+            if len(separators) > 1 and any(one in line for one in separators):
+                separator = max(separators, key=line.count)
+                separators = separator
             try:
-                cells = next(csv.reader([line]))
+                cells = next(csv.reader([line], delimiter=separator))
             except csv.Error as error:
                 raise RecordError(f"{path} line {number}: {error}") from error
             yield number, [cell.strip() for cell in cells]
@@ -212,7 +219,10 @@ def _meant(name: str, known: list[str]) -> str:
     meant = [one for one in alike if "_s" not in one[len(stem) + 1 :]]
     if len(meant) == 1:
         return f": use {meant[0]}, in {meant[0].rpartition('_')[2]}"
-    return f"; the columns are {', '.join(known)}"
+    return (
+        f"; the columns are {', '.join(known)}, or those that [columns] of the TOML file names, "
+        "which cmmsim new record --from FILE proposes"
+    )
 
 
 def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> list[float]:

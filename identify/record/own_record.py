@@ -1,15 +1,18 @@
-"""Records of users, from netCDF or CSV, with the scenario for their identification.
+"""Records of users, from netCDF or logs, with the scenario for their identification.
 
-A netCDF record contains its scenario and its scale anchor. A CSV table has a TOML file of the same
-name beside it. That file is a scenario; only its sections robot, timing, servo, model, filter,
-identification and payload are used. Its additional table `[record]` holds further measurements.
+A netCDF record contains its scenario and its scale anchor. A log is a CSV table, an export of
+motion capture or a bag of ROS 2, and has a TOML file of the same name beside it. That file is a
+scenario; only its sections robot, timing, servo, model, filter, identification and payload are
+used. Its additional table `[record]` holds further measurements, and `[columns]` says what the
+columns of a log are called.
 
 The template for a user's record is a table with two example rows, and its TOML file.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -20,10 +23,14 @@ from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.record.columns import Columns
 from identify.record.csv_record import RULES, columns_of, read_table
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
+from identify.record.readers.bags import is_bag
+from identify.record.readers.mapped import read_mapped
 from identify.record.recording import build_record, read
+from identify.record.suspicions import check_plausible
 from identify.record.telemetry import ReferenceLog, Telemetry
 from identify.scenario import Scenario
 from identify.scenario.payload import Payload
@@ -33,7 +40,13 @@ from identify.scenario.sections import Identification
 from identify.scenario.settings_file import one_line, starting_toml
 
 DESCRIPTION = "record"
-"""Name of the table of that file that is not part of a scenario."""
+"""Name of the table of that file with further measurements."""
+
+COLUMNS = "columns"
+"""Name of the table of that file with the columns of a log."""
+
+TABLES = (".csv", ".tsv", ".txt")
+"""Endings of the names of tables."""
 
 
 class Measured(Section):
@@ -78,13 +91,44 @@ def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
     dynamics.RobotFileError
         There is no such robot.
     """
-    pairs = [_of_csv(path) if path.suffix.lower() == ".csv" else _of_netcdf(path) for path in paths]
+    pairs = [_of_log(path) if is_log(path) else _of_netcdf(path) for path in paths]
     return [record for record, _ in pairs], pairs[0][1]
 
 
+def is_log(path: Path) -> bool:
+    """Return whether a path is a log or the description of one, by its name or as a folder."""
+    return path.suffix.lower() in (*TABLES, ".toml") or is_bag(path)
+
+
 def description_file(path: Path) -> Path:
-    """Return the path of the TOML file that describes a CSV record."""
-    return path.with_suffix(".toml")
+    """Return the path of the TOML file that describes a log, which can be that path itself."""
+    # The name of a folder can have dots.
+    return path.with_name(f"{path.name}.toml") if path.is_dir() else path.with_suffix(".toml")
+
+
+@dataclass(frozen=True)
+class Description:
+    """Content of the TOML file that describes a log."""
+
+    scenario: Scenario
+    measured: Measured
+    columns: Columns | None
+
+
+def read_telemetry(path: Path, about: Description, robot: Robot) -> Telemetry:
+    """Read the log that a description describes, and the files that it names.
+
+    Raises RecordError. The message names the row.
+    """
+    columns = about.columns
+    if columns is not None and (path.suffix != ".toml" or columns.measured.file is not None):
+        return read_mapped(columns, path, robot, about.scenario.timing.frame_rate_hz)
+    if path.suffix == ".toml" or is_bag(path):
+        raise RecordError(
+            f"{description_file(path)} must name the columns of its log in [{COLUMNS}], and for "
+            "another file columns.measured.file; cmmsim new record --from FILE proposes them"
+        )
+    return read_table(path, robot).telemetry()
 
 
 def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
@@ -92,10 +136,13 @@ def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
     return record, recorded_scenario(record)
 
 
-def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
-    scenario, measured = read_description(description_file(path), path)
+def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:
+    about = read_description(description_file(path), path)
+    scenario, measured = about.scenario, about.measured
     robot = load_robot(scenario.robot)
-    telemetry = read_table(path, robot).telemetry()
+    telemetry = read_telemetry(path, about, robot)
+    if about.columns is not None:
+        check_plausible(telemetry, robot)
     record = _record(telemetry, robot, scenario, measured, path)
     _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:
@@ -135,26 +182,35 @@ def _record(
     return record
 
 
-def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
-    """Read the description of a CSV record: its scenario and further measurements.
+def read_description(path: Path, log: Path) -> Description:
+    """Read the description of a log.
 
     Raises RecordError or ScenarioError if there is no such file, it is not TOML, or its content is
     not valid.
     """
     if not is_file(path):
         raise RecordError(
-            f"there is no file {path}, which must describe the record {table.name}; cmmsim new "
+            f"there is no file {path}, which must describe the record {log.name}; cmmsim new "
             "record writes both"
         )
     content = parse_toml(read_text(path, str(path), RecordError), str(path), RecordError)
-    own = content.pop(DESCRIPTION, {})
-    try:
-        measured = Measured.model_validate(own)
-    except ValidationError as error:
-        raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
+    measured = _section(Measured, content.pop(DESCRIPTION, {}), f"{path}: [{DESCRIPTION}]")
+    named = content.pop(COLUMNS, None)
+    columns = None if named is None else _section(Columns, named, f"{path}: [{COLUMNS}]")
     # A scenario needs a name, but this file does not have to state it.
     name = path.stem if is_name(path.stem) else DESCRIPTION
-    return SCENARIOS.from_dict({"name": name} | content, str(path), path.parent), measured
+    scenario = SCENARIOS.from_dict({"name": name} | content, str(path), path.parent)
+    return Description(scenario, measured, columns)
+
+
+Model = TypeVar("Model", bound=Section)
+
+
+def _section(model: type[Model], content: object, source: str) -> Model:
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise RecordError(f"{source} {one_line(error, model)}") from error
 
 
 def record_schema() -> dict[str, Any]:
@@ -163,10 +219,11 @@ def record_schema() -> dict[str, Any]:
     Editors read it from the file `record.schema.json`.
     """
     schema = scenario_schema()
-    own = Measured.model_json_schema()
     schema["required"].remove("name")
-    schema["properties"][DESCRIPTION] = {"$ref": "#/$defs/Measured"}
-    schema["$defs"]["Measured"] = own
+    for table, model in ((DESCRIPTION, Measured), (COLUMNS, Columns)):
+        own = model.model_json_schema()
+        schema["properties"][table] = {"$ref": f"#/$defs/{model.__name__}"}
+        schema["$defs"] |= own.pop("$defs", {}) | {model.__name__: own}
     return schema
 
 

@@ -1,0 +1,224 @@
+"""Table ``[columns]`` of the file that describes a record.
+
+It says what the columns of a log are called, and in which units, directions and frames they are. A
+pose of the record is
+
+    base_from_platform = base_from_frame · frame_from_body · body_from_platform
+
+where the log holds the pose of the tracked body in the log's own frame, frame_from_body.
+"""
+
+import re
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
+
+from identify.scenario.section import Section, quantity
+
+ASKED = "?"
+"""Value of a key that a proposal leaves to the user."""
+
+TIMES = {"s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9"}
+"""Seconds in each unit of time, as decimal numbers."""
+
+FRAMES = "frames"
+"""Unit of times that count frames at the rate of the timing."""
+
+LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6}
+"""Metres in each unit of length."""
+
+ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "turn": 6.283185307179586}
+"""Radians in each unit of angle."""
+
+COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vector": 3}
+"""Number of columns of each convention but the Euler sequences, which have three."""
+
+EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
+
+CONVENTIONS = (*COUNTS, "euler_XYZ", "euler_ZYX", "euler_xyz", "...")
+
+
+def _check_convention(name: str) -> str:
+    if name in COUNTS or re.fullmatch(EULER, name):
+        return name
+    raise ValueError(
+        f"{name!r} is not a convention: {', '.join(CONVENTIONS)}; capitals are turns about the "
+        "body's own axes, small letters about axes that stand still"
+    )
+
+
+Convention = Annotated[
+    str,
+    AfterValidator(_check_convention),
+    WithJsonSchema(
+        {"type": "string", "pattern": f"^({'|'.join(COUNTS)}|euler_([xyz]{{3}}|[XYZ]{{3}}))$"}
+    ),
+]
+
+
+def _check_unit(unit: str | float) -> str | float:
+    known = (*ANGLES, *LENGTHS)
+    if unit in known or (isinstance(unit, float) and unit > 0):
+        return unit
+    raise ValueError(f"{unit!r} is not a unit: {', '.join(known)}, or a number > 0")
+
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+class Log(Section):
+    """Rows of a log and their times."""
+
+    file: str | None = Field(
+        None, description="file with these columns; without it, that of the record"
+    )
+    topic: str | None = Field(
+        None, description="topic of a bag, or section of a Vicon export, with these columns"
+    )
+    time: str | None = Field(
+        None, description="column of the times; without it, that of the measured poses"
+    )
+    time_unit: Literal["s", "ms", "us", "ns", "frames"] = Field(
+        "s", description="unit of the times; frames are those of timing.frame_rate_hz"
+    )
+    time_offset_s: float = quantity(
+        0.0, "s", "what to add to the times, for example between two clocks", ge=-1e10, le=1e10
+    )
+
+    @property
+    def is_own(self) -> bool:
+        """Whether these columns have rows of their own."""
+        return not (self.file is None and self.topic is None and self.time is None)
+
+
+class PoseColumns(Log):
+    """Columns of the measured poses, or with the same keys of the desired poses."""
+
+    position: list[str] = Field(
+        description="columns of x, y and z of the position", min_length=3, max_length=3
+    )
+    position_unit: Literal["m", "mm", "cm", "um"] = Field(description="unit of the position")
+    orientation: list[str] = Field(
+        description="columns of the orientation, as many as its convention has",
+        min_length=3,
+        max_length=9,
+    )
+    convention: Convention = Field(
+        description="quaternion_xyzw, quaternion_wxyz, matrix (row by row), rotation_vector, or an "
+        "Euler sequence of scipy's Rotation: euler_XYZ and so on turn about the body's own axes, "
+        "euler_xyz about axes that stand still"
+    )
+    angle_unit: Literal["rad", "deg"] = Field(
+        "rad", description="unit of Euler angles and of a rotation vector"
+    )
+    axes: list[Axis] = Field(
+        ["x", "y", "z"],
+        description='axes of the log that are our x, y and z: ["x", "-z", "y"] turns y up into z '
+        'up, and ["x", "z", "y"] makes a left-handed system with y up right-handed',
+        min_length=3,
+        max_length=3,
+    )
+    base_from_frame: list[float] = Field(
+        [0.0] * 6,
+        description="pose of the frame of the log in the base frame of the robot: x, y, z in m, "
+        "alpha, beta, gamma in rad",
+        min_length=6,
+        max_length=6,
+    )
+    body_from_platform: list[float] = Field(
+        [0.0] * 6,
+        description="pose of the platform frame of the robot in the tracked body, in m and rad",
+        min_length=6,
+        max_length=6,
+    )
+    ok: str | None = Field(
+        None, description="column that is 1 where the pose was measured, and 0 where it was lost"
+    )
+
+    @model_validator(mode="after")
+    def _agree(self) -> "PoseColumns":
+        wanted = COUNTS.get(self.convention, 3)
+        if len(self.orientation) != wanted:
+            raise ValueError(
+                f"orientation names {len(self.orientation)} columns, but the convention "
+                f"{self.convention} has {wanted}"
+            )
+        if sorted(axis.lstrip("-") for axis in self.axes) != ["x", "y", "z"]:
+            raise ValueError(f"axes = {self.axes} must name each of x, y and z once")
+        _check_once([*self.position, *self.orientation])
+        return self
+
+
+class CommandColumns(Log):
+    """Columns of the joint commands.
+
+    A joint coordinate of the robot file is sign · unit · (column - zero).
+    """
+
+    names: list[str] = Field(description="columns of the commands of joints 1, 2, ...")
+    unit: Annotated[str | float, AfterValidator(_check_unit)] = Field(
+        description="unit of the commands, or rad or m in one unit, such as of a gear or a spindle"
+    )
+    signs: list[Literal[1, -1]] | None = Field(
+        None, description="1 where a joint counts as in the robot file, -1 where it counts against"
+    )
+    zeros: list[float] | None = Field(
+        None, description="values of the columns at the zeros of the robot file's joints"
+    )
+    written: str | None = Field(
+        None,
+        description="column of the times at which commands were written to the drives, if they "
+        "stand in the rows of the poses; in rows of their own, the times of the rows",
+    )
+
+    @model_validator(mode="after")
+    def _agree(self) -> "CommandColumns":
+        for name in ("signs", "zeros"):
+            values = getattr(self, name)
+            if values is not None and len(values) != len(self.names):
+                raise ValueError(
+                    f"{name} has {len(values)} numbers, and names has {len(self.names)} columns"
+                )
+        if self.written is not None and self.is_own:
+            raise ValueError(
+                f"written = {self.written!r} is for commands in the rows of the poses, but these "
+                "have rows of their own, whose times are those at which they were written"
+            )
+        _check_once(self.names)
+        return self
+
+
+class Columns(Section):
+    """Columns of a log that are called otherwise than those of a record."""
+
+    measured: PoseColumns
+    command: CommandColumns
+    reference: PoseColumns | None = None
+
+    @model_validator(mode="after")
+    def _agree(self) -> "Columns":
+        if self.measured.time is None:
+            raise ValueError("measured.time must name the column of the times")
+        for name in ("command", "reference"):
+            log = getattr(self, name)
+            if log is not None and log.is_own and log.time is None:
+                raise ValueError(f"{name}.time must name the column of the times of its own rows")
+        self._check_named_once()
+        return self
+
+    def _check_named_once(self) -> None:
+        """Check that no column is both a pose and a command. Raises ValueError with its name."""
+        pose = [*self.measured.position, *self.measured.orientation]
+        command = self.command
+        if not command.is_own or (command.file, command.topic) == (
+            self.measured.file,
+            self.measured.topic,
+        ):
+            _check_once([*pose, *command.names])
+
+
+def _check_once(names: list[str]) -> None:
+    """Check that no column is named twice. Raises ValueError with its name."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"column {name!r} is named twice")

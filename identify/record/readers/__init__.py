@@ -1,0 +1,1 @@
+"""Readers of logs: tables, exports of motion capture, and bags of ROS 2."""

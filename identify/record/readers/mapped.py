@@ -1,0 +1,303 @@
+"""Telemetry from a log whose columns are called otherwise, as ``[columns]`` says.
+
+A pose of the log is (R, p) in the log's own frame. Axes that are called otherwise turn it into
+(A R A^T, A p), where A has one entry of 1 or -1 in each row. A with the determinant -1 makes a
+left-handed system right-handed.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.record.columns import (
+    ANGLES,
+    FRAMES,
+    LENGTHS,
+    Columns,
+    CommandColumns,
+    Log,
+    PoseColumns,
+)
+from identify.record.readers.bags import Bag, is_bag
+from identify.record.readers.streams import LoggedFile, Stream, checked_topic
+from identify.record.readers.tables import LoggedTable
+from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
+
+UNIT_LENGTH = 0.01
+"""Largest deviation of a quaternion's length from one, and of a matrix from a rotation."""
+
+MOST_RADIANS = 2 * np.pi + 0.1
+"""Largest Euler angle, rad, that is believed. Angles beyond are degrees."""
+
+
+def open_log(path: Path) -> LoggedFile:
+    """Return the file at a path, whose columns can then be read: a bag, or a table."""
+    return Bag(path) if is_bag(path) else LoggedTable(path)
+
+
+def read_mapped(columns: Columns, path: Path, robot: Robot, rate_hz: float) -> Telemetry:
+    """Read the log at a path, and the further files that its columns name.
+
+    Parameters
+    ----------
+    columns
+        What the columns are called.
+    path
+        File of the record. Other files are relative to its folder.
+    robot
+        Robot whose joints the commands move.
+    rate_hz
+        Rate of times that are counted in frames.
+
+    Raises
+    ------
+    RecordError
+        A file cannot be read, has no such column, or a row is wrong. The message names the row.
+    """
+    return _Reader(path, rate_hz).telemetry(columns, robot)
+
+
+@dataclass
+class _Reader:
+    """Files of a record, each opened once."""
+
+    path: Path
+    rate_hz: float
+    opened: dict[Path, LoggedFile] = field(default_factory=dict)
+
+    def telemetry(self, columns: Columns, robot: Robot) -> Telemetry:
+        """Return the logs of a record."""
+        measured = columns.measured
+        stream = self._stream(measured, _pose_names(measured))
+        moments = self._moments(stream, measured, measured.time)
+        start = moments[0]
+        poses, ok = _poses(stream, measured)
+        log = PoseLog(_since(moments, start), _near_home(poses, robot), ok, stream.rows)
+        commands = self._commands(columns.command, measured, start, robot)
+        _check_overlap(log, commands)
+        return Telemetry(log, commands, self._reference(columns, start, robot))
+
+    def _commands(
+        self, given: CommandColumns, measured: PoseColumns, start: Decimal, robot: Robot
+    ) -> CommandLog:
+        own = given if given.is_own else _shared(given, measured)
+        written = [] if given.written is None else [given.written]
+        stream = self._stream(own, [*given.names, *written])
+        time = _since(self._moments(stream, own, own.time), start)
+        commands = _joint_coordinates(stream, given, robot)
+        if given.is_own:
+            return CommandLog(time, commands, stream.rows, time)
+        return CommandLog(
+            time, commands, stream.rows, self._written(stream, own, given.written, start)
+        )
+
+    def _written(self, stream: Stream, own: Log, name: str | None, start: Decimal) -> Array | None:
+        """Return the times (M,) at which commands were written, NaN in rows without one."""
+        if name is None:
+            return None
+        kept = [row for row, cell in enumerate(stream.columns[name]) if cell not in (None, "")]
+        cells = [stream.columns[name][row] for row in kept]
+        places = Rows(stream.rows.source, [stream.rows.numbers[row] for row in kept])
+        found = np.full(len(stream.rows.numbers), np.nan)
+        found[kept] = _since(self._moments(Stream({name: cells}, places), own, name), start)
+        return found
+
+    def _reference(self, columns: Columns, start: Decimal, robot: Robot) -> ReferenceLog | None:
+        given = columns.reference
+        if given is None:
+            return None
+        own = given if given.is_own else _shared(given, columns.measured)
+        stream = self._stream(own, _pose_names(given))
+        poses, ok = _poses(stream, given)
+        if not ok.all():
+            row = int(np.argmin(ok))
+            raise RecordError(f"{stream.rows.place(row)}: the desired pose has an empty cell")
+        time = _since(self._moments(stream, own, own.time), start)
+        return ReferenceLog(time, _near_home(poses, robot), stream.rows)
+
+    def _stream(self, log: Log, names: list[str]) -> Stream:
+        path = self.path if log.file is None else self.path.parent / log.file
+        file = self.opened.setdefault(path, open_log(path))
+        topic = checked_topic(file.headers, log.topic, str(path))
+        stated = file.headers[topic].rate_hz
+        if log.time_unit == FRAMES and stated is not None and stated != self.rate_hz:
+            raise RecordError(
+                f"{path} states {stated:g} frames per second, and timing.frame_rate_hz is "
+                f"{self.rate_hz:g}, by which its times would be counted"
+            )
+        return file.read(topic, [str(log.time), *names])
+
+    def _moments(self, stream: Stream, log: Log, name: str | None) -> list[Decimal]:
+        offset = Decimal(repr(log.time_offset_s))
+        return [
+            moment + offset for moment in stream.moments(str(name), log.time_unit, self.rate_hz)
+        ]
+
+
+def _shared(own: Log, measured: PoseColumns) -> Log:
+    """Return where the columns are that stand in the rows of the measured poses."""
+    place: Mapping[str, object] = {name: getattr(measured, name) for name in Log.model_fields}
+    return own.model_copy(update=place)
+
+
+def _pose_names(log: PoseColumns) -> list[str]:
+    return [*log.position, *log.orientation, *([] if log.ok is None else [log.ok])]
+
+
+def _since(moments: Iterable[Decimal], start: Decimal) -> Array:
+    """Return times (N,) from the start on, s."""
+    return np.array([float(moment - start) for moment in moments])
+
+
+def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured."""
+    position = np.stack([stream.numbers(name) for name in log.position], axis=1)
+    orientation = np.stack([stream.numbers(name) for name in log.orientation], axis=1)
+    ok = np.asarray(np.isfinite(np.hstack([position, orientation])).all(axis=1))
+    if log.ok is not None:
+        stated = stream.numbers(log.ok)
+        strange = np.flatnonzero(~np.isin(stated, (0, 1)))
+        if len(strange):
+            row = int(strange[0])
+            raise RecordError(
+                f"{stream.rows.place(row)}: {log.ok} is {stated[row]:g}, must be 1 or 0"
+            )
+        ok &= stated == 1
+    poses = np.full((len(ok), 6), np.nan)
+    if not ok.any():
+        raise RecordError(f"{stream.rows.source}: no row has a whole pose")
+    rows = Rows(
+        stream.rows.source,
+        [number for number, good in zip(stream.rows.numbers, ok, strict=True) if good],
+        stream.rows.word,
+    )
+    turned = _rotations(orientation[ok], log, rows)
+    axes = _axes(log.axes)
+    frame = Rotation.from_matrix(axes @ turned.as_matrix() @ axes.T)
+    moved = LENGTHS[log.position_unit] * position[ok] @ axes.T
+    base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
+    whole = base[0] * frame * body[0]
+    poses[ok, :3] = base[1] + base[0].apply(moved + frame.apply(body[1]))
+    poses[ok, 3:] = whole.as_euler("XYZ")
+    return poses, ok
+
+
+def _axes(names: Sequence[str]) -> Array:
+    """Return A (3, 3), whose rows are the axes of the log that are our x, y and z."""
+    rows = np.zeros((3, 3))
+    for row, name in enumerate(names):
+        rows[row, "xyz".index(name[-1])] = -1 if name.startswith("-") else 1
+    return rows
+
+
+def _transform(pose: list[float]) -> tuple[Rotation, Array]:
+    return Rotation.from_euler("XYZ", pose[3:]), np.array(pose[:3])
+
+
+def _rotations(cells: Array, log: PoseColumns, rows: Rows) -> Rotation:
+    """Return the rotations of columns (N, k). Raises RecordError with the row of a wrong one."""
+    named = ", ".join(log.orientation)
+    if log.convention.startswith("quaternion"):
+        length = np.linalg.norm(cells, axis=1)
+        wrong = np.flatnonzero(np.abs(length - 1) > UNIT_LENGTH)
+        if len(wrong):
+            row = int(wrong[0])
+            raise RecordError(
+                f"{rows.place(row)}: the quaternion {named} has the length {length[row]:.6g}, "
+                f"must be 1 (in {len(wrong)} of {len(cells)} rows it is not)"
+            )
+        return Rotation.from_quat(cells, scalar_first=log.convention.endswith("wxyz"))
+    if log.convention == "matrix":
+        return _from_matrices(cells.reshape(-1, 3, 3), named, rows)
+    radians = ANGLES[log.angle_unit] * cells
+    large = np.flatnonzero(np.abs(radians).max(axis=1) > MOST_RADIANS)
+    if log.angle_unit == "rad" and len(large):
+        row = int(large[0])
+        worst = float(np.abs(cells[row]).max())
+        raise RecordError(
+            f"{rows.place(row)}: an angle of {named} is {worst:.6g} rad, more than a turn; if "
+            'these are degrees, angle_unit = "deg"'
+        )
+    if log.convention == "rotation_vector":
+        return Rotation.from_rotvec(radians)
+    return Rotation.from_euler(log.convention.removeprefix("euler_"), radians)
+
+
+def _from_matrices(matrices: Array, named: str, rows: Rows) -> Rotation:
+    """Return the rotations nearest to matrices (N, 3, 3)."""
+    gap = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero(gap > UNIT_LENGTH)
+    if len(wrong):
+        row = int(wrong[0])
+        raise RecordError(
+            f"{rows.place(row)}: the matrix {named} is not a rotation, its rows are not of length "
+            f"one and at right angles to within {UNIT_LENGTH:g}: {gap[row]:.3g}"
+        )
+    mirrored = np.flatnonzero(np.linalg.det(matrices) < 0)
+    if len(mirrored):
+        raise RecordError(
+            f"{rows.place(int(mirrored[0]))}: the matrix {named} mirrors (its determinant is -1): "
+            "a left-handed frame"
+        )
+    return Rotation.from_matrix(matrices)
+
+
+def _near_home(poses: Array, robot: Robot) -> Array:
+    """Return poses (N, 6) whose angles begin in the half turn about home, and do not jump."""
+    good = np.isfinite(poses).all(axis=1)
+    angles = np.unwrap(poses[good, 3:], axis=0)
+    turns = np.round((robot.home_pose[3:] - angles[0]) / (2 * np.pi))
+    unwrapped = poses.copy()
+    unwrapped[good, 3:] = angles + 2 * np.pi * turns
+    return unwrapped
+
+
+def _joint_coordinates(stream: Stream, given: CommandColumns, robot: Robot) -> Array:
+    """Return commands (M, n) with the units, directions and zeros of the robot file."""
+    joints = robot.layout.joints
+    if len(given.names) != joints:
+        raise RecordError(
+            f"columns.command.names has {len(given.names)} columns, and {robot.name} has {joints} "
+            "joints"
+        )
+    unit = given.unit
+    if isinstance(unit, str):
+        table = LENGTHS if robot.layout.prismatic else ANGLES
+        if unit not in table:
+            raise RecordError(
+                f"columns.command.unit is {unit!r}, and the joints of {robot.name} move in "
+                f"{robot.layout.joint_unit}: one of {', '.join(table)}"
+            )
+        unit = table[unit]
+    cells = np.stack([stream.numbers(name) for name in given.names], axis=1)
+    missing = np.argwhere(~np.isfinite(cells))
+    if len(missing):
+        row, joint = missing[0]
+        raise RecordError(
+            f"{stream.rows.place(int(row))}: the command {given.names[joint]} is empty or not "
+            "finite"
+        )
+    signs = np.ones(joints) if given.signs is None else np.array(given.signs, dtype=float)
+    zeros = np.zeros(joints) if given.zeros is None else np.array(given.zeros)
+    return np.asarray(signs * unit * (cells - zeros))
+
+
+def _check_overlap(poses: PoseLog, commands: CommandLog) -> None:
+    """Check that the clocks of poses and commands overlap. Raises RecordError with both spans."""
+    first, last = commands.time[0], commands.time[-1]
+    if first <= poses.time[-1] and last >= 0:
+        return
+    raise RecordError(
+        f"the commands of {commands.rows.source} run from {first:.12g} to {last:.12g} s after the "
+        f"first pose, and the poses of {poses.rows.source} to {poses.time[-1]:.9g} s: the clocks "
+        "do not overlap; columns.command.time_offset_s is added to the times of commands, and "
+        f"with {-first:.12g} s more both would begin together"
+    )

@@ -1,0 +1,266 @@
+"""Units, frames and joints of telemetry that are likely wrong, by what would fit instead.
+
+A pose and the commands at its time tell the same joint coordinates, but for the lag of the drives
+and the errors of the geometry. Where they do not, the poses are tried in other units, with other
+axes and mirrored, and the commands in other units, directions, orders and zeros.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.record.motion_lag import MotionLag, motion_lag
+from identify.record.telemetry import Telemetry
+
+TRIED = 400
+"""Number of poses with which other units and axes are tried."""
+
+LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
+"""Lags, s, of the motion behind the commands with which they are tried."""
+
+IN_REACH = 0.5
+"""Smallest share of poses in reach, and of those that fit with other units or axes 0.9."""
+
+FITS = 0.9
+"""Smallest correlation of a joint with its command that counts as the same motion."""
+
+OPPOSES = -0.8
+"""Largest correlation of a joint with its command that counts as the opposite direction."""
+
+NEAR_TURN = 0.3
+"""Largest difference, rad, of a joint's zero from a whole turn that counts as that turn."""
+
+ZERO = 0.5
+"""Largest difference of a joint's zero, as a share of its travel limit.
+
+Drives without an integral hold a joint away from its command.
+"""
+
+SCALE = 2.0
+"""Largest factor between two units that count as the same one. Loops overshoot and lag."""
+
+LENGTHS_TRIED = {
+    1.0: "",
+    1e-3: "positions in mm and not m",
+    1e-2: "positions in cm and not m",
+    1e3: "positions in m and not mm",
+}
+"""Factors of positions that are tried."""
+
+ANGLES_TRIED = {
+    1.0: "",
+    np.pi / 180: "angles in degrees and not rad",
+    180 / np.pi: "angles in rad and not degrees",
+}
+"""Factors of angles that are tried."""
+
+NAMES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """Sentence about what is likely wrong, with the evidence."""
+
+    text: str
+
+
+def check_plausible(telemetry: Telemetry, robot: Robot) -> None:
+    """Raise RecordError if units, frames or joints of telemetry are likely wrong."""
+    found = suspicions(telemetry, robot)
+    if found:
+        raise RecordError("; ".join(one.text for one in found))
+
+
+def suspicions(telemetry: Telemetry, robot: Robot) -> list[Suspicion]:
+    """Return what is likely wrong with the units, frames and joints of telemetry."""
+    return list(_found(telemetry, robot))
+
+
+def joint_motion(telemetry: Telemetry, robot: Robot) -> tuple[Array, Array]:
+    """Return the times (K,) and joint coordinates (K, n) of the measured poses in reach."""
+    poses = telemetry.poses
+    free = _on_chart(poses.pose[poses.ok], robot)
+    reached = _reached(free, robot)
+    return poses.time[poses.ok][reached], robot.inverse_kinematics(free[reached])
+
+
+def lag_of(telemetry: Telemetry, robot: Robot) -> MotionLag:
+    """Return the lag of the measured motion behind the commands."""
+    time, coordinates = joint_motion(telemetry, robot)
+    commands = telemetry.commands
+    return motion_lag(time, coordinates, commands.time, commands.command)
+
+
+def _found(telemetry: Telemetry, robot: Robot) -> Iterator[Suspicion]:
+    poses = telemetry.poses
+    reached = _reached(_on_chart(poses.pose[poses.ok], robot), robot)
+    if reached.mean() < IN_REACH:
+        yield _out_of_reach(telemetry, robot, reached)
+        return
+    time, coordinates = joint_motion(telemetry, robot)
+    held = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    moving = (np.ptp(held, axis=0) > 0) & (np.ptp(coordinates, axis=0) > 0)
+    if not moving.all():
+        return
+    alike = np.diagonal(_correlations(held, coordinates))
+    order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates)
+    if np.abs(alike).min() > FITS:
+        yield from _of_joints(held, coordinates, alike, robot, order)
+        return
+    hint = order or _fitting(telemetry, robot, alike.mean())
+    if hint:
+        yield Suspicion(
+            "the measured motion is not that of the commands (correlations of the joints from "
+            f"{alike.min():.2f} to {alike.max():.2f}); {hint}"
+        )
+
+
+def _other_order(telemetry: Telemetry, time: Array, coordinates: Array) -> str:
+    """Return the order of the joints in which all commands fit, or an empty string."""
+    for lag in LAGS_S:
+        alike = _correlations(_commands_at(telemetry, time - lag), coordinates)
+        joints, order = linear_sum_assignment(-alike)
+        if (order != joints).any() and alike[joints, order].min() > FITS:
+            listed = ", ".join(str(place + 1) for place in np.argsort(order))
+            return f"in another order they would fit: columns {listed} move joints 1, 2, ..."
+    return ""
+
+
+def _of_joints(
+    held: Array, coordinates: Array, alike: Array, robot: Robot, order: str
+) -> Iterator[Suspicion]:
+    """Yield wrong directions, units and zeros of joints that move as their commands do.
+
+    `order` says in which other order the commands would fit.
+    """
+    prismatic = robot.layout.prismatic
+    unit = robot.layout.joint_unit
+    against = np.flatnonzero(alike < OPPOSES)
+    if len(against):
+        listed = ", ".join(str(joint + 1) for joint in against)
+        yield Suspicion(
+            f"the commands of joint {listed} count against the direction of the robot file: their "
+            f"correlation with the poses is {alike[against[0]]:.2f} (columns.command.signs)"
+            + (f"; or {order}" if order else "")
+        )
+        return
+    slope = float(np.median(alike * coordinates.std(axis=0) / held.std(axis=0)))
+    for factor, said in (LENGTHS_TRIED if prismatic else ANGLES_TRIED).items():
+        if said and abs(np.log(slope / factor)) < np.log(SCALE):
+            yield Suspicion(
+                f"the commands are {1 / slope:.3g} times the joint coordinates of the poses: they "
+                f"are {said.partition(' ')[2]} (columns.command.unit)"
+            )
+            return
+    for joint, gap in enumerate(np.median(coordinates - held, axis=0)):
+        turns = 0 if prismatic else round(gap / (2 * np.pi))
+        lies = (
+            f"the commands of joint {joint + 1} lie {-gap:.4g} {unit} from the joint coordinates "
+            "of the poses"
+        )
+        if turns and abs(gap - 2 * np.pi * turns) < NEAR_TURN:
+            by = "a turn" if abs(turns) == 1 else f"{abs(turns)} turns"
+            yield Suspicion(f"{lies}: its zero is off by {by} (columns.command.zeros)")
+        elif abs(gap) > ZERO * robot.travel_limit:
+            yield Suspicion(
+                f"{lies}, {abs(gap) / robot.travel_limit:.0%} of the travel limit: its zero, or "
+                "the frame of the poses, differs from the robot file"
+            )
+
+
+def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]) -> Suspicion:
+    """Say that poses are out of reach, with the row of the first, and what would fit."""
+    poses = telemetry.poses
+    row = int(np.flatnonzero(poses.ok)[np.argmin(reached)])
+    place = poses.rows.place(row)
+    pose = ", ".join(f"{value:.6g}" for value in poses.pose[row])
+    leg = int(np.argmin(robot.reach_margin(_on_chart(poses.pose[row], robot)))) + 1
+    hint = _fitting(telemetry, robot, 0.0)
+    return Suspicion(
+        f"{place}: leg {leg} of {robot.name} cannot reach the measured pose [{pose}], m and rad, "
+        f"as {1 - reached.mean():.0%} of the poses; "
+        + (hint or "its units, its frame (base_from_frame) or its body differ from the robot file")
+    )
+
+
+def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
+    """Return in which units, and with which axes, the poses would move as the commands do.
+
+    Returns an empty string if they fit in none, or not better than now (mean correlation `alike`).
+    """
+    poses = telemetry.poses
+    rows = np.flatnonzero(poses.ok)
+    rows = rows[:: -(-len(rows) // TRIED)]
+    held = [_commands_at(telemetry, poses.time[rows] - lag) for lag in LAGS_S]
+    best = max(alike, FITS - 0.1)
+    found = ""
+    units = product(LENGTHS_TRIED.items(), ANGLES_TRIED.items())
+    for ((metres, length), (radians, angle)), (axes, matrix) in product(units, _all_axes()):
+        scaled = poses.pose[rows] * np.repeat([metres, radians], 3)
+        tried = _on_chart(_with_axes(scaled, matrix), robot)
+        reached = _reached(tried, robot)
+        if reached.mean() < FITS:
+            continue
+        joints = robot.inverse_kinematics(tried[reached])
+        score = max(np.diagonal(_correlations(one[reached], joints)).mean() for one in held)
+        # What changes less is tried first, and only a better fit takes its place.
+        if score > best + 0.02:
+            best = score
+            said = [length, angle, "" if axes == NAMES else f"axes = [{', '.join(axes)}]"]
+            left = " (the frame is left-handed)" if np.linalg.det(matrix) < 0 else ""
+            found = f"with {' and '.join(filter(None, said))} it would fit{left}"
+    return found
+
+
+def _commands_at(telemetry: Telemetry, time: Array) -> Array:
+    """Return the commands (N, n) at times (N,), and the nearest where there are none."""
+    commands = telemetry.commands
+    return np.stack([np.interp(time, commands.time, one) for one in commands.command.T], axis=1)
+
+
+def _all_axes() -> Iterator[tuple[tuple[str, ...], Array]]:
+    """Yield names and matrices (3, 3) of all axes, first those that change less."""
+    found = []
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        matrix = np.zeros((3, 3))
+        matrix[range(3), order] = signs
+        names = tuple(
+            f"{'-' if sign < 0 else ''}{NAMES[axis]}"
+            for axis, sign in zip(order, signs, strict=True)
+        )
+        changed = sum(name != usual for name, usual in zip(names, NAMES, strict=True))
+        found.append((changed, names, matrix))
+    for _, names, matrix in sorted(found, key=lambda one: one[0]):
+        yield names, matrix
+
+
+def _with_axes(poses: Array, matrix: Array) -> Array:
+    """Return poses (N, 6) whose frame has other axes."""
+    turned = matrix @ Rotation.from_euler("XYZ", poses[:, 3:]).as_matrix() @ matrix.T
+    return np.hstack([poses[:, :3] @ matrix.T, Rotation.from_matrix(turned).as_euler("XYZ")])
+
+
+def _on_chart(poses: Array, robot: Robot) -> Array:
+    """Return poses (N, 6) with only those entries that the platform can change."""
+    return np.asarray(robot.pose(robot.coordinates(poses)))
+
+
+def _reached(poses: Array, robot: Robot) -> NDArray[np.bool_]:
+    return np.asarray((robot.reach_margin(poses) > 0).all(axis=-1))
+
+
+def _correlations(held: Array, coordinates: Array) -> Array:
+    """Return the correlations (n, n) of the commands with the joint coordinates, both (N, n)."""
+    one = held - held.mean(axis=0)
+    other = coordinates - coordinates.mean(axis=0)
+    scale = np.sqrt(np.outer((one**2).sum(axis=0), (other**2).sum(axis=0)))
+    # A joint that does not move correlates with none.
+    return np.asarray((one.T @ other) / np.where(scale > 0, scale, 1.0))

@@ -1,0 +1,459 @@
+"""Logs of other programs: what is in them is read to the last digits, and what is wrong is named.
+
+The same poses and commands are written as each program writes them, by `log_files`.
+"""
+
+import re
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dynamics import load_robot
+from identify.commands.help import NOT_DONE
+from identify.errors import RecordError
+from identify.record.own_record import (
+    description_file,
+    read_description,
+    read_own_records,
+    read_telemetry,
+)
+from identify.record.recording import poses, write
+from tests.identify.commands import command, one_line
+from tests.identify.log_files import (
+    FIRST_FRAME,
+    write_bag,
+    write_commands,
+    write_motive,
+    write_vicon,
+)
+from tests.identify.synthetic import short_run
+from tests.identify.test_own_record import DESCRIPTION, table_of
+
+TOLERANCE = 1e-9
+SIGNS = np.array([1, -1, 1, -1, 1, -1])
+ZEROS = np.array([10.0, 0, -20, 0, 0, 370])
+ANCHOR = (
+    DESCRIPTION.format(std=0.005, value=20.0)
+    + "position_std_m = 5e-6\norientation_std_rad = 3e-5\n"
+)
+
+COMMANDS = f"""
+[columns.command]
+file = "commands.csv"
+time = "t_ms"
+time_unit = "ms"
+names = ["q0", "q1", "q2", "q3", "q4", "q5"]
+unit = "deg"
+signs = {SIGNS.tolist()}
+zeros = {ZEROS.tolist()}
+"""
+
+MOTIVE = """
+[columns.measured]
+time = "Time (Seconds)"
+position = ["Plate Position X", "Plate Position Y", "Plate Position Z"]
+position_unit = "mm"
+orientation = ["Plate Rotation X", "Plate Rotation Y", "Plate Rotation Z", "Plate Rotation W"]
+convention = "quaternion_xyzw"
+axes = ["x", "-z", "y"]
+"""
+
+VICON = """
+[columns.measured]
+topic = "Segments"
+time = "Frame"
+time_unit = "frames"
+position = ["Plate:Plate TX", "Plate:Plate TY", "Plate:Plate TZ"]
+position_unit = "mm"
+orientation = ["Plate:Plate RX", "Plate:Plate RY", "Plate:Plate RZ"]
+convention = "rotation_vector"
+angle_unit = "deg"
+base_from_frame = [0.5, -0.25, 1.5, 0.1, 0.2, -2.5]
+body_from_platform = [0.01, 0.02, -0.125, 0.3, 0.0, 1.0]
+"""
+
+BAG = """
+[columns.measured]
+topic = "/plate/pose"
+time = "header.stamp"
+position = ["pose.position.x", "pose.position.y", "pose.position.z"]
+position_unit = "m"
+orientation = ["pose.orientation.w", "pose.orientation.x", "pose.orientation.y", "pose.orientation.z"]
+convention = "quaternion_wxyz"
+[columns.command]
+topic = "/joint_commands"
+time = "header.stamp"
+names = ["position[crank1]", "position[crank2]", "position[crank3]", "position[crank4]", "position[crank5]", "position[crank6]"]
+unit = "rad"
+"""
+
+ONE_TABLE = """
+[columns.measured]
+time = "time_s"
+position = ["measured_x_m", "measured_y_m", "measured_z_m"]
+position_unit = "m"
+orientation = ["measured_alpha_rad", "measured_beta_rad", "measured_gamma_rad"]
+convention = "euler_XYZ"
+[columns.reference]
+position = ["reference_x_m", "reference_y_m", "reference_z_m"]
+position_unit = "m"
+orientation = ["reference_alpha_rad", "reference_beta_rad", "reference_gamma_rad"]
+convention = "euler_XYZ"
+[columns.command]
+names = ["command_1_rad", "command_2_rad", "command_3_rad", "command_4_rad", "command_5_rad", "command_6_rad"]
+unit = "rad"
+written = "command_time_s"
+"""
+
+
+def transform(pose):
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_euler("XYZ", pose[3:]).as_matrix()
+    found[:3, 3] = pose[:3]
+    return found
+
+
+@pytest.fixture(scope="module")
+def record():
+    found = short_run()[0]
+    return found.assign(command_time=("time", found["time"].values + 0.004))
+
+
+def described(path, columns):
+    """A path whose description names its columns."""
+    path.with_suffix(".toml").write_text(ANCHOR + columns)
+    return path
+
+
+def telemetry_of(path):
+    about = read_description(description_file(path), path)
+    return read_telemetry(path, about, load_robot(about.scenario.robot))
+
+
+def as_motive(folder, record):
+    write_commands(folder / "commands.csv", record, SIGNS, ZEROS)
+    write_motive(folder / "take.csv", record)
+    return described(folder / "take.csv", MOTIVE + COMMANDS)
+
+
+def as_newer_motive(folder, record):
+    write_commands(folder / "commands.csv", record, SIGNS, ZEROS)
+    write_motive(folder / "take.csv", record, "1.25")
+    return described(folder / "take.csv", MOTIVE + COMMANDS)
+
+
+def as_vicon(folder, record):
+    """Its commands are on a clock that shows zero a tenth of a second before frame 0."""
+    write_commands(folder / "commands.csv", record, SIGNS, ZEROS, offset_s=-0.1 - FIRST_FRAME / 60)
+    base_from_frame = transform([0.5, -0.25, 1.5, 0.1, 0.2, -2.5])
+    body_from_platform = transform([0.01, 0.02, -0.125, 0.3, 0.0, 1.0])
+    write_vicon(
+        folder / "trial.csv",
+        record,
+        np.linalg.inv(base_from_frame),
+        np.linalg.inv(body_from_platform),
+    )
+    return described(folder / "trial.csv", VICON + COMMANDS + "time_offset_s = -0.1\n")
+
+
+def as_mcap(folder, record):
+    write_bag(folder / "bag", record)
+    (folder / "bag" / "bag.mcap").rename(folder / "run.mcap")
+    return described(folder / "run.mcap", BAG)
+
+
+def as_bag(folder, record):
+    write_bag(folder / "run", record, mcap=False)
+    return described(folder / "run", BAG)
+
+
+def as_table(folder, record):
+    table_of(record).to_csv(folder / "mine.csv", index=False)
+    return described(folder / "mine.csv", ONE_TABLE)
+
+
+def as_our_table(folder, record):
+    table_of(record).to_csv(folder / "mine.csv", index=False)
+    return described(folder / "mine.csv", "")
+
+
+@pytest.mark.parametrize(
+    "write_log", [as_motive, as_newer_motive, as_vicon, as_mcap, as_bag, as_table, as_our_table]
+)
+def test_every_kind_of_log_holds_the_poses_and_commands_of_the_record_to_1e_9(
+    write_log, record, tmp_path
+):
+    found = telemetry_of(write_log(tmp_path, record))
+    ok = record["measured_ok"].values == 1
+    # A bag has no message where the pose was lost.
+    rows = ok if len(found.poses.time) == ok.sum() else np.full(len(ok), True)
+    np.testing.assert_array_equal(found.poses.ok, ok[rows])
+    for ours, theirs in (
+        (found.poses.time, record["time"].values[rows]),
+        (found.poses.pose, poses(record, "measured")[rows]),
+        (found.commands.time, record["time"].values),
+        (found.commands.command, record["command"].values),
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
+
+
+def test_netcdf_holds_the_same(record, tmp_path):
+    write(tmp_path / "mine.nc", record)
+    (found,), _ = read_own_records([tmp_path / "mine.nc"])
+    np.testing.assert_array_equal(poses(found, "measured"), poses(record, "measured"))
+    np.testing.assert_array_equal(found["command"], record["command"])
+
+
+@pytest.mark.parametrize(
+    ("convention", "names", "values"),
+    [
+        ("matrix", 9, lambda turned: turned.as_matrix().reshape(-1, 9)),
+        ("rotation_vector", 3, lambda turned: turned.as_rotvec()),
+        ("quaternion_wxyz", 4, lambda turned: turned.as_quat(scalar_first=True)),
+        ("euler_xyz", 3, lambda turned: turned.as_euler("xyz")),
+        ("euler_ZXZ", 3, lambda turned: turned.as_euler("ZXZ")),
+    ],
+)
+def test_every_convention_of_rotations_is_read(convention, names, values, record, tmp_path):
+    path = as_table(tmp_path, record)
+    ok = record["measured_ok"].values == 1
+    turned = Rotation.from_euler("XYZ", poses(record, "measured")[ok, 3:])
+    columns = [f"o{k}" for k in range(names)]
+    found = pd.DataFrame(np.full((len(ok), names), np.nan), columns=columns)
+    found.loc[ok, columns] = values(turned)
+    pd.concat([pd.read_csv(path), found], axis=1).to_csv(path, index=False)
+    listed = ", ".join(f'"{name}"' for name in columns)
+    change(
+        path.with_suffix(".toml"),
+        'orientation = ["measured_alpha_rad", "measured_beta_rad", "measured_gamma_rad"]\n'
+        'convention = "euler_XYZ"',
+        f'orientation = [{listed}]\nconvention = "{convention}"',
+    )
+    read = telemetry_of(path).poses
+    np.testing.assert_allclose(
+        read.pose, poses(record, "measured"), rtol=0, atol=TOLERANCE, equal_nan=True
+    )
+
+
+def test_a_left_handed_log_with_y_up_is_the_same_record_with_its_axes_named(record, tmp_path):
+    """The oracle reflects points: a left-handed system has y and z of ours exchanged."""
+    path = as_table(tmp_path, record)
+    ours = poses(record, "measured")
+    ok = record["measured_ok"].values == 1
+    mirror = np.array([[1, 0, 0], [0, 0, 1], [0, 1, 0]])
+    turned = Rotation.from_euler("XYZ", ours[ok, 3:]).as_matrix()
+    table = pd.read_csv(path)
+    names = table.columns[table.columns.str.startswith("measured_")]
+    table.loc[ok, names[:3]] = ours[ok, :3] @ mirror
+    table.loc[ok, names[3:]] = Rotation.from_matrix(mirror @ turned @ mirror).as_euler("XYZ")
+    table.to_csv(path, index=False)
+    with pytest.raises(RecordError, match=r"axes = \[x, z, y\] it would fit .the frame is left"):
+        read_own_records([path])
+    change(
+        path.with_suffix(".toml"),
+        "[columns.reference]",
+        'axes = ["x", "z", "y"]\n[columns.reference]',
+    )
+    np.testing.assert_allclose(
+        telemetry_of(path).poses.pose, ours, rtol=0, atol=TOLERANCE, equal_nan=True
+    )
+
+
+def test_a_description_alone_names_its_log(record, tmp_path):
+    """Bags are folders with dots in their names, and one description can name several files."""
+    path = as_motive(tmp_path, record)
+    text = path.with_suffix(".toml").read_text()
+    (tmp_path / "whole.toml").write_text(
+        text.replace("[columns.measured]", '[columns.measured]\nfile = "take.csv"')
+    )
+    found = telemetry_of(tmp_path / "whole.toml")
+    np.testing.assert_array_equal(found.poses.pose, telemetry_of(path).poses.pose)
+
+
+def test_a_mapped_table_is_the_record_that_our_own_table_is(record, tmp_path):
+    (mapped,), scenario = read_own_records([as_table(tmp_path, record)])
+    (ours,), _ = read_own_records([as_our_table(tmp_path, record)])
+    for name in ("measured_position", "measured_orientation", "command", "command_time", "time"):
+        np.testing.assert_allclose(mapped[name], ours[name], rtol=0, atol=1e-14)
+    assert scenario.timing.frame_rate_hz == 60.0
+
+
+def change(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def cell(name, row, value):
+    """A table with one other cell."""
+
+    def spoil(path):
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        table.loc[row, name] = value
+        table.to_csv(path, index=False)
+
+    return spoil
+
+
+def described_as(old, new):
+    return lambda path: change(path.with_suffix(".toml"), old, new)
+
+
+def scaled(prefix, factor):
+    def spoil(path):
+        table = pd.read_csv(path)
+        names = [name for name in table if name.startswith(prefix) and "time" not in name]
+        table[names] *= factor
+        table.to_csv(path, index=False)
+
+    return spoil
+
+
+WRONG_TABLES = [
+    (cell("time_s", 7, "0.05"), "line 9: its time 0.05 s is before 0.1 s of line 8"),
+    (cell("time_s", 7, "0.1"), "line 9: its time 0.1 s is also that of line 8"),
+    (cell("time_s", 7, "soon"), "line 9: the time time_s is 'soon', which is not a number"),
+    (cell("command_2_rad", 3, ""), "line 5: the command command_2_rad is empty or not finite"),
+    (cell("reference_x_m", 4, ""), "line 6: the desired pose has an empty cell"),
+    (cell("measured_x_m", 2, "1,5"), "line 4: measured_x_m is '1,5', which is not a number"),
+    (
+        described_as('"measured_y_m", "measured_z_m"', '"measured_y_m", "measured_y_m"'),
+        r"\[columns\] measured: column 'measured_y_m' is named twice",
+    ),
+    (
+        described_as('names = ["command_1_rad"', 'names = ["measured_x_m"'),
+        r"\[columns\] column 'measured_x_m' is named twice",
+    ),
+    (
+        described_as('"measured_z_m"]', '"z"]'),
+        r"mine.csv: there is no column 'z'; it has time_s, reference_x_m",
+    ),
+    (described_as('position_unit = "m"', 'position_unit = "?"'), "'m', 'mm', 'cm' or 'um'"),
+    (
+        described_as('convention = "euler_XYZ"', 'convention = "?"'),
+        "'[?]' is not a convention: quaternion_xyzw, quaternion_wxyz, matrix",
+    ),
+    (
+        described_as('convention = "euler_XYZ"', 'convention = "quaternion_xyzw"'),
+        "orientation names 3 columns, but the convention quaternion_xyzw has 4",
+    ),
+    (described_as('unit = "rad"', 'unit = "mm"'), "unit is 'mm', and the joints of rss6 move in"),
+    (described_as('unit = "rad"', 'unit = "furlong"'), "unit: 'furlong' is not a unit: rad, deg"),
+    (
+        described_as(', "command_6_rad"]', "]"),
+        "names has 5 columns, and rss6 has 6 joints",
+    ),
+    (
+        scaled("measured_", 1e3),
+        "line 61: an angle of .* is 6.42008 rad, more than a turn; if these are degrees",
+    ),
+    (
+        described_as('position_unit = "m"', 'position_unit = "mm"'),
+        "line 2: leg . of rss6 cannot reach .* with positions in m and not mm it would fit",
+    ),
+    (described_as('unit = "rad"', 'unit = "deg"'), "they are in rad and not degrees"),
+    (
+        described_as('unit = "rad"', 'unit = "rad"\nsigns = [1, 1, -1, 1, 1, 1]'),
+        "the commands of joint 3 count against the direction",
+    ),
+    (
+        described_as('unit = "rad"', 'unit = "rad"\nzeros = [0, 6.28, 0, 0, 0, 0]'),
+        "the commands of joint 2 lie -6.2.* its zero is off by a turn",
+    ),
+    (
+        described_as('time = "time_s"', 'time = "time_s"\ntime_unit = "ms"'),
+        "line 3: time_s is 1.66667e-05 after 0 in the row before, which is 0.001 frames of 60 Hz",
+    ),
+]
+
+
+@pytest.mark.parametrize(("spoil", "says"), WRONG_TABLES)
+def test_a_wrong_mapping_or_row_is_one_line_that_names_it(spoil, says, record, tmp_path, capfd):
+    path = as_table(tmp_path, record)
+    spoil(path)
+    assert command("identify", "--record", path, "--out", tmp_path / "new", "--quiet") == NOT_DONE
+    assert re.search(says, one_line(capfd.readouterr().err))
+    assert not (tmp_path / "new").exists()
+
+
+def motive_row(old, new, line=12):
+    """A Motive export with a cell of one line replaced."""
+
+    def spoil(path):
+        lines = path.read_text().splitlines()
+        cells = lines[line - 1].split(",")
+        lines[line - 1] = ",".join(cells[:2] + new + cells[2 + len(new) :])
+        path.write_text("\n".join(lines) + "\n")
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (
+            motive_row(None, ["0", "0", "0", "0"]),
+            "line 12: the quaternion Plate Rotation X, .* has the length 0, must be 1",
+        ),
+        (
+            described_as('file = "commands.csv"', 'file = "none.csv"'),
+            "cannot read record .*none.csv",
+        ),
+        (
+            described_as('time_unit = "ms"', 'time_unit = "ms"\ntime_offset_s = 1e9'),
+            "the clocks do not overlap; columns.command.time_offset_s is added .* -1000000000 s more",
+        ),
+        (described_as("[columns.command]", "[columns.commands]"), "command is missing"),
+        (described_as('time = "t_ms"', 'topic = "x"'), "command.time must name the column"),
+    ],
+)
+def test_wrong_exports_are_one_line(spoil, says, record, tmp_path):
+    path = as_motive(tmp_path, record)
+    spoil(path)
+    with pytest.raises(RecordError, match=says):
+        read_own_records([path])
+
+
+def test_a_rate_that_contradicts_the_export_is_refused(record, tmp_path):
+    path = as_vicon(tmp_path, record)
+    change(path.with_suffix(".toml"), "frame_rate_hz = 60.0", "frame_rate_hz = 100.0")
+    with pytest.raises(RecordError, match="states 60 frames per second, and"):
+        telemetry_of(path)
+    change(path.with_suffix(".toml"), 'topic = "Segments"', 'topic = "Objects"')
+    with pytest.raises(RecordError, match=r"no topic 'Objects'; it has Segments \(Vicon\), Traj"):
+        telemetry_of(path)
+
+
+def test_a_bag_without_the_topic_lists_those_that_it_has(record, tmp_path):
+    path = as_mcap(tmp_path, record)
+    change(path.with_suffix(".toml"), "/plate/pose", "/plate")
+    listed = (
+        r"no topic '/plate'; it has /joint_commands \(sensor_msgs/JointState\), "
+        r"/plate/pose \(geometry_msgs/PoseStamped\), /rosout \(std_msgs/String\)"
+    )
+    with pytest.raises(RecordError, match=listed):
+        telemetry_of(path)
+    change(path.with_suffix(".toml"), '"/plate"', '"/plate/pose"')
+    change(path.with_suffix(".toml"), "position[crank6]", "position[crank7]")
+    with pytest.raises(
+        RecordError, match=r"no column 'position\[crank7\]'; it has log_time, header.stamp"
+    ):
+        telemetry_of(path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(RecordError, match="cannot read the bag"):
+        telemetry_of(path)
+    path.with_suffix(".toml").write_text(ANCHOR)
+    with pytest.raises(
+        RecordError, match=r"run.toml must name the columns of its log in \[columns\]"
+    ):
+        telemetry_of(path)
+
+
+def test_a_bag_without_the_package_that_reads_it_is_one_line(record, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    path = described(tmp_path / "run.mcap", BAG)
+    with pytest.raises(RecordError, match=r"not installed: pip install 'cmmsim\[bags\]'"):
+        telemetry_of(path)
