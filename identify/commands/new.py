@@ -142,6 +142,25 @@ def record(
         Path, typer.Argument(metavar="FILE.csv", help="Table to write. It must not exist yet.")
     ],
     robot: RobotArgument = "rss6",
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--from",
+            metavar="LOG",
+            help="Log of your own, from whose header [columns] is proposed: a CSV table, an export "
+            "of Motive or Vicon, or a bag of ROS 2. Repeat the option for a second log with the "
+            "commands.",
+            show_default=False,
+        ),
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", help="Body of the platform, where a log has several."),
+    ] = None,
+    commands: Annotated[
+        str | None,
+        typer.Option("--commands", help="Columns of the commands, where a log has several."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a template for a record of your own: a CSV table, and a TOML file that describes it.
@@ -150,23 +169,33 @@ def record(
     record, and two example rows at rest. The TOML file holds the robot, timing, servo gains, the
     quantity that fixes the scale, and the uncertainty of the poses.
 
-    Reads a robot file. Writes FILE.csv and FILE.toml.
+    With --from, no table is written. The TOML file then also says what the columns of your log are
+    called, and in which units and conventions they are. What the header does not tell has the value
+    "?", which you replace.
+
+    Reads a robot file, and your logs. Writes FILE.csv and FILE.toml.
 
     \b
     Examples:
       cmmsim new record mine.csv ups6
+      cmmsim new record mine.csv ups6 --from take.csv --from commands.csv
       cmmsim identify --record mine.csv
     """
     from dynamics import load_robot
+    from dynamics.files import parse_toml
+    from identify.errors import RecordError
     from identify.record.own_record import (
+        FRAME_RATE_HZ,
         SCHEMA,
         description_file,
         description_text,
+        is_log,
+        proposed,
         read_own_records,
         table_text,
     )
 
-    if file.suffix != ".csv":
+    if file.suffix != ".csv" and not (logs and is_log(file)):
         raise OutputFolderError(
             f"cannot write {file}: the name of a record's table must end in .csv"
         )
@@ -174,6 +203,14 @@ def record(
     beside = description_file(file)
     # The path is absolute, because the description may be read from another folder.
     named = robot if robot in built_in_names("robot") else str(Path(robot).resolve())
+    if logs:
+        proposal = proposed(logs, file, chosen, body, commands)
+        head = description_text(chosen, named, file.name, proposal.rate_hz or FRAME_RATE_HZ)
+        text = _with_schema(SCHEMA, f"{head}{proposal.text}")
+        _write({beside: text}, lambda path: parse_toml(path.read_text(), str(path), RecordError))
+        asked = f"answer {', '.join(proposal.asked)} in it, " if proposal.asked else ""
+        _say(quiet, beside, f"{asked}fill in the rest, then: cmmsim check {file}")
+        return
     description = _with_schema(SCHEMA, description_text(chosen, named, file.name))
     _write({file: table_text(chosen), beside: description}, lambda path: read_own_records([path]))
     _say(quiet, file, f"fill in its rows and {beside}, then: cmmsim identify --record {file}")

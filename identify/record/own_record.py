@@ -9,6 +9,7 @@ columns of a log are called.
 The template for a user's record is a table with two example rows, and its TOML file.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -28,7 +29,8 @@ from identify.record.csv_record import RULES, columns_of, read_table
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
-from identify.record.readers.mapped import read_mapped
+from identify.record.readers.mapped import open_log, read_mapped
+from identify.record.readers.proposal import Proposal, propose
 from identify.record.recording import build_record, read
 from identify.record.suspicions import check_plausible
 from identify.record.telemetry import ReferenceLog, Telemetry
@@ -36,7 +38,7 @@ from identify.scenario import Scenario
 from identify.scenario.payload import Payload
 from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.section import Section, quantity
-from identify.scenario.sections import Identification
+from identify.scenario.sections import Excitation, Identification, Validation
 from identify.scenario.settings_file import one_line, starting_toml
 
 DESCRIPTION = "record"
@@ -199,8 +201,25 @@ def read_description(path: Path, log: Path) -> Description:
     columns = None if named is None else _section(Columns, named, f"{path}: [{COLUMNS}]")
     # A scenario needs a name, but this file does not have to state it.
     name = path.stem if is_name(path.stem) else DESCRIPTION
-    scenario = SCENARIOS.from_dict({"name": name} | content, str(path), path.parent)
+    whole = _with_whole_frames({"name": name} | content)
+    scenario = SCENARIOS.from_dict(whole, str(path), path.parent)
     return Description(scenario, measured, columns)
+
+
+def _with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a scenario whose planned runs have whole frames at the rate of a record.
+
+    A record does not read these runs, and its rate can be any.
+    """
+    timing = content.get("timing")
+    rate = timing.get("frame_rate_hz") if isinstance(timing, Mapping) else None
+    whole = dict(content)
+    if isinstance(rate, int | float) and rate > 0:
+        for section, planned in (("excitation", Excitation()), ("validation", Validation())):
+            frames = round(planned.duration_s * rate)
+            if frames != planned.duration_s * rate and section not in content:
+                whole[section] = {"duration_s": frames / rate}
+    return whole
 
 
 Model = TypeVar("Model", bound=Section)
@@ -313,23 +332,44 @@ def table_text(robot: Robot) -> str:
     return "\n".join(lines) + "\n"
 
 
-def description_text(robot: Robot, name_or_path: str, table: str) -> str:
+def proposed(
+    logs: Sequence[Path], record: Path, robot: Robot, body: str | None, commands: str | None
+) -> Proposal:
+    """Propose the columns of logs for the description beside the path of a record.
+
+    Raises the RecordError of `propose`.
+    """
+    files = {_relative(log, record.parent): open_log(log) for log in logs}
+    return propose(files, robot, body, commands)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder if it lies in it, and else its absolute path."""
+    whole, inside = path.resolve(), folder.resolve()
+    return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)
+
+
+def description_text(
+    robot: Robot, name_or_path: str, table: str, rate_hz: float = FRAME_RATE_HZ
+) -> str:
     """Return the text of the TOML file for a table: robot, timing, servo and scale.
 
-    The user replaces the example values.
+    The user replaces the example values. `rate_hz` is the frame rate.
     """
     mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(
-        {
-            "name": "record",
-            "robot": name_or_path,
-            "timing": {"frame_rate_hz": FRAME_RATE_HZ, "latency_s": 0.0, "hold": "zero"},
-            "servo": {
-                name: getattr(Scenario.model_fields["servo"].default, name)
-                for name in ("kp", "kd", "ki")
-            },
-            "identification": {"scale_anchor": "platform_mass", "anchor_std": 0.005},
-        }
+        _with_whole_frames(
+            {
+                "name": "record",
+                "robot": name_or_path,
+                "timing": {"frame_rate_hz": rate_hz, "latency_s": 0.0, "hold": "zero"},
+                "servo": {
+                    name: getattr(Scenario.model_fields["servo"].default, name)
+                    for name in ("kp", "kd", "ki")
+                },
+                "identification": {"scale_anchor": "platform_mass", "anchor_std": 0.005},
+            }
+        )
     )
     measured = Measured(
         anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD

@@ -65,7 +65,7 @@ def read_messages(
                 _seconds(moment) if name == LOG_TIME else _entry(message, steps)
                 for name, steps in zip(names, paths, strict=True)
             ]
-            if all(cells[place] is None for place in telling):
+            if telling and all(cells[place] is None for place in telling):
                 continue
             numbers.append(number)
             for column, cell in zip(columns, cells, strict=True):

@@ -1,0 +1,182 @@
+"""Columns of bodies and joints, by their names in the headers of logs."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from dynamics import Robot
+from identify.record.readers.streams import Header, LoggedFile
+
+UNITS = {
+    "mm": "mm",
+    "millimeters": "mm",
+    "cm": "cm",
+    "centimeters": "cm",
+    "um": "um",
+    "m": "m",
+    "meters": "m",
+    "deg": "deg",
+    "degrees": "deg",
+    "rad": "rad",
+    "radians": "rad",
+    "turn": "turn",
+    "turns": "turn",
+    "s": "s",
+    "sec": "s",
+    "seconds": "s",
+    "ms": "ms",
+    "us": "us",
+    "ns": "ns",
+}
+"""Units by their spellings at the end of a name, and in headers."""
+
+PLACED = ("position", "pos", "translation", "pose", "p", "t")
+"""Words before x, y and z of a position."""
+
+TURNED = ("rotation", "orientation", "quaternion", "quat", "rot", "q")
+"""Words before x, y, z and w of a rotation."""
+
+ANGLES = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"))
+"""Names of three angles."""
+
+WANTED = ("reference", "ref", "desired", "des", "target", "goal", "setpoint", "sp")
+"""Words for desired poses."""
+
+COMMANDED = ("command", "commands", "cmd", "commanded", *WANTED)
+"""Words for commands of joints."""
+
+OTHERWISE = ("velocity", "vel", "effort", "torque", "current", "rate", "acc", "covariance", "error")
+"""Words for what is neither a pose nor a command."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Part of a file in which columns stand."""
+
+    file: str
+    topic: str | None
+    header: Header
+    numbers: LoggedFile
+    part: str
+
+
+@dataclass(frozen=True)
+class Body:
+    """Columns of a pose."""
+
+    place: Place
+    stem: str
+    position: tuple[str, ...]
+    orientation: tuple[str, ...]
+    convention: str | None
+    """None if the names do not tell it."""
+
+    @property
+    def label(self) -> str:
+        """Name for the choice between several."""
+        return " ".join(filter(None, (self.place.topic or "", self.stem))) or "the only one"
+
+
+@dataclass(frozen=True)
+class Joints:
+    """Columns of commands."""
+
+    place: Place
+    stem: str
+    names: tuple[str, ...]
+
+    @property
+    def label(self) -> str:
+        """Name for the choice between several."""
+        return " ".join(filter(None, (self.place.topic or "", self.stem))) or self.names[0]
+
+
+def bodies_of(place: Place) -> Iterator[Body]:
+    """Yield the poses whose columns a header names."""
+    positions: dict[str, dict[str, str]] = {}
+    turns: dict[str, dict[str, str]] = {}
+    for name in place.header.names:
+        words = words_of(name)
+        if not words or has_word(name, OTHERWISE):
+            continue
+        last, before = words[-1].lower(), words[:-1]
+        kept = [word for word in before if word.lower() not in (*PLACED, *TURNED)]
+        # Vicon names a subject and its segment, which are often alike.
+        stem = " ".join(dict.fromkeys(kept))
+        in_turn = last in ("w", "x", "y", "z") and has_word(" ".join(before), TURNED)
+        if in_turn or re.fullmatch("q[wxyz]|rw", last):
+            turns.setdefault(stem, {})[f"q{last[-1]}"] = name
+        elif last in ("x", "y", "z"):
+            positions.setdefault(stem, {})[last] = name
+        elif re.fullmatch("(pos|p|t)[xyz]", last):
+            positions.setdefault(stem, {})[last[-1]] = name
+        elif any(last in angles for angles in ANGLES) or re.fullmatch("[rm][0-3][0-3]", last):
+            turns.setdefault(stem, {})[last] = name
+    for stem, three in positions.items():
+        if len(three) == 3 and stem in turns:
+            turned, convention = _turned(turns[stem])
+            if turned:
+                yield Body(place, stem, tuple(three[one] for one in "xyz"), turned, convention)
+
+
+def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
+    """Return the columns of a rotation, and its convention if the names tell it."""
+    if all(f"q{one}" in named for one in "xyzw"):
+        return tuple(named[f"q{one}"] for one in "xyzw"), "quaternion_xyzw"
+    matrix = sorted(one for one in named if re.fullmatch("[rm][0-3][0-3]", one))
+    if len(matrix) == 9:
+        return tuple(named[one] for one in matrix), "matrix"
+    for angles in (*ANGLES, ("qx", "qy", "qz")):
+        if all(one in named for one in angles):
+            if angles[0] == "rx" and "qw" in named:
+                return (*(named[one] for one in angles), named["qw"]), "quaternion_xyzw"
+            return tuple(named[one] for one in angles), None
+    return (), None
+
+
+def joints_of(place: Place, robot: Robot) -> Iterator[Joints]:
+    """Yield the groups of columns, one a joint, that a header names."""
+    groups: dict[str, dict[str, str]] = {}
+    for name in place.header.names:
+        if has_word(name, OTHERWISE) or re.search(r"[wxyz]$", without_unit(name).lower()):
+            continue
+        entry = re.fullmatch(r"(.*)\[([^\]]+)\]", name)
+        numbered = re.fullmatch(r"(.*?)(\d+)(\D*)", without_unit(name))
+        if entry:
+            groups.setdefault(entry[1], {})[entry[2]] = name
+        elif numbered:
+            stem = f"{numbered[1]}{numbered[3]}".strip(" _.")
+            groups.setdefault(stem, {})[numbered[2]] = name
+    for stem, members in groups.items():
+        if len(members) == robot.layout.joints:
+            yield Joints(place, stem, tuple(members[key] for key in _in_order(members, robot)))
+
+
+def _in_order(members: Mapping[str, str], robot: Robot) -> Sequence[str]:
+    """Return the keys of joints in the order of the robot, of their numbers, or of the file."""
+    if set(members) == set(robot.joint_names):
+        return list(robot.joint_names)
+    numbers = {key: re.findall(r"\d+", key) for key in members}
+    if all(numbers.values()):
+        return sorted(members, key=lambda key: int(numbers[key][-1]))
+    return list(members)
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of a name without its unit."""
+    return [word for word in re.split(r"[^A-Za-z0-9]+", without_unit(name)) if word]
+
+
+def has_word(text: str, words: Sequence[str]) -> bool:
+    """Return whether a text has one of some words."""
+    return bool(set(re.split(r"[^a-z]+", text.lower())) & set(words))
+
+
+UNIT = re.compile(r"^(.*?)[\s_]*[\[(/_ ]\s*(" + "|".join(UNITS) + r")\s*[\])]?$", re.IGNORECASE)
+"""Name with a unit at its end, after a separator or in brackets."""
+
+
+def without_unit(name: str) -> str:
+    """Return a name without the unit at its end."""
+    found = UNIT.match(name)
+    return found[1] if found and found[1] else name

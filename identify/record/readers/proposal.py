@@ -1,0 +1,231 @@
+"""Proposal of ``[columns]`` from the headers of logs.
+
+Names tell which columns belong together, and units at the end of a name are taken as they stand.
+What a header does not tell, such as the sequence of three angles, is left to the user as a key with
+the value "?", which is refused with the choices until it is answered. What several bodies or
+several groups of columns could be is refused at once, with their names.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dynamics import Robot
+from identify.errors import RecordError
+from identify.record.columns import ASKED, FRAMES
+from identify.record.columns import TIMES as SECONDS
+from identify.record.readers.header_names import (
+    COMMANDED,
+    UNIT,
+    UNITS,
+    WANTED,
+    Body,
+    Joints,
+    Place,
+    bodies_of,
+    has_word,
+    joints_of,
+    without_unit,
+)
+from identify.record.readers.streams import Header, LoggedFile, Stream
+from identify.record.readers.tables import FRAME
+
+TIMES = ("time", "t", "timestamp", "stamp", "secs")
+"""Words for times."""
+
+LOG_TIME = "log_time"
+
+EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz about fixed axes"
+
+
+@dataclass
+class Proposal:
+    """Text of the tables of a description, and what is left to the user."""
+
+    lines: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    rate_hz: float | None = None
+
+    @property
+    def text(self) -> str:
+        """TOML text of ``[columns]``."""
+        return "\n".join(self.lines) + "\n"
+
+    def add(self, table: str, key: str, value: str | None, why: str) -> None:
+        """Add an entry, or ask for it with the reason if it is None."""
+        if value is None:
+            self.asked.append(f"{table}.{key}")
+        shown = _text(ASKED if value is None else value)
+        self.lines.append(f"{f'{key} = {shown}':<40} # {why}" if why else f"{key} = {shown}")
+
+
+def propose(
+    files: Mapping[str, LoggedFile],
+    robot: Robot,
+    body: str | None = None,
+    commands: str | None = None,
+) -> Proposal:
+    """Propose the columns of logs.
+
+    Parameters
+    ----------
+    files
+        Logs by their names in the description.
+    robot
+        Robot whose joints are commanded.
+    body, commands
+        Body of the platform and group of commands, to choose between several.
+
+    Raises
+    ------
+    RecordError
+        There are no poses or commands, or several; the message names them.
+    """
+    places = [
+        Place(name, topic if len(file.headers) > 1 else None, header, file, topic)
+        for name, file in files.items()
+        for topic, header in file.headers.items()
+    ]
+    found = [one for place in places for one in bodies_of(place)]
+    wanted = [one for one in found if has_word(one.stem, WANTED)]
+    measured = _chosen([one for one in found if one not in wanted], body, "poses", "--body")
+    groups = [one for place in places for one in joints_of(place, robot)]
+    meant = [one for one in groups if has_word(f"{one.stem} {one.place.topic}", COMMANDED)]
+    joints = _chosen(
+        meant if commands is None and meant else groups,
+        commands,
+        f"commands of {robot.layout.joints} joints",
+        "--commands",
+    )
+    made = Proposal(rate_hz=measured.place.header.rate_hz)
+    _propose_body(made, "measured", measured, None)
+    _propose_joints(made, joints, measured.place, robot)
+    reference = [one for one in wanted if body is None or one.label != measured.label]
+    if len(reference) == 1:
+        _propose_body(made, "reference", reference[0], measured.place)
+    return made
+
+
+def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None) -> None:
+    """Add the table of a pose. `rows` is the place of the measured poses, None for themselves."""
+    header = body.place.header
+    made.lines += ["", f"[columns.{table}]"]
+    cells = _propose_rows(made, table, body.place, rows, [*body.position, *body.orientation])
+    made.lines.append(f"position = {_text(list(body.position))}")
+    made.add(
+        table,
+        "position_unit",
+        _unit(header, body.position, ("m", "mm", "cm", "um")),
+        f"m, mm, cm or um; {_range(cells, body.position)}",
+    )
+    made.lines.append(f"orientation = {_text(list(body.orientation))}")
+    stated = f"; the file says {header.rotation}" if header.rotation else ""
+    choices = EULER_CHOICES if len(body.orientation) == 3 else "quaternion_xyzw or quaternion_wxyz"
+    rotated = "rotation_vector, " if len(body.orientation) == 3 else ""
+    why = "" if body.convention else f"{rotated}{choices}{stated}"
+    made.add(table, "convention", body.convention, why)
+    if len(body.orientation) == 3:
+        unit = _unit(header, body.orientation, ("rad", "deg"))
+        made.add(table, "angle_unit", unit, f"rad or deg; {_range(cells, body.orientation)}")
+    if header.kind == "Motive":
+        made.lines.append(
+            '# axes = ["x", "-z", "y"]  # where y is up in the log, as Motive exports by default'
+        )
+    made.lines += [
+        "# base_from_frame = [0, 0, 0, 0, 0, 0]  # pose of the log's frame in the robot's base",
+        "# body_from_platform = [0, 0, 0, 0, 0, 0]  # pose of the platform in the tracked body",
+    ]
+
+
+def _propose_joints(made: Proposal, joints: Joints, rows: Place, robot: Robot) -> None:
+    made.lines += ["", "[columns.command]"]
+    cells = _propose_rows(made, "command", joints.place, rows, joints.names)
+    made.lines.append(f"names = {_text(list(joints.names))}")
+    units = ("m", "mm", "cm", "um") if robot.layout.prismatic else ("rad", "deg", "turn")
+    unit = _unit(joints.place.header, joints.names, units)
+    if "JointState" in joints.place.header.kind:
+        unit = robot.layout.joint_unit
+    listed = f"{', '.join(units[:-1])} or {units[-1]}, or a number"
+    made.add("command", "unit", unit, f"{listed}; {_range(cells, joints.names)}")
+    ones = ", ".join("1" for _ in joints.names)
+    noughts = ", ".join("0" for _ in joints.names)
+    made.lines += [
+        f"# signs = [{ones}]  # -1 where a joint counts against the robot file",
+        f"# zeros = [{noughts}]  # values at the zeros of the robot file, in this unit",
+    ]
+
+
+def _propose_rows(
+    made: Proposal, table: str, place: Place, rows: Place | None, names: Sequence[str]
+) -> Stream:
+    """Add where the rows of a table are, if not in those of the poses. Return its columns."""
+    if place is rows:
+        return place.numbers.read(place.part, names)
+    entries = {"file": place.file, "topic": place.topic}
+    made.lines += [f"{key} = {_text(value)}" for key, value in entries.items() if value is not None]
+    header = place.header
+    found = [name for name in header.names if has_word(without_unit(name), TIMES)]
+    if table == "measured":
+        found = [name for name in found if not has_word(name, COMMANDED)]
+    # The time in a message is that of the pose, and not that of its way into the bag.
+    times = [name for name in found if name != LOG_TIME] or found
+    if not times and FRAME in header.names:
+        made.lines += [f"time = {_text(FRAME)}", f"time_unit = {_text(FRAMES)}"]
+        return place.numbers.read(place.part, names)
+    sure = len(times) == 1 or (bool(times) and header.kind != "CSV")
+    why = "" if len(times) == 1 else f"one of {', '.join(times or header.names)}"
+    made.add(table, "time", times[0] if sure else None, why)
+    cells = place.numbers.read(place.part, [*times[:1], *names])
+    if times:
+        unit = _unit(header, times[:1], tuple(SECONDS))
+        steps = np.diff(cells.numbers(times[0]))
+        step = float(np.median(steps)) if len(steps) else 0.0
+        made.add(table, "time_unit", unit, f"s, ms, us, ns or frames; the steps are {step:.6g}")
+        if table == "measured" and made.rate_hz is None and unit is not None and step > 0:
+            made.rate_hz = float(f"{1 / (float(SECONDS[unit]) * step):.4g}")
+    return cells
+
+
+def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> Any:
+    """Return the one that is meant. Raises RecordError with those that there are."""
+    labels = [one.label for one in found]
+    if label is None and len(found) == 1:
+        return found[0]
+    if label in labels:
+        return found[labels.index(label)]
+    if not found:
+        raise RecordError(
+            f"no {what} are found in the header; write [columns] by hand (cmmsim new record "
+            "without --from writes the rest)"
+        )
+    listed = ", ".join(repr(one) for one in labels)
+    said = f"there are several {what}" if label is None else f"there are no {what} {label!r}"
+    raise RecordError(f"{said}: choose one of {listed} with {option}")
+
+
+def _unit(header: Header, names: Sequence[str], allowed: Sequence[str]) -> str | None:
+    """Return the unit of columns by their names or the header, or None if neither tells it."""
+    if "/" in header.kind:  # messages of ROS are in SI units
+        return allowed[0]
+    stated = {header.units.get(name, "") for name in names}
+    spelt = {found[2] if (found := UNIT.match(name)) else "" for name in names}
+    for texts in (stated, spelt):
+        units = {UNITS.get(text.lower()) for text in texts}
+        if len(units) == 1 and (unit := units.pop()) in allowed:
+            return unit
+    return None
+
+
+def _range(cells: Stream, names: Sequence[str]) -> str:
+    """Say between which numbers the columns lie."""
+    values = np.concatenate([cells.numbers(name) for name in names])
+    if np.isnan(values).all():
+        return "all cells are empty"
+    return f"from {np.nanmin(values):.6g} to {np.nanmax(values):.6g}"
+
+
+def _text(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,157 @@
+"""Proposals of `cmmsim new record --from`: what a header says stands in them, and the rest is asked.
+
+The oracle is the record from which the logs were written.
+"""
+
+import re
+import tomllib
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from identify.commands.help import DONE, NOT_DONE
+from identify.errors import RecordError, ScenarioError
+from identify.record.recording import poses
+from tests.identify.commands import command, one_line
+from tests.identify.test_readers import (
+    SIGNS,
+    TOLERANCE,
+    ZEROS,
+    as_mcap,
+    as_motive,
+    as_table,
+    as_vicon,
+    change,
+    record,  # noqa: F401
+    telemetry_of,
+)
+
+
+def proposed(path, *logs, more=()):
+    """Propose the description of a record from logs, and return its [columns]."""
+    path.with_suffix(".toml").unlink(missing_ok=True)
+    options = [part for log in logs for part in ("--from", log)]
+    assert command("new", "record", path, "rss6", *options, *more, "--quiet") == DONE
+    return tomllib.loads(path.with_suffix(".toml").read_text())["columns"]
+
+
+def answer(path, key, value, after=""):
+    """Replace a key that is asked by a value."""
+    text = path.with_suffix(".toml").read_text()
+    place = text.index(after)
+    assert re.search(rf'^{key} = "\?"', text[place:], re.MULTILINE)
+    found = re.sub(
+        rf'^{key} = "\?".*$', lambda _: f"{key} = {value}", text[place:], count=1, flags=re.M
+    )
+    path.with_suffix(".toml").write_text(text[:place] + found)
+
+
+def uncomment(path, entry, value, after):
+    text = path.with_suffix(".toml").read_text()
+    place = text.index(after)
+    found = re.sub(
+        rf"^# {entry} = .*$", lambda _: f"{entry} = {value}", text[place:], count=1, flags=re.M
+    )
+    path.with_suffix(".toml").write_text(text[:place] + found)
+
+
+def check(path, recorded):
+    found = telemetry_of(path)
+    ok = recorded["measured_ok"].values == 1
+    rows = found.poses.ok
+    measured = poses(recorded, "measured")[ok]
+    np.testing.assert_allclose(found.poses.pose[rows], measured, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        found.commands.command, recorded["command"].values, rtol=0, atol=TOLERANCE
+    )
+
+
+def test_a_proposal_for_motive_asks_only_for_the_unit_of_the_commands(record, tmp_path):  # noqa: F811
+    take = as_motive(tmp_path, record)
+    path = tmp_path / "mine.csv"
+    found = proposed(path, take, tmp_path / "commands.csv")
+    assert found["measured"]["position_unit"] == "mm"
+    assert found["command"]["time_unit"] == "ms"
+    with pytest.raises(RecordError, match=r"command.unit: '\?' is not a unit: rad, deg"):
+        telemetry_of(path)
+    answer(path, "unit", '"deg"')
+    uncomment(path, "axes", '["x", "-z", "y"]', "[columns.measured]")
+    uncomment(path, "signs", SIGNS.tolist(), "[columns.command]")
+    uncomment(path, "zeros", ZEROS.tolist(), "[columns.command]")
+    check(path, record)
+
+
+def test_a_proposal_for_vicon_asks_which_body_and_which_convention(record, tmp_path, capfd):  # noqa: F811
+    trial = as_vicon(tmp_path, record)
+    trial.with_suffix(".toml").unlink()
+    logs = ("--from", trial, "--from", tmp_path / "commands.csv", "--quiet")
+    assert command("new", "record", trial, "rss6", *logs) == NOT_DONE
+    said = one_line(capfd.readouterr().err)
+    assert "several poses: choose one of 'Segments Base', 'Segments Plate' with --body" in said
+    found = proposed(trial, trial, tmp_path / "commands.csv", more=("--body", "Segments Plate"))
+    assert (found["measured"]["time"], found["measured"]["time_unit"]) == ("Frame", "frames")
+    assert found["measured"]["convention"] == "?"
+    assert found["measured"]["angle_unit"] == "deg"
+    with pytest.raises(RecordError, match=r"'\?' is not a convention: quaternion_xyzw"):
+        telemetry_of(trial)
+
+
+def test_a_proposal_for_a_bag_needs_no_answer(record, tmp_path):  # noqa: F811
+    bag = as_mcap(tmp_path, record)
+    proposed(bag, bag)
+    check(bag, record)
+
+
+def test_a_proposal_for_a_table_finds_poses_references_and_commands(record, tmp_path):  # noqa: F811
+    table = as_table(tmp_path, record)
+    found = proposed(table, table)
+    assert found["measured"]["time"] == "time_s"
+    for section in ("measured", "reference"):
+        answer(table, "convention", '"euler_XYZ"', f"[columns.{section}]")
+    check(table, record)
+    np.testing.assert_allclose(
+        telemetry_of(table).reference.pose, poses(record, "reference"), rtol=0, atol=TOLERANCE
+    )
+
+
+def test_names_without_units_are_asked_with_the_range_of_their_numbers(record, tmp_path):  # noqa: F811
+    """At 29.97 Hz, of which 20 s are no whole number of frames."""
+    names = ["t", "px", "py", "pz", "qw", "qx", "qy", "qz", *(f"u{k}" for k in range(1, 7))]
+    numbers = np.arange(60.0)[:, None] / 29.97 + np.zeros(len(names))
+    path = tmp_path / "plain.csv"
+    pd.DataFrame(numbers, columns=names).to_csv(path, index=False)
+    found = proposed(path, path)
+    assert found["measured"]["orientation"] == ["qx", "qy", "qz", "qw"]
+    assert found["command"]["names"] == names[-6:]
+    asked = {key for key, value in found["measured"].items() if value == "?"}
+    assert asked == {"time_unit", "position_unit"}
+    assert "from 0 to 1.96864" in path.with_suffix(".toml").read_text()
+    answer(path, "time_unit", '"s"')
+    answer(path, "position_unit", '"m"')
+    answer(path, "unit", '"rad"')
+    change(path.with_suffix(".toml"), "frame_rate_hz = 60.0", "frame_rate_hz = 29.97")
+    with pytest.raises(RecordError, match=r"the quaternion .* has the length 0, must be 1"):
+        telemetry_of(path)
+    change(path.with_suffix(".toml"), "frame_rate_hz = 29.97", "frame_rate_hz = -1.0")
+    with pytest.raises(ScenarioError, match="frame_rate_hz = -1"):
+        telemetry_of(path)
+
+
+def test_a_log_without_poses_or_with_several_groups_of_commands_says_so(record, tmp_path, capfd):  # noqa: F811
+    table = as_table(tmp_path, record)
+    table.with_suffix(".toml").unlink()
+    found = pd.read_csv(table)
+    again = {f"command_{k}_rad": f"command_again_{k}_rad" for k in range(1, 7)}
+    found.assign(**{new: found[old] for old, new in again.items()}).to_csv(table, index=False)
+    for options, says in (
+        ((), "several commands of 6 joints: choose one of 'command', 'command_again'"),
+        (("--body", "plate"), "no poses 'plate': choose one of 'measured' with --body"),
+    ):
+        assert command("new", "record", table, "rss6", "--from", table, *options) == NOT_DONE
+        assert says in one_line(capfd.readouterr().err)
+    assert not table.with_suffix(".toml").exists()
+    proposed(table, table, more=("--commands", "command_again"))
+    (tmp_path / "none.csv").write_text("a,b\n1,2\n")
+    command("new", "record", tmp_path / "n.csv", "rss6", "--from", tmp_path / "none.csv")
+    assert "no poses are found in the header" in one_line(capfd.readouterr().err)
