@@ -11,6 +11,9 @@ Sensor
 Images from other sources
     measure_frame(StereoFrame(left, right), sensor.estimator)  -> Measurement
     Tracker(sensor.estimator).measure(images)                  -> Measurement of successive frames
+    teach(left, right, "mine.toml")            -> PhotographedTeaching from folders or videos
+    measure(left, right, "mine.toml", taught)  -> MeasuredPair of each pair of photographs
+    read_taught("taught.json")                 -> Taught, from the file of a teaching
 
 Cameras that drift
     Sensor.drift_rig({"right.cx_px": 0.1}, frames)  moves the true rig, not the estimator's rig
@@ -43,6 +46,7 @@ from cmmsim.errors import (
     CmmError,
     LostError,
     OpenGLMissingError,
+    PhotographError,
     SensorFileError,
     ShapeError,
     TeachingError,
@@ -58,6 +62,8 @@ if TYPE_CHECKING:
     from cmmsim.faults import FaultGenerator as FaultGenerator
     from cmmsim.faults import fault_bodies as fault_bodies
     from cmmsim.files.sensor_file import built_in_names as built_in_names
+    from cmmsim.from_photographs import measure as measure
+    from cmmsim.from_photographs import teach as teach
     from cmmsim.geometry.camera import PinholeCamera as PinholeCamera
     from cmmsim.geometry.pose import pose_to_transform as pose_to_transform
     from cmmsim.geometry.pose import transform_to_pose as transform_to_pose
@@ -70,6 +76,9 @@ if TYPE_CHECKING:
     from cmmsim.measuring.pose_estimator import PoseEstimator as PoseEstimator
     from cmmsim.measuring.pose_estimator import measure_frame as measure_frame
     from cmmsim.measuring.taught import Taught as Taught
+    from cmmsim.photographs.measuring import MeasuredPair as MeasuredPair
+    from cmmsim.photographs.taught_file import read_taught as read_taught
+    from cmmsim.photographs.teaching import PhotographedTeaching as PhotographedTeaching
     from cmmsim.radiometry.stereo_images import StereoFrame as StereoFrame
     from cmmsim.sensor import Sensor as Sensor
     from cmmsim.tracker import Tracker as Tracker
@@ -83,6 +92,10 @@ _HOME = {
     "StereoFrame": "cmmsim.radiometry.stereo_images",
     "Taught": "cmmsim.measuring.taught",
     "require_opengl": "cmmsim.imaging.pyrender_renderer",
+    **dict.fromkeys(("teach", "measure"), "cmmsim.from_photographs"),
+    "read_taught": "cmmsim.photographs.taught_file",
+    "PhotographedTeaching": "cmmsim.photographs.teaching",
+    "MeasuredPair": "cmmsim.photographs.measuring",
     **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.measuring.pose_estimator"),
     "Tracker": "cmmsim.tracker",
     "DriftWatch": "cmmsim.uncertainty.drift_watch",
@@ -100,6 +113,7 @@ __all__ = [
     "CmmError",
     "LostError",
     "OpenGLMissingError",
+    "PhotographError",
     "SensorFileError",
     "ShapeError",
     "TeachingError",

@@ -95,5 +95,9 @@ class CalibrationError(CmmError):
     """Images, board or poses allow no calibration; the message states the cause and a remedy."""
 
 
+class PhotographError(CmmError):
+    """Photographs cannot be used; the message names the file and the cause."""
+
+
 class AcceptanceError(CmmError):
     """A volume cannot be seen, measuring lines break a rule, or an artefact cannot be measured."""

@@ -6,8 +6,8 @@ knows, and the result of teaching.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -16,28 +16,27 @@ from numpy.typing import ArrayLike
 
 from cmmsim.allowed_plugins import is_plugin_name, require_renderer
 from cmmsim.checks import checked_seed, require_kind
-from cmmsim.detection.detector import FitLimits, find_detector
+from cmmsim.detection.detector import find_detector
 from cmmsim.errors import CmmError, UnknownOptionError
-from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, require_corner
+from cmmsim.files.rig_and_bodies import marked_body, require_corner
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.geometry.camera import Optics
-from cmmsim.geometry.pose import Array, apply, pose_to_transform
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+from cmmsim.geometry.pose import Array
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.imaging.stereo_camera import Quality, VirtualStereoCamera
-from cmmsim.measuring.layout_search import SMALLEST_STEP
 from cmmsim.measuring.observation import DetectionSettings, Observer
 from cmmsim.measuring.pose_estimator import METHODS, PoseEstimator
 from cmmsim.measuring.taught import Taught, require_taught_for, setup_of
+from cmmsim.photographs.pairs import Photograph, numbered
+from cmmsim.photographs.teaching import PhotographedTeaching, teach_from
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages
+from cmmsim.sticker_view import StickerView
 from cmmsim.teaching import (
     Progress,
     Teacher,
-    WindowSizes,
     exactly_taught,
-    largest_radius,
-    radius_at,
-    window_sizes,
 )
 from cmmsim.true_cameras import TrueCameras
 from cmmsim.uncertainty.common_errors import CommonErrors, MeasuringGeometry
@@ -94,7 +93,9 @@ class Instrument:
         bodies = self.platform, self.base
         self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
-        self._taught = taught
+        self._taught: Taught | None = None
+        if taught is not None:
+            self._take(taught)
 
     def __repr__(self) -> str:
         state = "not yet taught" if self._taught is None else "taught"
@@ -183,13 +184,20 @@ class Instrument:
         """Both cameras in front of the true scene, in their state at teaching."""
         return self.true_cameras.at_rest
 
-    def teach(self, progress: Progress | None = None) -> Taught:
+    def teach(
+        self,
+        progress: Progress | None = None,
+        frames: Iterable[StereoFrame | StereoImages] | None = None,
+    ) -> Taught:
         """Teach the frames of base and platform, unless they are taught already.
 
         Parameters
         ----------
         progress : callable, optional
             Function that is called with the number of steps done and of all steps.
+        frames : iterable of StereoFrame or of results of `Sensor.look`, optional
+            Exposures of the platform in several poses, to teach from instead of exposures that the
+            sensor takes itself. An earlier teaching is replaced.
 
         Returns
         -------
@@ -206,6 +214,8 @@ class Instrument:
         >>> sensor.teach().sensor_name
         'ctrack780'
         """
+        if frames is not None:
+            self._take(self.teach_from(numbered(frames, self.timing.frame_rate)).taught)
         if self._taught is None:
             for body in (self.platform, self.base):
                 require_corner(body)
@@ -216,6 +226,45 @@ class Instrument:
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file), known=self._known)
         return self._taught
+
+    def teach_from(
+        self, photographs: Iterable[Photograph], advance: Callable[[], None] = lambda: None
+    ) -> PhotographedTeaching:
+        """Return what photographs teach about this sensor's frames, without taking it over.
+
+        Parameters
+        ----------
+        photographs : iterable of Photograph
+            Pairs of images.
+        advance : callable, optional
+            Function that is called after each pair.
+
+        Returns
+        -------
+        PhotographedTeaching
+
+        Raises
+        ------
+        TeachingError
+            If the stickers are not found, or do not determine the frames.
+        """
+        bodies = self.platform, self.base
+        for body in bodies:
+            require_corner(body)
+        found = teach_from(photographs, self.observer, *bodies, self.name, self._known, advance)
+        return replace(found, taught=replace(found.taught, setup=setup_of(self._file)))
+
+    def _take(self, taught: Taught) -> None:
+        """Measure from now on with a result of teaching, its rig and its stickers."""
+        self._taught = taught
+        if taught.known is not None:
+            self._known = taught.known
+            self.rig = taught.known.rig
+        if taught.platform_ids:
+            kept = np.isin(self.platform.sticker_ids, taught.platform_ids)
+            self.platform = self.platform.selected(np.flatnonzero(kept))
+        for name in ("_view", "settings", "_geometry"):
+            self.__dict__.pop(name, None)
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
         """Register further rigid bodies, which can hide stickers.
@@ -328,61 +377,3 @@ class Instrument:
         """Raise CmmError unless the method is "registration"; ``what`` begins the message."""
         if self.method != "registration":
             raise CmmError(f"{what} poses by registration only, not by {self.method}")
-
-
-@dataclass(frozen=True)
-class StickerView:
-    """Stickers of platform and base in front of a rig, with the platform at home.
-
-    ``known`` states how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is
-    the transform that the sensor file states.
-    """
-
-    file: SensorFile
-    platform: MarkedBody
-    base: MarkedBody
-    rig: StereoRig
-    known: KnownRig | None
-    camera_from_base: Array
-    optics: Optics
-
-    @cached_property
-    def sizes(self) -> WindowSizes:
-        """Sizes of windows. Large and blurred stickers need larger windows."""
-        radius = self.file.stickers.radius
-        place = self.camera_from_base
-        at_target = radius_at(self.rig, place, np.array(self.file.rig.target), radius)
-        at_teaching = max(
-            largest_radius(self.rig, place, self.base, radius),
-            largest_radius(self.rig, self._camera_from_platform, self.platform, radius),
-        )
-        blurred = self.optics.psf_px > 0.0 or self.file.timing.exposure > 0.0
-        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
-
-    def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
-        """Return the settings of the search for stickers in windows.
-
-        ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
-        """
-        timing = self.file.timing
-        return DetectionSettings(
-            self.sizes.window,
-            self.sizes.fit,
-            radius=self.file.stickers.radius,
-            detector=self.file.detection.detector,
-            limits=FitLimits(smallest_contrast=SMALLEST_STEP * noise.white_level),
-            optics=self.optics,
-            centre_error_px=centre_error_px,
-            exposed_share=timing.exposure * timing.frame_rate,
-            line_error_px=0.0 if self.known is None else self.known.line_std(self._stickers),
-        )
-
-    @property
-    def _camera_from_platform(self) -> Array:
-        return self.camera_from_base @ pose_to_transform(np.array(self.file.platform.home))
-
-    @property
-    def _stickers(self) -> Array:
-        """Nominal places (n,3) of all stickers in the camera frame."""
-        places = (self._camera_from_platform, self.platform), (self.camera_from_base, self.base)
-        return np.concatenate([apply(move, body.nominal) for move, body in places])

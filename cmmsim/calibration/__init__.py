@@ -17,8 +17,9 @@ from cmmsim.calibration.calibrated_rig import (
 )
 from cmmsim.calibration.halves import Halves, compare_halves
 from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
-from cmmsim.calibration.sightings import ImagePair, PairView, pair_images, read_grey, view_pairs
+from cmmsim.calibration.sightings import PairView, read_grey, view_pairs
 from cmmsim.errors import CalibrationError
+from cmmsim.files.image_files import ImagePair, pair_images
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 
 __all__ = [

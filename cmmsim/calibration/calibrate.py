@@ -21,9 +21,10 @@ from cmmsim.calibration.adjustment import (
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_detection import BoardView, radius_differs
 from cmmsim.calibration.calibrated_rig import Calibration, UsedView
-from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, some, views_of
+from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, views_of
 from cmmsim.calibration.start_values import start_values
 from cmmsim.errors import CalibrationError
+from cmmsim.files.image_files import some
 from cmmsim.geometry.camera import camera_from
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply, invert

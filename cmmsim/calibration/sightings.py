@@ -11,58 +11,13 @@ from numpy.typing import NDArray
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_detection import BoardView, find_board
 from cmmsim.errors import CalibrationError
+from cmmsim.files.image_files import ImagePair, read_pixels
 from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
-SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
 # Percentile of an image with more than 8 bits that becomes 255. A fixed scale is unsuitable,
 # because images of 12-bit cameras use 1/16 of the range of 16 bits.
 WHITE_SHARE = 99.9
-HOW_PAIRED = "pairs are made in the order of the sorted file names"
-
-
-@dataclass(frozen=True)
-class ImagePair:
-    """Files of one exposure of both cameras."""
-
-    left: Path
-    right: Path
-
-    @property
-    def name(self) -> str:
-        """Name of the pair in results and messages.
-
-        It is the name of the left file, followed by the name of the right file if that differs.
-        """
-        return (
-            self.left.name
-            if self.left.name == self.right.name
-            else f"{self.left.name} | {self.right.name}"
-        )
-
-
-def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
-    """Return pairs of the images in two folders, in the order of the sorted file names.
-
-    The names in both folders are either all different (left_01.png, right_01.png) or all equal.
-    Raises CalibrationError if a folder is missing or empty, if both folders are the same, if the
-    numbers of images differ, or if only some names are equal. In the last two cases, the message
-    has the names that exist in one folder only.
-    """
-    if Path(left).resolve() == Path(right).resolve():
-        raise CalibrationError(
-            f"{left} is given for both cameras; give one folder of left and one of right images"
-        )
-    found = [_image_files(Path(folder)) for folder in (left, right)]
-    names = [{path.stem for path in side} for side in found]
-    if len(found[0]) != len(found[1]) or (names[0] & names[1] and names[0] != names[1]):
-        alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
-        raise CalibrationError(
-            f"{left} has {len(found[0])} images and {right} has {len(found[1])}; {HOW_PAIRED}, so "
-            f"each image needs its partner. Only on the left: {some(alone[0])}; only on the right: "
-            f"{some(alone[1])}"
-        )
-    return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
@@ -72,26 +27,10 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     more than 8 bits are scaled so that the brightest 0.1 % are white. Raises CalibrationError for
     an unreadable file.
     """
-    try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        image = (
-            cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-            if len(data)
-            else None
-        )
-    except OSError as error:
-        raise CalibrationError(f"cannot read image {path}: {error.strerror or error}") from error
-    except cv2.error as error:
-        raise CalibrationError(f"cannot read image {path}: {error.err}") from error
-    if image is None:
-        raise CalibrationError(f"cannot read image {path}: it is truncated or not an image")
-    if image.ndim == 3 and image.shape[2] in (3, 4):
+    image = read_pixels(path, CalibrationError)
+    if image.ndim == 3:
         image = cv2.cvtColor(
             _eight_bit(image), cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-        )
-    elif image.ndim == 3:
-        raise CalibrationError(
-            f"cannot read image {path}: it has {image.shape[2]} channels, not 1, 3 or 4"
         )
     return _eight_bit(image)
 
@@ -102,23 +41,6 @@ def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
     values = np.nan_to_num(image.astype(np.float32), posinf=0.0, neginf=0.0)
     white = max(float(np.percentile(values, WHITE_SHARE)), 1e-9)
     return np.rint(np.clip(values * (255.0 / white), 0.0, 255.0)).astype(np.uint8)
-
-
-def _image_files(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise CalibrationError(
-            f"no folder {folder}; give one folder of left and one of right images"
-        )
-    files = sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
-    )
-    if not files:
-        raise CalibrationError(
-            f"folder {folder} contains no images, which end in {', '.join(SUFFIXES)}"
-        )
-    return files
 
 
 @dataclass(frozen=True)
@@ -228,9 +150,3 @@ def _joined(views: dict[int, BoardView]) -> Sightings:
         np.concatenate([view.index for view in views.values()]),
         np.concatenate([view.pixels for view in views.values()]),
     )
-
-
-def some(names: Sequence[str]) -> str:
-    """Return the first three names and the number of the others, or "none" for no names."""
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more if names else "none"

@@ -130,6 +130,16 @@ class MarkedBody:
         """Outward normal (n,3) at each sticker."""
         return self.normals[self.plane_index]
 
+    def selected(self, stickers: NDArray[np.int_]) -> "MarkedBody":
+        """Return the body with only some of its stickers, which are given by their indices."""
+        return replace(
+            self,
+            sticker_ids=self.sticker_ids[stickers],
+            plane_index=self.plane_index[stickers],
+            nominal=self.nominal[stickers],
+            in_plane=self.in_plane[stickers],
+        )
+
 
 def marked_body(name: str, body: Body) -> MarkedBody:
     """Return the body that a section of a sensor file describes."""

@@ -16,6 +16,7 @@ from cmmsim.errors import ShapeError, TeachingError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import dotted
 from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.known_rig import KnownRig
 
 SHOWN_CHANGES = 3
@@ -48,6 +49,12 @@ class Taught:
         a result that was not made by teaching.
     known : KnownRig or None
         Rig that was used for teaching, if it differs from the file's rig.
+    by_rig : ndarray, shape (6 + 3 n, 24), or None
+        Derivative of the errors of ``base_from_camera`` and of the platform's places by the errors
+        of the known rig, if teaching has adjusted the rig. The covariances are then those for an
+        exact rig. Otherwise the derivative follows from the geometry of the simulated teaching.
+    platform_ids : tuple of str
+        Names of the platform's stickers, if they are not all stickers of the sensor file.
 
     Raises
     ------
@@ -69,6 +76,8 @@ class Taught:
     base_places: Array
     setup: str = ""
     known: KnownRig | None = None
+    by_rig: Array | None = None
+    platform_ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         stickers = len(self.platform_places)
@@ -81,6 +90,8 @@ class Taught:
             "platform_covariance": (6, 6),
             "base_places": (base_stickers, 3),
         }
+        if self.by_rig is not None:
+            shapes["by_rig"] = (6 + 3 * stickers, len(PARAMETER_NAMES))
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ShapeError(
@@ -177,7 +188,7 @@ def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
             f"taught belongs to sensor {taught.sensor_name!r} with other entries: "
             f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew"
         )
-    if len(taught.platform_places) != stickers:
+    if len(taught.platform_places) != (len(taught.platform_ids) or stickers):
         raise TeachingError(
             f"taught has {len(taught.platform_places)} stickers of the platform, sensor "
             f"{file.name!r} has {stickers}"

@@ -27,6 +27,7 @@ from identify.commands.help import (
 )
 from identify.commands.importing import imports
 from identify.commands.new import new
+from identify.commands.photographs import measure, teach
 from identify.commands.robot_pages import base_parameters, export, verify_model, workspace
 from identify.commands.run_stages import excite, identify, record, report, run, validate, warm_up
 from identify.commands.scene import replay, show
@@ -166,7 +167,7 @@ _add(ROBOTS, verify_model, cls=Judging)
 app.add_typer(export, name="export", rich_help_panel=ROBOTS)
 app.add_typer(imports, name="import", rich_help_panel=ROBOTS)
 _add(SENSORS, acceptance, cls=Judging)
-_add(SENSORS, detectors, calibrate)
+_add(SENSORS, detectors, calibrate, teach, measure)
 _add(STUDIES, stoppable(study), cls=StudyCommand)
 _add(STUDIES, stoppable(gauntlet), cls=RowsCommand)
 app.add_typer(new, name="new", rich_help_panel=SETTING_UP)

@@ -1,0 +1,117 @@
+"""Teaching and measuring from photographs, by the names or paths of a sensor file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from cmmsim.loading import load_sensor
+from cmmsim.measuring.taught import Taught
+from cmmsim.photographs.measuring import MeasuredPair, measure_pairs
+from cmmsim.photographs.pairs import Format, Photographs, Source
+from cmmsim.photographs.taught_file import read_taught
+from cmmsim.photographs.teaching import PhotographedTeaching
+from cmmsim.sensor import Sensor
+
+# Photographs are not drawn. This renderer needs no OpenGL, and its images have exact centres.
+RENDERER = "analytic"
+
+
+def photographs_for(
+    sensor: Sensor, left: Source, right: Source, colour: str | None = None
+) -> Photographs:
+    """Return pairs of photographs that must fit a sensor. Raises PhotographError."""
+    rate = sensor.timing.frame_rate
+    return Photographs(left, right, Format(sensor.rig, sensor.noise, rate, colour))
+
+
+def teach(
+    left: Source,
+    right: Source,
+    sensor: str | Path,
+    colour: str | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> PhotographedTeaching:
+    """Teach a sensor from photographs of its platform in several poses.
+
+    The cameras and the base stand still, and the platform moves from pair to pair. Stickers need no
+    labels: those with the same pixels in most pairs belong to the base, and those that move
+    together to the platform. The sensor file names them by rough places.
+
+    Parameters
+    ----------
+    left, right : str, Path, or iterable of ndarray
+        Folders of images, videos, or arrays (height, width) of both cameras.
+    sensor : str or Path
+        Built-in name, or path of a TOML sensor file with the cameras, the radius of the stickers,
+        and the planes with the rough places of the stickers.
+    colour : {"grey", "red", "green", "blue"}, optional
+        How grey values are made of colours. Without it, images with colours are refused.
+    advance : callable, optional
+        Function that is called after each pair.
+
+    Returns
+    -------
+    PhotographedTeaching
+        Its ``taught`` is for `load_sensor`, and its ``save`` writes a file.
+
+    Raises
+    ------
+    PhotographError
+        If images cannot be used; the message names the file.
+    TeachingError
+        If the stickers are not found, or do not determine the frames.
+
+    Examples
+    --------
+    >>> import cmmsim
+    >>> try:
+    ...     teach("no/left", "no/right", "ctrack780")
+    ... except cmmsim.PhotographError as error:
+    ...     print(error)
+    no folder no/left; give one folder of left and one of right images
+    """
+    known = load_sensor(sensor, renderer=RENDERER)
+    return known.teach_from(photographs_for(known, left, right, colour), advance)
+
+
+def measure(
+    left: Source,
+    right: Source,
+    sensor: str | Path,
+    taught: str | Path | Taught,
+    colour: str | None = None,
+) -> Iterator[MeasuredPair]:
+    """Measure the pose of the platform in each pair of photographs.
+
+    Parameters
+    ----------
+    left, right, sensor, colour
+        As in `teach`.
+    taught : str, Path or Taught
+        Result of teaching, or its file.
+
+    Returns
+    -------
+    iterator of MeasuredPair
+        Name, time, and measurement of each pair, when its images are read.
+
+    Raises
+    ------
+    PhotographError
+        If images cannot be used; the message names the file.
+    TeachingError
+        If ``taught`` cannot be read, or belongs to another sensor.
+
+    Examples
+    --------
+    >>> import cmmsim
+    >>> try:
+    ...     measure("no/left", "no/right", "ctrack780", "no/taught.json")
+    ... except cmmsim.TeachingError as error:
+    ...     print(error)
+    cannot read no/taught.json: No such file or directory
+    """
+    known = taught if isinstance(taught, Taught) else read_taught(taught)
+    measuring = load_sensor(sensor, renderer=RENDERER, taught=known)
+    return measure_pairs(photographs_for(measuring, left, right, colour), measuring.estimator)

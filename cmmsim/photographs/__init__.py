@@ -1,0 +1,1 @@
+"""Teaching from photographs, and measuring in photographs."""

@@ -1,0 +1,253 @@
+"""One least-squares adjustment of sticker places, platform poses and cameras to all photographs.
+
+The observations are the centres of stickers in both images of all pairs, with their covariances.
+The unknowns are the places of the base's stickers in the camera frame, the places of the platform's
+stickers in the frame of a reference pair, the pose of the platform in each pair, and, if the rig is
+known with a covariance, the 24 parameters of the rig. The known parameters are then observations,
+too.
+
+A pose affects only the observations of its own pair. Gauss-Newton steps therefore eliminate the
+poses pair by pair (Schur complement). A common movement of platform places and poses changes no
+observation. The adjustment holds this movement by an inner constraint, which does not affect the
+shape of the platform.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.disc_image import centre_offset
+from cmmsim.geometry.pose import Array, rotation_exp, skew
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+
+MOST_STEPS = 12
+# An adjustment ends with steps of places below this, m.
+CONVERGED = 1e-9
+POSE = 6
+RIG = len(PARAMETER_NAMES)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Centres of stickers in both images, m of them.
+
+    pair         (m,), number of the pair
+    sticker      (m,), number of the sticker: first those of the base, then those of the platform
+    pixels       (2, m, 2), centres of ellipses
+    covariances  (2, m, 2, 2), px²
+    base         number of stickers of the base
+    normals      (n, 3), of all stickers, in the axes of their places
+    radius       of a sticker, m
+    """
+
+    pair: NDArray[np.int_]
+    sticker: NDArray[np.int_]
+    pixels: Array
+    covariances: Array
+    base: int
+    normals: Array
+    radius: float
+
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Observations (m,) of the platform."""
+        return np.asarray(self.sticker >= self.base)
+
+    def selected(self, keep: NDArray[np.bool_]) -> Observations:
+        """Return only some of the observations."""
+        return replace(
+            self,
+            pair=self.pair[keep],
+            sticker=self.sticker[keep],
+            pixels=self.pixels[:, keep],
+            covariances=self.covariances[:, keep],
+        )
+
+
+@dataclass(frozen=True)
+class BundleState:
+    """Values of the unknowns.
+
+    ``places`` (n, 3) of all stickers, m; ``poses`` (K, 4, 4) of the platform in each pair; and the
+    ``rig``, which differs from the known rig by ``rig_change`` (24,).
+    """
+
+    places: Array
+    poses: Array
+    rig: StereoRig
+    rig_change: Array
+
+    def points(self, seen: Observations) -> Array:
+        """Return the points (m, 3) of the observed stickers in the camera frame."""
+        return self._placed(seen, self.places) + np.where(
+            seen.moves[:, None], self.poses[seen.pair, :3, 3], 0.0
+        )
+
+    def _placed(self, seen: Observations, vectors: Array) -> Array:
+        """Return vectors (n, 3) of the observed stickers, turned into the axes of the camera."""
+        own = vectors[seen.sticker]
+        turned = np.einsum("mij,mj->mi", self.poses[seen.pair, :3, :3], own)
+        return np.where(seen.moves[:, None], turned, own)
+
+    def residuals(self, seen: Observations) -> Array:
+        """Return measured minus computed centres (2, m, 2), px."""
+        points = self.points(seen)
+        normals = self._placed(seen, seen.normals)
+        computed = self.rig.project(points)[0]
+        for side, (camera, move) in enumerate(
+            zip(self.rig.cameras, self.rig.from_camera, strict=True)
+        ):
+            there = points @ move[:3, :3].T + move[:3, 3]
+            computed[side] += centre_offset(camera, there, normals @ move[:3, :3].T, seen.radius)
+        return np.asarray(seen.pixels - computed)
+
+    def moved(self, known: StereoRig, places: Array, poses: Array, rig: Array) -> BundleState:
+        """Return the state after changes of places (n, 3), poses (K, 6) and rig (24,)."""
+        moved = self.poses.copy()
+        moved[:, :3, 3] += poses[:, :3]
+        moved[:, :3, :3] = (
+            np.stack([rotation_exp(turn) for turn in poses[:, 3:]]) @ self.poses[:, :3, :3]
+        )
+        change = self.rig_change + rig
+        return BundleState(self.places + places, moved, known.moved(change), change)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Result of an adjustment.
+
+    state        adjusted values
+    covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, with poses eliminated
+    residuals    (2, m, 2), px
+    squares      (m,), squared residuals of both images in units of their noise
+    factor       ratio of the squared residuals to their noise
+    freedom      number of observed numbers minus number of determined unknowns
+    """
+
+    state: BundleState
+    covariance: Array
+    residuals: Array
+    squares: Array
+    factor: float
+    freedom: int
+
+
+def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Array) -> Bundle:
+    """Adjust a state to the observations.
+
+    ``known`` is the rig as calibrated, and ``prior`` (24, 24) the covariance of its parameters.
+    Parameters with zero variance do not change. The covariance of the result belongs to noise as
+    stated; ``factor`` tells how much larger the residuals are.
+    """
+    state = start
+    free = np.flatnonzero(np.diag(prior) > 0.0)
+    information: Array = np.asarray(np.linalg.inv(prior[np.ix_(free, free)]), dtype=float)
+    for _ in range(MOST_STEPS):
+        places, poses, rig, covariance = _step(seen, state, information, free)
+        if np.abs(places).max() < CONVERGED:
+            break
+        state = state.moved(known, places, poses, rig)
+    residuals = state.residuals(seen)
+    squares = np.einsum(
+        "smi,smij,smj->m", residuals, np.linalg.inv(seen.covariances), residuals, optimize=True
+    )
+    # The common movement of places and poses of the platform is not determined.
+    unknowns = 3 * len(np.unique(seen.sticker)) + POSE * (len(np.unique(seen.pair[seen.moves])) - 1)
+    freedom = 4 * len(squares) - unknowns
+    factor = float(squares.sum() / max(freedom, 1))
+    return Bundle(state, covariance, residuals, squares, factor, freedom)
+
+
+def _step(
+    seen: Observations, state: BundleState, information: Array, free: NDArray[np.int_]
+) -> tuple[Array, Array, Array, Array]:
+    """Return the changes of places (n, 3), poses (K, 6) and rig (24,), and the covariance.
+
+    ``information`` (f, f) is that of the ``free`` (f,) parameters of the rig. The covariance of
+    places and rig (3 n + 24, 3 n + 24) has zeros for parameters that are not free.
+    """
+    rows = _rows(seen, state, free)
+    count = 3 * len(state.places)
+    matrix = np.zeros((count + len(free),) * 2)
+    right = np.zeros(len(matrix))
+    matrix[count:, count:] = information
+    right[count:] = -information @ state.rig_change[free]
+    poses = []
+    for by_common, by_pose, residuals in rows:
+        matrix += by_common.T @ by_common
+        right += by_common.T @ residuals
+        if not by_pose.any():
+            poses.append((np.zeros((POSE, len(matrix))), np.zeros(POSE)))
+            continue
+        own = np.linalg.inv(by_pose.T @ by_pose)
+        mixed = own @ (by_pose.T @ by_common)
+        alone = own @ (by_pose.T @ residuals)
+        matrix -= by_common.T @ by_pose @ mixed
+        right -= by_common.T @ by_pose @ alone
+        poses.append((mixed, alone))
+    # A row of an unseen sticker is empty.
+    empty = np.diag(matrix) == 0.0
+    matrix[empty, empty] = 1.0
+    gauge = _gauge(seen, state, len(matrix))
+    matrix += np.diag(matrix)[:count].mean() * gauge @ gauge.T
+    covariance = np.linalg.inv(matrix)
+    change = covariance @ right
+    by_pair = np.array([alone - mixed @ change for mixed, alone in poses])
+    rig = np.zeros(RIG)
+    rig[free] = change[count:]
+    kept = np.concatenate([np.arange(count), count + free])
+    whole = np.zeros((count + RIG,) * 2)
+    whole[np.ix_(kept, kept)] = covariance
+    return change[:count].reshape(-1, 3), by_pair, rig, whole
+
+
+def _rows(
+    seen: Observations, state: BundleState, free: NDArray[np.int_]
+) -> list[tuple[Array, Array, Array]]:
+    """Return, for each pair, derivatives and residuals in units of their noise.
+
+    The derivatives of the r numbers are those by places and rig (r, 3 n + f), and by the pose of
+    the pair (r, 6).
+    """
+    points = state.points(seen)
+    by_points, by_rig = state.rig.derivatives(points)
+    whiten = np.linalg.inv(np.linalg.cholesky(seen.covariances))
+    moves = seen.moves[:, None, None]
+    turns = np.where(moves, state.poses[seen.pair, :3, :3], np.eye(3))
+    arms = points - state.poses[seen.pair, :3, 3]
+    by_places = whiten @ by_points @ turns
+    shifts = np.broadcast_to(np.eye(3), turns.shape)
+    by_poses = (
+        whiten @ by_points @ np.where(moves, np.concatenate([shifts, -skew(arms)], axis=2), 0.0)
+    )
+    by_rig = whiten @ by_rig[..., free]
+    residuals = (whiten @ state.residuals(seen)[..., None])[..., 0]
+    count = 3 * len(state.places)
+    rows = []
+    for pair in range(len(state.poses)):
+        own = np.flatnonzero(seen.pair == pair)
+        common = np.zeros((2, len(own), 2, count + len(free)))
+        for k, column in enumerate(3 * seen.sticker[own]):
+            common[:, k, :, column : column + 3] = by_places[:, own[k]]
+        common[..., count:] = by_rig[:, own]
+        rows.append(
+            (
+                common.reshape(-1, count + len(free)),
+                by_poses[:, own].reshape(-1, POSE),
+                residuals[:, own].ravel(),
+            )
+        )
+    return rows
+
+
+def _gauge(seen: Observations, state: BundleState, size: int) -> Array:
+    """Return the common movements (size, 6) of the platform's places, of length one each."""
+    places = state.places[seen.base :]
+    arms = places - places.mean(axis=0)
+    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
+    gauge = np.zeros((size, POSE))
+    gauge[3 * seen.base : 3 * len(state.places)] = np.linalg.qr(moves.reshape(-1, POSE))[0]
+    return gauge

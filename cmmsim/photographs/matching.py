@@ -1,0 +1,268 @@
+"""Which spots of many pairs of photographs are the same sticker, without labels in the print.
+
+A spot of the left image and a spot of the right image that lie on each other's epipolar lines are a
+candidate: a point in space. The stickers of the base stand still, so their candidates have the same
+pixels in most pairs. All other candidates are compared as one rigid body: the pair with most of
+them is the first model, and this model is searched in every other pair. The rough places of the
+sensor file then only name the stickers that were found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cmmsim.detection.ellipse_fit import EllipseFits
+from cmmsim.errors import LostError
+from cmmsim.files.rig_and_bodies import MarkedBody
+from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.measuring.layout_search import (
+    ENOUGH,
+    LINE_STDS,
+    LINE_TOLERANCE_PX,
+    bright_ellipses,
+    candidate_pairs,
+    find_layout,
+)
+from cmmsim.measuring.observation import Observer, StickerExposure
+from cmmsim.measuring.pose_estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, TAUGHT_TOLERANCE
+from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
+
+# Share of all pairs in which a standing sticker has the same pixels.
+STANDING_SHARE = 0.6
+# Largest distance between the pixels of a standing sticker in two pairs, over both images.
+STANDING_PX = 0.7
+# Fewest candidates of a pair that are recognised as a rigid body.
+FEWEST_MOVING = 6
+# Rough places may be off by the first tolerance, or else by the second, m.
+ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
+NONE = -1
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Possible stickers of one pair of images: m pairs of spots.
+
+    pixels       (2, m, 2), centres of the ellipses in both images
+    covariances  (2, m, 2, 2), of the centres, px²
+    misfits      (2, m), reduced chi-square of the grey values
+    points       (m, 3), in the camera frame, m
+    alone        (m,), True if both spots belong to no other candidate
+    """
+
+    pixels: Array
+    covariances: Array
+    misfits: Array
+    points: Array
+    alone: NDArray[np.bool_]
+
+
+Spots = tuple[EllipseFits, EllipseFits]
+"""Ellipses of the spots in the left and in the right image."""
+
+
+def spots_in(images: StereoFrame | StereoImages | StickerExposure, observer: Observer) -> Spots:
+    """Return the ellipses of all bright spots in both images."""
+    if not isinstance(images, StickerExposure):
+        images = readable(images)
+    return bright_ellipses(images, observer)
+
+
+def candidates(spots: Spots, observer: Observer) -> Candidates:
+    """Return the possible stickers of a pair of images; some of them are false."""
+    good = []
+    ideal = []
+    for camera, fits in zip(observer.rig.cameras, spots, strict=True):
+        pixels, found = camera.undistort(fits.centres)
+        good.append(np.flatnonzero(found & fits.good))
+        ideal.append(pixels[good[-1]])
+    off_line = LINE_TOLERANCE_PX + LINE_STDS * observer.settings.line_error_px
+    pairs, points = candidate_pairs(observer.rig.ideal, ideal[0], ideal[1], off_line)
+    chosen = [(fits, own[at]) for fits, own, at in zip(spots, good, pairs.T, strict=True)]
+    return Candidates(
+        np.stack([fits.centres[own] for fits, own in chosen]),
+        np.stack([fits.covariances[own] for fits, own in chosen]),
+        np.stack([fits.misfits[own] for fits, own in chosen]),
+        points,
+        np.all([np.bincount(side, minlength=1)[side] == 1 for side in pairs.T], axis=0),
+    )
+
+
+@dataclass(frozen=True)
+class FoundBody:
+    """Stickers of one body that were found in K pairs.
+
+    sticker   (n,), indices of the stickers among those of the body
+    members   (n, K), indices of their candidates, or NONE
+    places    (n, 3), in the camera frame at the reference pair, m
+    moves     (K, 4, 4), place of the body in each pair, relative to the reference pair
+    seen      (K,), pairs in which the body was found
+    """
+
+    sticker: NDArray[np.int_]
+    members: NDArray[np.int_]
+    places: Array
+    moves: Array
+    seen: NDArray[np.bool_]
+
+
+def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
+    """Return the candidates (g, K) of g standing points in K pairs, or NONE where one is missing.
+
+    A point that stands has the same pixels in most of the pairs.
+    """
+    counts = [len(one.points) for one in pairs]
+    owner = np.repeat(np.arange(len(pairs)), counts)
+    number = np.concatenate([np.arange(count) for count in counts])
+    flat = np.concatenate([np.hstack(list(one.pixels)) for one in pairs])
+    near = cKDTree(flat).query_ball_point(flat, STANDING_PX)
+    pairs_near = np.array([len(set(owner[own])) for own in near], dtype=int)
+    free = np.ones(len(flat), dtype=bool)
+    found = []
+    for k in np.argsort(-pairs_near, kind="stable").tolist():
+        own = np.array([j for j in near[k] if free[j]], dtype=int)
+        if pairs_near[k] < STANDING_SHARE * len(pairs):
+            break
+        if not free[k] or len(set(owner[own])) < STANDING_SHARE * len(pairs):
+            continue
+        members = np.full(len(pairs), NONE)
+        # Of two candidates of one pair, the one nearer to the point that most agree on is taken.
+        order = np.argsort(-np.linalg.norm(flat[own] - np.median(flat[own], axis=0), axis=1))
+        members[owner[own[order]]] = number[own[order]]
+        free[own] = False
+        found.append(members)
+    return np.array(found, dtype=int).reshape(-1, len(pairs))
+
+
+def places_of(pairs: Sequence[Candidates], members: NDArray[np.int_]) -> Array:
+    """Return the median places (g, 3) of points with candidates ``members`` (g, K)."""
+    return np.array(
+        [
+            np.median([pairs[k].points[j] for k, j in enumerate(own) if j != NONE], axis=0)
+            for own in members
+        ]
+    ).reshape(-1, 3)
+
+
+def moving(
+    pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: str
+) -> tuple[NDArray[np.int_], Array, Array, NDArray[np.bool_]]:
+    """Find the rigid body that moves among the ``free`` candidates of each pair.
+
+    Returns its candidates (n, K), places (n, 3) at the reference pair, moves (K, 4, 4) and the
+    pairs (K,) in which it was found. Raises LostError if it is found in the reference pair only.
+    """
+    # False candidates share spots with true ones, and would make the search long.
+    clear = [own[one.alone[own]] for one, own in zip(pairs, free, strict=True)]
+    reference = int(np.argmax([len(own) for own in clear]))
+    model = pairs[reference].points[clear[reference]]
+    moves = np.tile(np.eye(4), (len(pairs), 1, 1))
+    seen = np.zeros(len(pairs), dtype=bool)
+    said = ""
+    for k, own in enumerate(free):
+        if k == reference:
+            seen[k] = True
+            continue
+        try:
+            points = pairs[k].points[own]
+            moves[k], known, _ = find_layout(model, points, TAUGHT_TOLERANCE, FEWEST_MOVING, name)
+            seen[k] = True
+            if len(known) < ENOUGH * len(model):
+                model = model[known]
+        except LostError as error:
+            said = said or str(error)
+    if seen.sum() < 2:
+        raise LostError(said)
+    model = _extended(model, pairs, free, moves, seen)
+    members = np.full((len(model), len(pairs)), NONE)
+    for k in np.flatnonzero(seen).tolist():
+        at, there = cKDTree(apply(moves[k], model)).query(
+            pairs[k].points[free[k]], distance_upper_bound=2.0 * TAUGHT_TOLERANCE
+        )
+        order = np.argsort(-at)  # of two candidates the nearer one is entered last
+        order = order[np.isfinite(at[order])]
+        members[there[order], k] = free[k][order]
+    often = np.sum(members != NONE, axis=1) >= 2
+    return members[often], model[often], moves, seen
+
+
+def _extended(
+    model: Array,
+    pairs: Sequence[Candidates],
+    free: Sequence[NDArray[np.int_]],
+    moves: Array,
+    seen: NDArray[np.bool_],
+) -> Array:
+    """Return the model with points that the reference pair lacks, but two other pairs have."""
+    others = []
+    owner = []
+    for k in np.flatnonzero(seen).tolist():
+        back = apply(invert(moves[k]), pairs[k].points[free[k]])
+        away = cKDTree(model).query(back)[0] > 4.0 * TAUGHT_TOLERANCE
+        others.append(back[away])
+        owner.append(np.full(int(away.sum()), k))
+    points = np.concatenate(others)
+    of = np.concatenate(owner)
+    added: list[Array] = []
+    near = cKDTree(points).query_ball_point(points, 2.0 * TAUGHT_TOLERANCE) if len(points) else []
+    for own in sorted(near, key=lambda one: -len(set(of[one]))):
+        middle = np.median(points[own], axis=0)
+        far = all(np.linalg.norm(middle - one) > 4.0 * TAUGHT_TOLERANCE for one in added)
+        if len(set(of[own])) >= 2 and far:
+            added.append(middle)
+    return np.concatenate([model, np.array(added).reshape(-1, 3)])
+
+
+def named(body: MarkedBody, points: Array) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return the stickers (n,) of a body, and the points (n,) that are these stickers.
+
+    Raises LostError if the rough places are not found among the points (g, 3).
+    """
+    for tolerance in ROUGH:
+        try:
+            _, stickers, own = find_layout(
+                body.nominal, points, tolerance, FEWEST_NOMINAL, body.name
+            )
+        except LostError as error:
+            said = error
+            continue
+        return stickers, own
+    raise said
+
+
+def match(pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody) -> list[FoundBody]:
+    """Return the stickers of base and platform in K pairs. Raises LostError."""
+    still = standing(pairs)
+    stood = places_of(pairs, still)
+    stickers, own = named(base, stood)
+    count = len(pairs)
+    found = [
+        FoundBody(
+            stickers,
+            still[own],
+            stood[own],
+            np.tile(np.eye(4), (count, 1, 1)),
+            np.ones(count, dtype=bool),
+        )
+    ]
+    try:
+        # Stickers that stand and belong to no body are left out as well.
+        members, places, moves, seen = moving(pairs, _free(pairs, still), platform.name)
+    except LostError:
+        # A platform that seldom moves stands in most pairs, too.
+        members, places, moves, seen = moving(pairs, _free(pairs, still[own]), platform.name)
+    stickers, own = named(platform, places)
+    found.append(FoundBody(stickers, members[own], places[own], moves, seen))
+    return found
+
+
+def _free(pairs: Sequence[Candidates], taken: NDArray[np.int_]) -> list[NDArray[np.int_]]:
+    """Return the candidates of each of K pairs without the ``taken`` ones (g, K)."""
+    return [
+        np.setdiff1d(np.arange(len(one.points)), own)
+        for one, own in zip(pairs, taken.T, strict=True)
+    ]

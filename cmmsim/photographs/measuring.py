@@ -1,0 +1,115 @@
+"""Measuring in photographs: one pose for each pair of images, and its row of a table.
+
+The columns have the names of a record's measured part, so that the table can become a part of a
+record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import Array
+from cmmsim.measuring.measurement import Measurement
+from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.photographs.pairs import Photograph
+from cmmsim.radiometry.stereo_images import StereoFrame
+from cmmsim.tracker import Tracker
+
+POSE = ("x", "y", "z", "alpha", "beta", "gamma")
+UNITS = ("m", "m", "m", "rad", "rad", "rad")
+ENTRIES = [(row, column) for row in range(6) for column in range(row, 6)]
+COLUMNS = (
+    "pair",
+    "time_s",
+    *(f"measured_{name}_{unit}" for name, unit in zip(POSE, UNITS, strict=True)),
+    *(f"covariance_{POSE[row]}_{POSE[column]}" for row, column in ENTRIES),
+    *(f"common_{POSE[row]}_{POSE[column]}" for row, column in ENTRIES),
+    "stickers",
+    "ok",
+    "why",
+)
+"""Columns of the table: ``covariance`` is new noise in each pair, ``common`` the same in all."""
+# Radius of a circle around a found sticker in a picture, px.
+CIRCLE_PX = 14
+
+
+@dataclass(frozen=True)
+class MeasuredPair:
+    """Measurement of one pair of images.
+
+    Attributes
+    ----------
+    name : str
+        Name of the pair: its file, or its number.
+    time : float
+        Time of the images, s.
+    measurement : Measurement
+        Pose with its covariance, or the reason why there is none.
+    images : StereoFrame
+        Both images.
+
+    Examples
+    --------
+    >>> from cmmsim.measuring.measurement import lost_measurement
+    >>> images = StereoFrame(*np.zeros((2, 30, 40), dtype=np.uint8))
+    >>> MeasuredPair("dark.png", 0.0, lost_measurement("no stickers"), images).row[-2:]
+    ['0', 'no stickers']
+    """
+
+    name: str
+    time: float
+    measurement: Measurement
+    images: StereoFrame
+
+    @property
+    def row(self) -> list[str]:
+        """Cells of the columns `COLUMNS`; those of a pose that is missing are empty."""
+        found = self.measurement
+        numbers = [
+            *found.pose,
+            *(found.covariance[entry] for entry in ENTRIES),
+            *(found.common_covariance[entry] for entry in ENTRIES),
+        ]
+        return [
+            self.name,
+            repr(float(self.time)),
+            *(repr(float(number)) if np.isfinite(number) else "" for number in numbers),
+            str(len(found.target_ids)),
+            str(int(found.ok)),
+            found.reason,
+        ]
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return both images side by side, with a circle and a name at each sticker used."""
+        sides = zip(
+            (self.images.left, self.images.right),
+            (self.measurement.left_pixels, self.measurement.right_pixels),
+            strict=True,
+        )
+        return np.hstack([_marked(image, at, self.measurement.target_ids) for image, at in sides])
+
+
+def _marked(image: NDArray, at: Array, names: NDArray[np.str_]) -> NDArray[np.uint8]:
+    """Return an image in colours with marks at pixels (n, 2)."""
+    white = max(float(np.percentile(image, 99.9)), 1.0)
+    grey = np.clip(image * (255.0 / white), 0.0, 255.0).astype(np.uint8)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    for (x, y), name in zip(np.rint(at).astype(int).tolist(), names, strict=True):
+        cv2.circle(picture, (x, y), CIRCLE_PX, (0, 255, 0), 1, cv2.LINE_AA)
+        place = (x + CIRCLE_PX, y - CIRCLE_PX)
+        cv2.putText(picture, str(name), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 255, 0), 1)
+    return np.asarray(picture, dtype=np.uint8)
+
+
+def measure_pairs(
+    photographs: Iterable[Photograph], estimator: PoseEstimator
+) -> Iterator[MeasuredPair]:
+    """Yield the measurement of each pair, near the pose that the pairs before it predict."""
+    tracker = Tracker(estimator)
+    for one in photographs:
+        yield MeasuredPair(one.name, one.time, tracker.measure(one.images), one.images)

@@ -1,0 +1,165 @@
+"""Frames of adjusted stickers through their planes, with the covariance of the whole result.
+
+The frames are those of the simulated teaching. Their errors follow to first order from the errors
+of all places together. The derivatives are central differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.errors import LostError
+from cmmsim.files.rig_and_bodies import MarkedBody
+from cmmsim.geometry.plane_frame import FEWEST_STICKERS, PLANE_NAMES
+from cmmsim.geometry.pose import Array, apply_each, invert, rotation_log, skew
+from cmmsim.geometry.registration import register
+from cmmsim.measuring.pose_estimator import frames_by_planes
+from cmmsim.measuring.taught import Taught
+from cmmsim.photographs.bundle import POSE, RIG, Bundle, Observations
+from cmmsim.uncertainty.known_rig import KnownRig
+
+# Step of a place for differences, m.
+STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class TaughtFrames:
+    """Base frame and platform places, with the covariance of their common error.
+
+    base_from_camera  (4, 4)
+    base_places       (k, 3), in base axes, m
+    places            (n, 3), of the platform's stickers in platform axes, m
+    covariance        (6 + 3 n + 24,) squared: small error of base_from_camera, places, and the
+                      parameters of the rig
+    platform_ids      (n,), names of the platform's stickers
+    effect            (6, 3 n), small error of the platform frame that errors of places cause in a
+                      pose by registration
+    """
+
+    base_from_camera: Array
+    base_places: Array
+    places: Array
+    covariance: Array
+    platform_ids: NDArray[np.str_]
+    effect: Array
+
+    def taught(self, name: str, known: KnownRig | None, setup: str = "") -> Taught:
+        """Return the result of teaching; ``known`` is the adjusted rig, or None if it is exact."""
+        split = POSE + self.places.size
+        own = self.covariance[:split, :split]
+        by_rig = None
+        if known is not None:
+            # What the errors of the rig explain is stated as their effect, and the rest as noise.
+            with_rig = self.covariance[:split, split:]
+            slope = with_rig @ np.linalg.pinv(self.covariance[split:, split:], hermitian=True)
+            own = own - slope @ with_rig.T
+            # The errors of a rig are true minus known parameters.
+            by_rig = -slope
+        places = own[POSE:, POSE:]
+        blocks = np.einsum("iaib->iab", places.reshape(*self.places.shape, *self.places.shape))
+        return Taught(
+            name,
+            self.base_from_camera,
+            own[:POSE, :POSE],
+            self.places,
+            np.array(blocks),
+            self.effect @ places @ self.effect.T,
+            self.base_places,
+            setup,
+            known,
+            by_rig,
+            tuple(self.platform_ids.tolist()),
+        )
+
+
+def taught_frames(
+    bundle: Bundle, seen: Observations, base: MarkedBody, platform: MarkedBody
+) -> TaughtFrames:
+    """Put the frames of base and platform through the planes of their adjusted stickers.
+
+    Raises LostError if a plane has too few stickers.
+    """
+    places = bundle.state.places
+    split = 3 * seen.base
+    count = places.size
+    spread = bundle.covariance
+    of_base = _frame_of(base, spread[:split, :split])
+    of_platform = _frame_of(platform, spread[split:count, split:count])
+    stand, move = places[: seen.base], places[seen.base :]
+    base_from_camera = invert(of_base(stand, stand[None])[0])
+    body_from_model = invert(of_platform(move, move[None])[0])
+    slopes = np.zeros((POSE + move.size + RIG, count + RIG))
+    more, less = (invert(of_base(stand, one)) for one in _moved(stand))
+    slopes[:POSE, :split] = np.array(
+        [_small_error(a, b) / (2.0 * STEP) for a, b in zip(more, less, strict=True)]
+    ).T
+    more, less = (
+        apply_each(invert(of_platform(move, one)), one).reshape(move.size, -1)
+        for one in _moved(move)
+    )
+    slopes[POSE : POSE + move.size, split:count] = ((more - less) / (2.0 * STEP)).T
+    slopes[POSE + move.size :, count:] = np.eye(RIG)
+    turned = apply_each(body_from_model, move)
+    return TaughtFrames(
+        base_from_camera,
+        apply_each(base_from_camera, stand),
+        turned,
+        slopes @ bundle.covariance @ slopes.T,
+        platform.sticker_ids,
+        _effect(bundle, seen, turned, body_from_model[:3, :3]),
+    )
+
+
+def _moved(points: Array) -> tuple[Array, Array]:
+    """Return the points (3 n, n, 3) after a step of each coordinate, forwards and backwards."""
+    steps = STEP * np.eye(points.size).reshape(-1, *points.shape)
+    return points + steps, points - steps
+
+
+def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array]:
+    """Return the function of adjusted and changed points that gives the body's frames."""
+    counts = np.bincount(body.plane_index, minlength=len(PLANE_NAMES))
+    for plane, count in zip(PLANE_NAMES, counts, strict=True):
+        if count < FEWEST_STICKERS:
+            raise LostError(
+                f"{body.name}: plane {plane} has {count} stickers that were found, at least "
+                f"{FEWEST_STICKERS} are needed"
+            )
+    size = len(body.nominal)
+    blocks = np.array(np.einsum("iaib->iab", spread.reshape(size, 3, size, 3)))
+
+    def frames(points: Array, changed: Array) -> Array:
+        turn = register(body.nominal, points, blocks).transform[:3, :3]
+        return frames_by_planes(body, changed, blocks, body.normals @ turn.T)
+
+    return frames
+
+
+def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> Array:
+    """Return the derivative (6, 3 n) of a registered frame by errors of the platform's places.
+
+    The places (n, 3) are in platform axes, into which ``turn`` (3, 3) turns the axes of the model.
+    Stickers have the mean weight that they have in the photographs.
+    """
+    own = seen.selected(seen.moves)
+    by_points = bundle.state.rig.derivatives(bundle.state.points(own))[0]
+    by_places = by_points @ bundle.state.poses[own.pair, :3, :3] @ turn.T
+    each = np.einsum(
+        "smia,smij,smjb->mab", by_places, np.linalg.inv(own.covariances), by_places, optimize=True
+    )
+    weights = np.zeros((len(places), 3, 3))
+    np.add.at(weights, own.sticker - own.base, each)
+    rows = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(places)], axis=2)
+    weighted = rows.swapaxes(1, 2) @ weights
+    effect = np.linalg.solve((weighted @ rows).sum(axis=0), np.concatenate(list(weighted), axis=1))
+    return np.asarray(effect)
+
+
+def _small_error(moved: Array, other: Array) -> Array:
+    """Return the small movement [dt, dphi] (6,) from transform ``other`` to ``moved``."""
+    turn = moved[:3, :3] @ other[:3, :3].T
+    return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])

@@ -1,0 +1,163 @@
+"""Adjustment that leaves out what contradicts the rest: single centres, pairs, and stickers.
+
+The worst centre of each body in each pair is left out if its squared residual is larger than chance
+allows, and the adjustment is repeated. If most centres of a pair or a quarter of those of a sticker
+are left out, the whole pair or sticker is left out, and the result says so.
+
+All residuals can be larger than the noise that the fits of ellipses state. The noise is then
+enlarged to the size of the residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from cmmsim.errors import LostError
+from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.stereo_rig import StereoRig, triangulate
+from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
+
+# Probability that a good observation is left out.
+CHANCE = 1e-5
+LARGEST_SQUARE = float(chdtri(4, CHANCE))
+MEDIAN_SQUARE = float(chdtri(4, 0.5))
+# Probability that residuals count as larger than noise although they are not.
+EXCESS_CHANCE = 1e-4
+ROUNDS = 40
+# Fewest stickers of the platform that determine its pose in a pair.
+FEWEST = 4
+# Largest shares of left-out centres of a pair and of a sticker that remain in use.
+PAIR_SHARE = 0.5
+STICKER_SHARE = 0.25
+# A jump of a sticker's place is reported if it is this many times the scatter of the places.
+CLEAR_JUMP = 4.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Adjustment with what it left out.
+
+    seen      observations in use
+    bundle    their adjustment
+    pairs     reasons by the number of a pair whose platform is left out
+    stickers  reasons by the number of a sticker that is left out
+    singles   number of centres that are left out of other pairs and stickers
+    """
+
+    seen: Observations
+    bundle: Bundle
+    pairs: dict[int, str]
+    stickers: dict[int, str]
+    singles: int
+
+
+def adjust_robustly(
+    seen: Observations,
+    start: BundleState,
+    known: StereoRig,
+    prior: Array,
+    names: Sequence[str],
+) -> Judged:
+    """Adjust a state to the observations that agree; ``names`` (K,) are those of the pairs.
+
+    Raises LostError if fewer than two pairs remain.
+    """
+    kept = np.ones(len(seen.pair), dtype=bool)
+    left_out: tuple[dict[int, str], dict[int, str]] = ({}, {})
+    state = start
+    for _ in range(ROUNDS):
+        used = seen.selected(kept)
+        bundle = adjust(used, state, known, prior)
+        state = bundle.state
+        scale = max(1.0, float(np.median(bundle.squares)) / MEDIAN_SQUARE)
+        worst = _worst(used, bundle.squares / scale)
+        if not len(worst):
+            break
+        kept[np.flatnonzero(kept)[worst]] = False
+        left_out = _left_out(seen, state, kept, names)
+        if len(np.unique(seen.pair[kept & seen.moves])) < 2:
+            raise LostError(
+                "fewer than two pairs agree with each other: do the images of each pair belong "
+                "together?"
+            )
+    pairs, stickers = left_out
+    whole = np.isin(seen.sticker, list(stickers)) | (np.isin(seen.pair, list(pairs)) & seen.moves)
+    if bundle.factor > chdtri(bundle.freedom, EXCESS_CHANCE) / bundle.freedom:
+        used = replace(used, covariances=used.covariances * bundle.factor)
+        enlarged = adjust(used, state, known, prior)
+        bundle = replace(enlarged, factor=bundle.factor)
+    return Judged(used, bundle, pairs, stickers, int(np.sum(~kept & ~whole)))
+
+
+def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
+    """Return the worst observation of each body in each pair, if it is larger than by chance."""
+    group = 2 * seen.pair + seen.moves
+    order = np.lexsort((squares, group))
+    last = np.flatnonzero(np.diff(group[order], append=-1) != 0)
+    worst = order[last]
+    return np.asarray(worst[squares[worst] > LARGEST_SQUARE])
+
+
+def _left_out(
+    seen: Observations, state: BundleState, kept: NDArray[np.bool_], names: Sequence[str]
+) -> tuple[dict[int, str], dict[int, str]]:
+    """Leave out whole pairs and stickers of which too much is left out, and say why.
+
+    ``kept`` (m,) is changed.
+    """
+    pairs: dict[int, str] = {}
+    stickers: dict[int, str] = {}
+    for sticker in np.unique(seen.sticker).tolist():
+        own = seen.sticker == sticker
+        share = 1.0 - kept[own].mean()
+        if share > STICKER_SHARE and np.sum(~kept[own]) > 1:
+            stickers[sticker] = _why(seen, state, own, names)
+    kept[np.isin(seen.sticker, list(stickers))] = False
+    judged = seen.moves & ~np.isin(seen.sticker, list(stickers))
+    for pair in np.unique(seen.pair[judged]).tolist():
+        own = judged & (seen.pair == pair)
+        count = int(kept[own].sum())
+        if count < max(FEWEST, PAIR_SHARE * own.sum()):
+            kept[own] = False
+            pairs[pair] = (
+                f"{count} of {own.sum()} stickers of the platform agree with the other pairs: do "
+                "its images belong together?"
+            )
+    return pairs, stickers
+
+
+def _why(
+    seen: Observations, state: BundleState, own: NDArray[np.bool_], names: Sequence[str]
+) -> str:
+    """Return why a sticker is left out: where its place jumps, or that it does not fit."""
+    mine = seen.selected(own)
+    found = triangulate(state.rig, *mine.pixels, *mine.covariances).points
+    poses = state.poses[mine.pair]
+    places = np.array(
+        [
+            apply(invert(pose), point) if moves else point
+            for pose, point, moves in zip(poses, found, mine.moves, strict=True)
+        ]
+    )
+    order = np.argsort(mine.pair)
+    places = places[order]
+    jumps = [
+        float(np.linalg.norm(np.median(places[k:], axis=0) - np.median(places[:k], axis=0)))
+        for k in range(1, len(places))
+    ]
+    if jumps:
+        k = 1 + int(np.argmax(jumps))
+        parts = places[:k], places[k:]
+        scatter = max(
+            float(np.median(np.linalg.norm(part - np.median(part, axis=0), axis=1)))
+            for part in parts
+        )
+        if jumps[k - 1] > CLEAR_JUMP * scatter:
+            before, after = (names[mine.pair[order][j]] for j in (k - 1, k))
+            return f"moved by {1e3 * jumps[k - 1]:.2f} mm between {before} and {after}"
+    return "does not fit to the other stickers: hidden, damaged, or not round?"

@@ -1,0 +1,78 @@
+"""Stickers at their expected places in the images, and the sizes of windows that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cmmsim.detection.detector import FitLimits
+from cmmsim.files.rig_and_bodies import MarkedBody
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.measuring.layout_search import SMALLEST_STEP
+from cmmsim.measuring.observation import DetectionSettings
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.teaching import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.uncertainty.known_rig import KnownRig
+
+
+@dataclass(frozen=True)
+class StickerView:
+    """Stickers of platform and base in front of a rig, with the platform at home.
+
+    ``known`` states how well the rig is known; None means exactly. ``camera_from_base`` (4, 4) is
+    the transform that the sensor file states.
+    """
+
+    file: SensorFile
+    platform: MarkedBody
+    base: MarkedBody
+    rig: StereoRig
+    known: KnownRig | None
+    camera_from_base: Array
+    optics: Optics
+
+    @cached_property
+    def sizes(self) -> WindowSizes:
+        """Sizes of windows. Large and blurred stickers need larger windows."""
+        radius = self.file.stickers.radius
+        place = self.camera_from_base
+        at_target = radius_at(self.rig, place, np.array(self.file.rig.target), radius)
+        at_teaching = max(
+            largest_radius(self.rig, place, self.base, radius),
+            largest_radius(self.rig, self._camera_from_platform, self.platform, radius),
+        )
+        blurred = self.optics.psf_px > 0.0 or self.file.timing.exposure > 0.0
+        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
+
+    def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
+        """Return the settings of the search for stickers in windows.
+
+        ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
+        """
+        timing = self.file.timing
+        return DetectionSettings(
+            self.sizes.window,
+            self.sizes.fit,
+            radius=self.file.stickers.radius,
+            detector=self.file.detection.detector,
+            limits=FitLimits(smallest_contrast=SMALLEST_STEP * noise.white_level),
+            optics=self.optics,
+            centre_error_px=centre_error_px,
+            exposed_share=timing.exposure * timing.frame_rate,
+            line_error_px=0.0 if self.known is None else self.known.line_std(self._stickers),
+        )
+
+    @property
+    def _camera_from_platform(self) -> Array:
+        return self.camera_from_base @ pose_to_transform(np.array(self.file.platform.home))
+
+    @property
+    def _stickers(self) -> Array:
+        """Nominal places (n,3) of all stickers in the camera frame."""
+        places = (self._camera_from_platform, self.platform), (self.camera_from_base, self.base)
+        return np.concatenate([apply(move, body.nominal) for move, body in places])

@@ -1,0 +1,183 @@
+"""Commands ``cmmsim teach`` and ``cmmsim measure``: from photographs to poses."""
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from identify.commands.options import JsonFile, Quiet, completion, tell
+from identify.files.atomic import atomic_contents, write_bytes, write_text
+from identify.files.run_folder import new_run_folder, save_files
+from identify.progress import print_table, print_warnings, terminal_progress
+
+if TYPE_CHECKING:
+    from cmmsim import PhotographedTeaching
+    from identify.arrays import Array
+
+Left = Annotated[Path, typer.Argument(help="Folder of the left images, or a video.")]
+Right = Annotated[Path, typer.Argument(help="Folder of the right images, or a video.")]
+SensorFile = Annotated[
+    str,
+    typer.Option(
+        "--sensor",
+        metavar="NAME|FILE",
+        help="Sensor file with the cameras, and the rough places of the stickers on their planes.",
+        autocompletion=completion("sensor"),
+    ),
+]
+Colour = Annotated[
+    str | None,
+    typer.Option(
+        "--colour",
+        help="How grey values are made of colours: grey (weighted sum), red, green or blue.",
+        show_default="images with colours are refused",
+    ),
+]
+
+
+def teach(
+    context: typer.Context,
+    left: Left,
+    right: Right,
+    sensor: SensorFile,
+    out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path(
+        "runs/teaching"
+    ),
+    colour: Colour = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Teach a sensor from photographs: the frames of base and platform, from their stickers.
+
+    Both cameras and the base stand still. The platform takes 10 to 30 poses, and both cameras take
+    an image of each at the same time. Files of the two folders are paired in lexicographic order of
+    their names. The stickers need no labels: those that stand belong to the base, and those that
+    move together to the platform. The sensor file names them by rough places, which may be off by
+    some millimetres, and its planes define the frames.
+
+    Reads both folders or videos, and the sensor file. Images are grey, and have the size and the
+    bit depth of the sensor file.
+
+    Writes into the folder taught.json, which is also the JSON: places of the stickers, frames,
+    covariances, residuals, and stickers and pairs that do not fit; and residuals.png.
+
+    \b
+    Examples:
+      cmmsim teach photos/left photos/right --sensor mine.toml --out teaching
+      cmmsim teach left.avi right.avi --sensor mine.toml --colour green
+    """
+    from cmmsim.from_photographs import RENDERER, photographs_for
+    from cmmsim.loading import load_sensor
+    from identify.verification.photograph_figures import teaching_residuals
+
+    folder = context.with_resource(new_run_folder(out)).path
+    known = load_sensor(sensor, renderer=RENDERER)
+    pairs = photographs_for(known, left, right, colour)
+    with terminal_progress(quiet, "pairs/s").stage("find stickers", len(pairs)) as advance:
+        found = known.teach_from(pairs, advance)
+    content = found.as_dict()
+    save_files(folder, {"taught.json": content, "residuals.png": teaching_residuals(found)})
+    print_warnings(found.warnings)
+    tell(content, json, quiet, lambda: _print_summary(found, folder))
+
+
+def _print_summary(found: "PhotographedTeaching", folder: Path) -> None:
+    taught = found.taught
+    print_table(
+        ("body", "stickers", "position [um]", "orientation [urad]"),
+        [
+            (body, str(len(places)), *_stds(covariance))
+            for body, places, covariance in (
+                ("base", taught.base_places, taught.base_covariance),
+                ("platform", taught.platform_places, taught.platform_covariance),
+            )
+        ],
+        ("body",),
+        f"{len(found.pairs)} pairs; residuals {found.rms_px:.3g} px; standard deviation of frames:",
+    )
+    for names in (found.rejected_pairs, found.rejected_stickers):
+        for name, reason in names.items():
+            typer.echo(f"not used: {name}: {reason}")
+    typer.echo(f"teaching: {folder}")
+
+
+def _stds(covariance: "Array") -> tuple[str, str]:
+    """Show the root mean square of the standard deviations of position and orientation."""
+    diagonal = covariance.diagonal()
+    return f"{1e6 * diagonal[:3].mean() ** 0.5:.2g}", f"{1e6 * diagonal[3:].mean() ** 0.5:.2g}"
+
+
+def measure(
+    context: typer.Context,
+    left: Left,
+    right: Right,
+    sensor: SensorFile,
+    taught: Annotated[
+        Path, typer.Option("--taught", metavar="FILE", help="taught.json of cmmsim teach.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Table that is written.")] = Path("poses.csv"),
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures",
+            metavar="FOLDER",
+            help="Also write a picture of each pair with the stickers that were used.",
+            show_default=False,
+        ),
+    ] = None,
+    colour: Colour = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the pose of the platform in each pair of photographs.
+
+    Reads both folders or videos, the sensor file, and the taught.json that cmmsim teach wrote for
+    the same sensor file and place of the cameras.
+
+    Writes a CSV table with one row for each pair: time_s; measured_x_m to measured_gamma_rad, the
+    pose of the platform in the base frame; covariance_x_x to covariance_gamma_gamma, the covariance
+    of the noise, which is new in each pair; common_x_x to common_gamma_gamma, the covariance of
+    what is the same in all pairs; stickers; ok, which is 1 or 0; and why a pair has no pose. The
+    columns have the names of a record. In folders, the time of an image follows from the frame rate
+    of the sensor file.
+
+    \b
+    Examples:
+      cmmsim measure photos/left photos/right --sensor mine.toml \\
+        --taught teaching/taught.json --out poses.csv
+      cmmsim measure left.avi right.avi --sensor mine.toml \\
+        --taught teaching/taught.json --pictures found
+    """
+    import cv2
+
+    from cmmsim.from_photographs import RENDERER, photographs_for
+    from cmmsim.loading import load_sensor
+    from cmmsim.photographs.measuring import COLUMNS, measure_pairs
+    from cmmsim.photographs.taught_file import read_taught
+
+    measuring = load_sensor(sensor, renderer=RENDERER, taught=read_taught(taught))
+    pairs = photographs_for(measuring, left, right, colour)
+    made = None
+    if pictures is not None:
+        target = context.with_resource(new_run_folder(pictures)).path
+        made = context.with_resource(atomic_contents(target))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    lost: list[str] = []
+    count = 0
+    with terminal_progress(quiet, "pairs/s").stage("measure", len(pairs)) as advance:
+        for one in measure_pairs(pairs, measuring.estimator):
+            table.writerow(one.row)
+            if made is not None:
+                picture = cv2.imencode(".png", one.picture())[1].tobytes()
+                write_bytes(made / f"{count:05d}.png", picture)
+            count += 1
+            if not one.measurement.ok:
+                lost.append(f"{one.name}: {one.measurement.reason}")
+            advance()
+    write_text(out, text.getvalue())
+    print_warnings(lost[:3] + ([f"and {len(lost) - 3} more pairs lost"] if lost[3:] else []))
+    if not quiet:
+        typer.echo(f"{count - len(lost)} of {count} pairs measured: {out}")

@@ -1,0 +1,93 @@
+"""``cmmsim teach`` and ``cmmsim measure``: from folders of images to a table of poses."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import cmmsim
+from dynamics import load_robot
+from identify.record.csv_record import columns_of
+from tests.cmmsim.photographed import folders, photographed, spread_poses
+from tests.identify.commands import command, one_line
+
+COUNT = 7
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    path = tmp_path_factory.mktemp("photographs")
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=11)
+    folders(path, (photographed(sensor, pose) for pose in spread_poses(COUNT, 11)))
+    return path
+
+
+def teach(pictures, out, *more):
+    sides = pictures / "left", pictures / "right"
+    return command("teach", *sides, "--sensor", "ctrack780", "--out", out, *more)
+
+
+def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(pictures, tmp_path, capfd):
+    assert teach(pictures, tmp_path / "taught") == 0
+    said = capfd.readouterr()
+    assert "7 pairs" in said.out
+    assert "find stickers: 7 of 7" in said.err
+    names = ["residuals.png", "taught.json"]
+    assert sorted(path.name for path in (tmp_path / "taught").iterdir()) == names
+    content = json.loads((tmp_path / "taught" / "taught.json").read_text())
+    assert len(content["platform_places"]) == len(content["base_places"]) == 18
+    assert (content["rejected_pairs"], content["rejected_stickers"]) == ({}, {})
+    assert content["variance_factor"] == pytest.approx(1.0, abs=0.15)
+    measuring = (
+        *("measure", pictures / "left", pictures / "right", "--sensor", "ctrack780"),
+        *("--taught", tmp_path / "taught" / "taught.json", "--out", tmp_path / "poses.csv"),
+    )
+    assert command(*measuring, "--pictures", tmp_path / "found") == 0
+    assert "7 of 7 pairs measured" in capfd.readouterr().out
+    with (tmp_path / "poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    groups = columns_of(load_robot("rss6"))
+    for name in ("time", "measured", "covariance"):
+        assert set(groups[name].names) <= set(rows[0])
+    assert [(row["pair"], row["ok"], row["why"]) for row in rows] == [
+        (f"{k:03d}.png", "1", "") for k in range(COUNT)
+    ]
+    poses = np.array([[float(row[name]) for name in groups["measured"].names] for row in rows])
+    errors = poses - spread_poses(COUNT, 11)
+    spread = np.zeros((COUNT, 6, 6))
+    for row, matrix in zip(rows, spread, strict=True):
+        for kind in ("covariance", "common"):
+            upper = [float(value) for name, value in row.items() if name.startswith(f"{kind}_")]
+            own = np.zeros((6, 6))
+            own[np.triu_indices(6)] = upper
+            matrix += own + np.triu(own, 1).T
+    squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors)
+    assert squares.max() < 27.9  # one in ten thousand
+    picture = cv2.imread(str(tmp_path / "found" / "00000.png"))
+    assert picture.shape == (1536, 4096, 3)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda image: image[:-1], "left/000.png is 2048 x 1535 px, but the sensor file states"),
+        (lambda image: image.astype(np.uint16), "left/000.png has pixels of uint16"),
+        (lambda image: np.dstack([image, image, image // 2]), "left/000.png has colours: say how"),
+    ],
+)
+def test_an_image_that_does_not_fit_the_sensor_is_named_with_the_cause(
+    pictures, tmp_path, capfd, spoil, message
+):
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        for path in (pictures / side).iterdir():
+            (tmp_path / side / path.name).symlink_to(path)
+    first = tmp_path / "left" / "000.png"
+    image = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
+    first.unlink()
+    cv2.imwrite(str(first), spoil(image))
+    assert teach(tmp_path, tmp_path / "out") == 1
+    assert message in one_line(capfd.readouterr().err)
+    assert not (tmp_path / "out").exists()
