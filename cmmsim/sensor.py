@@ -370,7 +370,9 @@ class Sensor(Instrument):
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """Return a tracker, which measures frame after frame."""
-        if self.renderer != STATISTICAL.name or self.method != "registration":
+        # The faster tracker knows each sticker of the scene, and teaching can lack some.
+        whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
+        if self.renderer != STATISTICAL.name or self.method != "registration" or not whole:
             return Tracker(self.estimator)
         # Imported late, because importing numba takes time.
         from cmmsim.without_images.statistical_tracker import StatisticalTracker

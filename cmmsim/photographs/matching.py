@@ -10,7 +10,7 @@ sensor file then only name the stickers that were found.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,10 @@ FEWEST_MOVING = 6
 # Rough places may be off by the first tolerance, or else by the second, m.
 ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
+# Number of pairs that are tried as the first model of the platform.
+REFERENCES = 4
+# m: a sticker that has moved is searched so far from its rough place.
+NEAR = 0.015
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ class FoundBody:
     places    (n, 3), in the camera frame at the reference pair, m
     moves     (K, 4, 4), place of the body in each pair, relative to the reference pair
     seen      (K,), pairs in which the body was found
+    missing   reasons by the index of each sticker that is not used
     """
 
     sticker: NDArray[np.int_]
@@ -108,13 +113,32 @@ class FoundBody:
     places: Array
     moves: Array
     seen: NDArray[np.bool_]
+    missing: dict[int, str]
+
+    def without(self, positions: dict[int, str]) -> FoundBody:
+        """Return the body without the stickers at some positions; the values are reasons."""
+        count = len(self.sticker)
+        gone = {int(self.sticker[k]): why for k, why in positions.items() if 0 <= k < count}
+        return self.with_missing(gone)
+
+    def with_missing(self, gone: dict[int, str]) -> FoundBody:
+        """Return the body without some stickers of the file; the values are reasons."""
+        kept = ~np.isin(self.sticker, list(gone))
+        return replace(
+            self,
+            sticker=self.sticker[kept],
+            members=self.members[kept],
+            places=self.places[kept],
+            missing=self.missing | gone,
+        )
 
 
-def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
+def standing(pairs: Sequence[Candidates], share: float = STANDING_SHARE) -> NDArray[np.int_]:
     """Return the candidates (g, K) of g standing points in K pairs, or NONE where one is missing.
 
-    A point that stands has the same pixels in most of the pairs.
+    A point that stands has the same pixels in at least this ``share`` of the pairs.
     """
+    fewest = max(2.0, share * len(pairs))
     counts = [len(one.points) for one in pairs]
     owner = np.repeat(np.arange(len(pairs)), counts)
     number = np.concatenate([np.arange(count) for count in counts])
@@ -125,9 +149,9 @@ def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
     found = []
     for k in np.argsort(-pairs_near, kind="stable").tolist():
         own = np.array([j for j in near[k] if free[j]], dtype=int)
-        if pairs_near[k] < STANDING_SHARE * len(pairs):
+        if pairs_near[k] < fewest:
             break
-        if not free[k] or len(set(owner[own])) < STANDING_SHARE * len(pairs):
+        if not free[k] or len(set(owner[own])) < fewest:
             continue
         members = np.full(len(pairs), NONE)
         # Of two candidates of one pair, the one nearer to the point that most agree on is taken.
@@ -148,46 +172,90 @@ def places_of(pairs: Sequence[Candidates], members: NDArray[np.int_]) -> Array:
     ).reshape(-1, 3)
 
 
-def moving(
-    pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: str
-) -> tuple[NDArray[np.int_], Array, Array, NDArray[np.bool_]]:
+@dataclass(frozen=True)
+class Moving:
+    """Rigid body that moves among the candidates of K pairs.
+
+    members  (n, K), indices of the candidates of its n points, or NONE
+    places   (n, 3), in the camera frame at the reference pair, m
+    moves    (K, 4, 4), place of the body in each pair, relative to the reference pair
+    seen     (K,), pairs in which the body was found
+    """
+
+    members: NDArray[np.int_]
+    places: Array
+    moves: Array
+    seen: NDArray[np.bool_]
+
+
+def moving(pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: str) -> Moving:
     """Find the rigid body that moves among the ``free`` candidates of each pair.
 
-    Returns its candidates (n, K), places (n, 3) at the reference pair, moves (K, 4, 4) and the
-    pairs (K,) in which it was found. Raises LostError if it is found in the reference pair only.
+    Raises LostError if it is found in fewer than two pairs.
     """
     # False candidates share spots with true ones, and would make the search long.
     clear = [own[one.alone[own]] for one, own in zip(pairs, free, strict=True)]
-    reference = int(np.argmax([len(own) for own in clear]))
-    model = pairs[reference].points[clear[reference]]
-    moves = np.tile(np.eye(4), (len(pairs), 1, 1))
-    seen = np.zeros(len(pairs), dtype=bool)
-    said = ""
-    for k, own in enumerate(free):
-        if k == reference:
-            seen[k] = True
-            continue
+    best = np.zeros(len(pairs), dtype=bool)
+    model = np.zeros((0, 3))
+    moves = np.zeros((0, 4, 4))
+    # The two images of a pair may not belong together, so some pairs are tried as the reference.
+    for reference in np.argsort([-len(own) for own in clear])[:REFERENCES].tolist():
+        own = pairs[reference].points[clear[reference]]
         try:
-            points = pairs[k].points[own]
-            moves[k], known, _ = find_layout(model, points, TAUGHT_TOLERANCE, FEWEST_MOVING, name)
-            seen[k] = True
-            if len(known) < ENOUGH * len(model):
-                model = model[known]
+            shape, there, seen = _searched(own, reference, pairs, free, name)
         except LostError as error:
-            said = said or str(error)
-    if seen.sum() < 2:
-        raise LostError(said)
-    model = _extended(model, pairs, free, moves, seen)
+            said = error
+            continue
+        if seen.sum() > best.sum():
+            model, moves, best = shape, there, seen
+        if best.sum() > 0.5 * len(pairs):
+            break
+    if not best.any():
+        raise said
+    model = _extended(model, pairs, free, moves, best)
     members = np.full((len(model), len(pairs)), NONE)
-    for k in np.flatnonzero(seen).tolist():
-        at, there = cKDTree(apply(moves[k], model)).query(
+    for k in np.flatnonzero(best).tolist():
+        at, to = cKDTree(apply(moves[k], model)).query(
             pairs[k].points[free[k]], distance_upper_bound=2.0 * TAUGHT_TOLERANCE
         )
         order = np.argsort(-at)  # of two candidates the nearer one is entered last
         order = order[np.isfinite(at[order])]
-        members[there[order], k] = free[k][order]
+        members[to[order], k] = free[k][order]
     often = np.sum(members != NONE, axis=1) >= 2
-    return members[often], model[often], moves, seen
+    return Moving(members[often], model[often], moves, best)
+
+
+def _searched(
+    model: Array,
+    reference: int,
+    pairs: Sequence[Candidates],
+    free: Sequence[NDArray[np.int_]],
+    name: str,
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Search a model (n, 3), the points of one pair, in all other pairs.
+
+    Returns the part of the model that moves as one body, its moves (K, 4, 4) and the pairs (K,) in
+    which it was found. Raises LostError if no other pair has it.
+    """
+    moves = np.tile(np.eye(4), (len(pairs), 1, 1))
+    seen = np.zeros(len(pairs), dtype=bool)
+    seen[reference] = True
+    said = LostError(f"{name}: no pair to compare with")
+    for k, own in enumerate(free):
+        if k == reference:
+            continue
+        try:
+            points = pairs[k].points[own]
+            moves[k], known, _ = find_layout(model, points, TAUGHT_TOLERANCE, FEWEST_MOVING, name)
+        except LostError as error:
+            said = error
+            continue
+        seen[k] = True
+        if len(known) < ENOUGH * len(model):
+            model = model[known]
+    if seen.sum() < 2:
+        raise said
+    return model, moves, seen
 
 
 def _extended(
@@ -217,47 +285,73 @@ def _extended(
     return np.concatenate([model, np.array(added).reshape(-1, 3)])
 
 
-def named(body: MarkedBody, points: Array) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """Return the stickers (n,) of a body, and the points (n,) that are these stickers.
+def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
+    """Return the place (4, 4) of a body, its stickers (n,), and the points (n,) that these are.
 
     Raises LostError if the rough places are not found among the points (g, 3).
     """
     for tolerance in ROUGH:
         try:
-            _, stickers, own = find_layout(
-                body.nominal, points, tolerance, FEWEST_NOMINAL, body.name
-            )
+            return find_layout(body.nominal, points, tolerance, FEWEST_NOMINAL, body.name)
         except LostError as error:
             said = error
-            continue
-        return stickers, own
     raise said
 
 
-def match(pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody) -> list[FoundBody]:
-    """Return the stickers of base and platform in K pairs. Raises LostError."""
+def match(
+    pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody, names: Sequence[str]
+) -> list[FoundBody]:
+    """Return the stickers of base and platform in K pairs with these names. Raises LostError."""
     still = standing(pairs)
     stood = places_of(pairs, still)
-    stickers, own = named(base, stood)
-    count = len(pairs)
-    found = [
-        FoundBody(
-            stickers,
-            still[own],
-            stood[own],
-            np.tile(np.eye(4), (count, 1, 1)),
-            np.ones(count, dtype=bool),
-        )
-    ]
+    place, stickers, own = named(base, stood)
+    # Also points that stand for a while, which tell when a sticker has moved.
+    briefly = standing(pairs, 0.0)
+    lost = _missing(base, place, stickers, places_of(pairs, briefly), briefly, names)
+    stays = np.tile(np.eye(4), (len(pairs), 1, 1)), np.ones(len(pairs), dtype=bool)
+    found = [FoundBody(stickers, still[own], stood[own], *stays, {}).with_missing(lost)]
     try:
         # Stickers that stand and belong to no body are left out as well.
-        members, places, moves, seen = moving(pairs, _free(pairs, still), platform.name)
+        moved = moving(pairs, _free(pairs, still), platform.name)
     except LostError:
         # A platform that seldom moves stands in most pairs, too.
-        members, places, moves, seen = moving(pairs, _free(pairs, still[own]), platform.name)
-    stickers, own = named(platform, places)
-    found.append(FoundBody(stickers, members[own], places[own], moves, seen))
-    return found
+        moved = moving(pairs, _free(pairs, still[own]), platform.name)
+    place, stickers, own = named(platform, moved.places)
+    lost = _missing(platform, place, stickers, moved.places, moved.members, names)
+    body = FoundBody(stickers, moved.members[own], moved.places[own], moved.moves, moved.seen, {})
+    return [*found, body.with_missing(lost)]
+
+
+def _missing(
+    body: MarkedBody,
+    camera_from_body: Array,
+    found: NDArray[np.int_],
+    points: Array,
+    members: NDArray[np.int_],
+    names: Sequence[str],
+) -> dict[int, str]:
+    """Return reasons by the index of each sticker that cannot be used.
+
+    A sticker was not found, or points (g, 3) near its place belong to different pairs: it has
+    moved. ``members`` (g, K) are the candidates of the points.
+    """
+    reasons = {}
+    seen = members != NONE
+    for sticker, place in enumerate(apply(camera_from_body, body.nominal)):
+        near = np.flatnonzero(np.linalg.norm(points - place, axis=1) < NEAR)
+        near = near[np.argsort(-seen[near].sum(axis=1))]
+        others = [k for k in near[1:] if not np.any(seen[near[0]] & seen[k])]
+        if others:
+            first, later = sorted((near[0], others[0]), key=lambda k: int(np.argmax(seen[k])))
+            jump = 1e3 * np.linalg.norm(points[later] - points[first])
+            last = names[len(names) - 1 - int(np.argmax(seen[first][::-1]))]
+            reasons[sticker] = (
+                f"moved by {jump:.2f} mm between {last} and {names[int(np.argmax(seen[later]))]}"
+            )
+        elif sticker not in found:
+            count = int(seen[near[0]].sum()) if len(near) else 0
+            reasons[sticker] = f"found in {count} of {len(names)} pairs near its rough place"
+    return reasons
 
 
 def _free(pairs: Sequence[Candidates], taken: NDArray[np.int_]) -> list[NDArray[np.int_]]:

@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.errors import PhotographError
 from cmmsim.geometry.pose import Array
 from cmmsim.measuring.measurement import Measurement
-from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.measuring.pose_estimator import PoseEstimator, measure_frame
 from cmmsim.photographs.pairs import Photograph
 from cmmsim.radiometry.stereo_images import StereoFrame
 from cmmsim.tracker import Tracker
@@ -109,7 +110,22 @@ def _marked(image: NDArray, at: Array, names: NDArray[np.str_]) -> NDArray[np.ui
 def measure_pairs(
     photographs: Iterable[Photograph], estimator: PoseEstimator
 ) -> Iterator[MeasuredPair]:
-    """Yield the measurement of each pair, near the pose that the pairs before it predict."""
+    """Yield the measurement of each pair, near the pose that the pairs before it predict.
+
+    Raises PhotographError if the images of the first pair are exchanged.
+    """
     tracker = Tracker(estimator)
-    for one in photographs:
-        yield MeasuredPair(one.name, one.time, tracker.measure(one.images), one.images)
+    for number, one in enumerate(photographs):
+        found = tracker.measure(one.images)
+        if number == 0 and not found.ok:
+            _require_order(one, estimator)
+        yield MeasuredPair(one.name, one.time, found, one.images)
+
+
+def _require_order(first: Photograph, estimator: PoseEstimator) -> None:
+    """Raise PhotographError if a pose is found in the images of a pair when they are exchanged."""
+    left, right = first.images.left, first.images.right
+    if left.shape == right.shape and measure_frame(StereoFrame(right, left), estimator).ok:
+        raise PhotographError(
+            f"{first.name}: left and right are exchanged: give the two folders in the other order"
+        )

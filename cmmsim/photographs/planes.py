@@ -76,13 +76,21 @@ class TaughtFrames:
         )
 
 
+def require_planes(body: MarkedBody) -> None:
+    """Raise LostError if a plane of a body has too few stickers."""
+    counts = np.bincount(body.plane_index, minlength=len(PLANE_NAMES))
+    for plane, count in zip(PLANE_NAMES, counts, strict=True):
+        if count < FEWEST_STICKERS:
+            raise LostError(
+                f"{body.name}: plane {plane} has {count} stickers that can be used, at least "
+                f"{FEWEST_STICKERS} are needed"
+            )
+
+
 def taught_frames(
     bundle: Bundle, seen: Observations, base: MarkedBody, platform: MarkedBody
 ) -> TaughtFrames:
-    """Put the frames of base and platform through the planes of their adjusted stickers.
-
-    Raises LostError if a plane has too few stickers.
-    """
+    """Put the frames of base and platform through the planes of their adjusted stickers."""
     places = bundle.state.places
     split = 3 * seen.base
     count = places.size
@@ -122,13 +130,6 @@ def _moved(points: Array) -> tuple[Array, Array]:
 
 def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array]:
     """Return the function of adjusted and changed points that gives the body's frames."""
-    counts = np.bincount(body.plane_index, minlength=len(PLANE_NAMES))
-    for plane, count in zip(PLANE_NAMES, counts, strict=True):
-        if count < FEWEST_STICKERS:
-            raise LostError(
-                f"{body.name}: plane {plane} has {count} stickers that were found, at least "
-                f"{FEWEST_STICKERS} are needed"
-            )
     size = len(body.nominal)
     blocks = np.array(np.einsum("iaib->iab", spread.reshape(size, 3, size, 3)))
 

@@ -146,18 +146,13 @@ def _why(
     )
     order = np.argsort(mine.pair)
     places = places[order]
-    jumps = [
-        float(np.linalg.norm(np.median(places[k:], axis=0) - np.median(places[:k], axis=0)))
-        for k in range(1, len(places))
-    ]
-    if jumps:
-        k = 1 + int(np.argmax(jumps))
-        parts = places[:k], places[k:]
-        scatter = max(
-            float(np.median(np.linalg.norm(part - np.median(part, axis=0), axis=1)))
-            for part in parts
-        )
-        if jumps[k - 1] > CLEAR_JUMP * scatter:
-            before, after = (names[mine.pair[order][j]] for j in (k - 1, k))
-            return f"moved by {1e3 * jumps[k - 1]:.2f} mm between {before} and {after}"
+    # The best split into two places leaves the least scatter about them.
+    splits = [(places[:k], places[k:]) for k in range(1, len(places))]
+    scatter = [sum(float(np.sum((one - one.mean(axis=0)) ** 2)) for one in two) for two in splits]
+    if scatter:
+        k = int(np.argmin(scatter))
+        jump = float(np.linalg.norm(np.subtract(*(one.mean(axis=0) for one in splits[k]))))
+        if jump > CLEAR_JUMP * np.sqrt(scatter[k] / len(places)):
+            before, after = (names[mine.pair[order][j]] for j in (k, k + 1))
+            return f"moved by {1e3 * jump:.2f} mm between {before} and {after}"
     return "does not fit to the other stickers: hidden, damaged, or not round?"

@@ -21,14 +21,28 @@ from cmmsim.geometry.registration import register
 from cmmsim.measuring.observation import Observer
 from cmmsim.measuring.taught import Taught
 from cmmsim.photographs.bundle import RIG, Bundle, BundleState, Observations
-from cmmsim.photographs.matching import NONE, Candidates, FoundBody, candidates, match, spots_in
+from cmmsim.photographs.causes import cause_of
+from cmmsim.photographs.matching import (
+    NONE,
+    Candidates,
+    FoundBody,
+    Spots,
+    candidates,
+    match,
+    spots_in,
+)
 from cmmsim.photographs.pairs import Photograph
-from cmmsim.photographs.planes import TaughtFrames, taught_frames
-from cmmsim.photographs.rejection import adjust_robustly
+from cmmsim.photographs.planes import TaughtFrames, require_planes, taught_frames
+from cmmsim.photographs.rejection import Judged, adjust_robustly
 from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
 FEWEST_PAIRS = 3
+# A warning is given if the squared residuals exceed the stated noise by this factor.
+LARGEST_FACTOR = 1.5
+# A warning is given if the platform moves by less in all images.
+SHORTEST_WAY_PX = 3.0
+UNFOUND = "hidden, or its images do not belong together"
 
 
 @dataclass(frozen=True)
@@ -124,22 +138,55 @@ def teach_from(
         advance()
     if len(spots) < FEWEST_PAIRS:
         raise TeachingError(f"teaching failed: {len(spots)} pairs, at least {FEWEST_PAIRS} needed")
-    pairs = [candidates(one, observer) for one in spots]
-    whole = base, platform
     try:
-        bodies = match(pairs, platform, base)
-        marked = [own.selected(body.sticker) for own, body in zip(whole, bodies, strict=True)]
-        seen, start = observations(pairs, bodies, marked, observer)
-        prior = np.zeros((RIG, RIG)) if known is None else known.covariance
-        judged = adjust_robustly(seen, start, observer.rig, prior, names)
-        frames = taught_frames(judged.bundle, judged.seen, marked[0], marked[1])
+        return _taught(spots, names, observer, (base, platform), name, known)
     except LostError as error:
-        raise TeachingError(f"teaching failed: {error}") from error
+        cause = cause_of(spots, names, observer, base, platform)
+        raise TeachingError(f"teaching failed: {cause or error}") from error
+
+
+def _taught(
+    spots: list[Spots],
+    names: list[str],
+    observer: Observer,
+    whole: tuple[MarkedBody, MarkedBody],
+    name: str,
+    known: KnownRig | None,
+) -> PhotographedTeaching:
+    """Match, adjust, and put the frames through the planes. Raises LostError."""
+    base, platform = whole
+    pairs = [candidates(one, observer) for one in spots]
+    bodies = match(pairs, platform, base, names)
+    prior = np.zeros((RIG, RIG)) if known is None else known.covariance
+    while True:
+        marked = [own.selected(body.sticker) for own, body in zip(whole, bodies, strict=True)]
+        lost = {
+            f"{own.sticker_ids[k]} of the {own.name}": reason
+            for own, body in zip(whole, bodies, strict=True)
+            for k, reason in sorted(body.missing.items())
+        }
+        try:
+            for own in marked:
+                require_planes(own)
+        except LostError as error:
+            said = "; ".join(f"{sticker} {reason}" for sticker, reason in lost.items())
+            raise LostError(f"{error}: {said}") from error
+        seen, start = observations(pairs, bodies, marked, observer)
+        judged = adjust_robustly(seen, start, observer.rig, prior, names)
+        if not judged.stickers:
+            break
+        # A sticker that is left out leaves the unknowns, too.
+        bodies = [
+            body.without({k - first: why for k, why in judged.stickers.items()})
+            for body, first in zip(bodies, (0, seen.base), strict=True)
+        ]
+    frames = taught_frames(judged.bundle, judged.seen, marked[0], marked[1])
     rig = None
     if known is not None:
         covariance = judged.bundle.covariance[-RIG:, -RIG:]
         rig = KnownRig(judged.bundle.state.rig, covariance, known.exposure_std)
-    missing = {names[k]: "the platform was not found" for k in np.flatnonzero(~bodies[1].seen)}
+    unseen = np.flatnonzero(~bodies[1].seen).tolist()
+    missing = {names[k]: "the platform was not found: " + UNFOUND for k in unseen}
     missing |= {names[k]: reason for k, reason in judged.pairs.items()}
     return PhotographedTeaching(
         frames.taught(name, rig),
@@ -148,9 +195,48 @@ def teach_from(
         judged.bundle,
         tuple(names),
         missing,
-        {},
-        (),
+        lost,
+        tuple(doubts(judged, missing, lost, pairs, observer)),
     )
+
+
+def doubts(
+    judged: Judged,
+    missing: dict[str, str],
+    lost: dict[str, str],
+    pairs: list[Candidates],
+    observer: Observer,
+) -> list[str]:
+    """Return lines about what a user should look at."""
+    lines = [f"not used: {one}: {reason}" for one, reason in (missing | lost).items()]
+    if judged.bundle.factor > LARGEST_FACTOR:
+        lines.append(
+            f"squared residuals are {judged.bundle.factor:.1f} times the stated noise, and the "
+            "covariances are enlarged as much: are the cameras calibrated, and the images sharp?"
+        )
+    if (longest := longest_way(judged.seen)) < SHORTEST_WAY_PX:
+        lines.append(
+            f"the platform moves by at most {longest:.1f} px in the images: with larger movements, "
+            "errors of single pixels average out"
+        )
+    usual = float(np.median(np.concatenate([one.misfits.ravel() for one in pairs])))
+    limit = observer.settings.limits.largest_misfit
+    if usual > limit:
+        lines.append(
+            f"grey values of stickers scatter {usual:.1f} times as much as [camera] of the sensor "
+            f"file states, and cmmsim measure refuses stickers above {limit:g}: enlarge "
+            "camera.dark_noise, or state the point spread lens.psf_px"
+        )
+    return lines
+
+
+def longest_way(seen: Observations) -> float:
+    """Return the longest movement of a sticker of the platform in the images, px."""
+    ways = [
+        float(np.ptp(seen.pixels[:, seen.sticker == sticker], axis=1).max())
+        for sticker in np.unique(seen.sticker[seen.moves])
+    ]
+    return max(ways)
 
 
 def observations(

@@ -65,6 +65,9 @@ def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(picture
             matrix += own + np.triu(own, 1).T
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors)
     assert squares.max() < 27.9  # one in ten thousand
+    exchanged = (measuring[0], measuring[2], measuring[1], *measuring[3:])
+    assert command(*exchanged, "--quiet") == 1
+    assert "000.png: left and right are exchanged" in one_line(capfd.readouterr().err)
     picture = cv2.imread(str(tmp_path / "found" / "00000.png"))
     assert picture.shape == (1536, 4096, 3)
 
