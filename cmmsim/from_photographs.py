@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
+from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.files.rig_and_bodies import rig_from_file
+from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.loading import load_sensor
 from cmmsim.measuring.taught import Taught
 from cmmsim.photographs.measuring import MeasuredPair, measure_pairs
@@ -12,9 +17,26 @@ from cmmsim.photographs.pairs import Format, Photographs, Source
 from cmmsim.photographs.taught_file import read_taught
 from cmmsim.photographs.teaching import PhotographedTeaching
 from cmmsim.sensor import Sensor
+from cmmsim.uncertainty.known_rig import KnownRig
 
 # Photographs are not drawn. This renderer needs no OpenGL, and its images have exact centres.
 RENDERER = "analytic"
+
+
+def sensor_for(name: str | Path) -> Sensor:
+    """Return the sensor of a file, which knows its cameras with the covariance in the file.
+
+    Raises SensorFileError for a covariance that is not valid.
+    """
+    file = read_sensor_file(name)
+    if file.rig.covariance is None:
+        return Sensor(file, renderer=RENDERER)
+    rig = rig_from_file(file.rig)[0]
+    try:
+        known = KnownRig(rig, np.array(file.rig.covariance.matrix))
+    except CmmError as error:
+        raise SensorFileError(f"sensor file {name}: rig.covariance.matrix: {error}") from error
+    return Sensor(file, renderer=RENDERER, known=known)
 
 
 def photographs_for(
@@ -36,7 +58,8 @@ def teach(
 
     The cameras and the base stand still, and the platform moves from pair to pair. Stickers need no
     labels: those with the same pixels in most pairs belong to the base, and those that move
-    together to the platform. The sensor file names them by rough places.
+    together to the platform. The sensor file names them by rough places. If it states the
+    covariance of its cameras, as that of `cmmsim calibrate` does, they are adjusted within it.
 
     Parameters
     ----------
@@ -71,7 +94,7 @@ def teach(
     ...     print(error)
     no folder no/left; give one folder of left and one of right images
     """
-    known = load_sensor(sensor, renderer=RENDERER)
+    known = sensor_for(sensor)
     return known.teach_from(photographs_for(known, left, right, colour), advance)
 
 

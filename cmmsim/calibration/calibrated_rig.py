@@ -22,7 +22,7 @@ from cmmsim.geometry.pose import Array, skew, transform_to_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.uncertainty.known_rig import KnownRig
 
-TABLES = ("rig.left", "rig.right", "rig.right_from_left")
+TABLES = ("rig.left", "rig.right", "rig.right_from_left", "rig.covariance")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
 # Largest ratio of the two baselines of the calibration and the sensor file without a warning.
@@ -112,7 +112,7 @@ def _inverse_left_jacobian(vector: Array) -> Array:
 
 
 def rig_tables(found: Calibration) -> str:
-    """Return the tables [rig.left], [rig.right] and [rig.right_from_left] of a sensor file."""
+    """Return the tables of a sensor file with the calibrated cameras and their covariance."""
     state = found.adjustment.state
     lines = []
     for side, values in zip(SIDES, state.intrinsics, strict=True):
@@ -127,6 +127,11 @@ def rig_tables(found: Calibration) -> str:
         "[rig.right_from_left]",
         f"translation = {found.rig.right_from_left[:3, 3].tolist()}  # m",
         f"rotation_vector = {found.rotation_vector.tolist()}  # rad",
+        "",
+        "[rig.covariance]",
+        "matrix = [",
+        *(f"    {row.tolist()}," for row in found.covariance),
+        "]",
     ]
     return "\n".join(lines) + "\n"
 

@@ -164,8 +164,8 @@ class Taught:
 
 def setup_of(file: SensorFile) -> str:
     """Return the entries of a sensor file that teaching depends on, as JSON with sorted keys."""
-    # The position already accounts for the distance.
-    rig = file.rig.model_dump(exclude={"distance"})
+    # The position already accounts for the distance, and the covariance changes no true frame.
+    rig = file.rig.model_dump(exclude={"distance", "covariance"})
     bodies = {
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")
     }

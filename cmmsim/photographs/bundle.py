@@ -193,7 +193,10 @@ def _step(
     matrix[empty, empty] = 1.0
     gauge = _gauge(seen, state, len(matrix))
     matrix += np.diag(matrix)[:count].mean() * gauge @ gauge.T
-    covariance = np.linalg.inv(matrix)
+    # Parameters differ by many orders of magnitude. A unit diagonal avoids a loss of digits.
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    unit = np.linalg.inv(scale[:, None] * matrix * scale)
+    covariance = scale[:, None] * (0.5 * (unit + unit.T)) * scale
     change = covariance @ right
     by_pair = np.array([alone - mixed @ change for mixed, alone in poses])
     rig = np.zeros(RIG)

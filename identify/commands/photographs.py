@@ -55,7 +55,8 @@ def teach(
     an image of each at the same time. Files of the two folders are paired in lexicographic order of
     their names. The stickers need no labels: those that stand belong to the base, and those that
     move together to the platform. The sensor file names them by rough places, which may be off by
-    some millimetres, and its planes define the frames.
+    some millimetres, and its planes define the frames. If it states the covariance of its cameras,
+    as the file of cmmsim calibrate does, the cameras are adjusted within it.
 
     Reads both folders or videos, and the sensor file. Images are grey, and have the size and the
     bit depth of the sensor file.
@@ -68,12 +69,11 @@ def teach(
       cmmsim teach photos/left photos/right --sensor mine.toml --out teaching
       cmmsim teach left.avi right.avi --sensor mine.toml --colour green
     """
-    from cmmsim.from_photographs import RENDERER, photographs_for
-    from cmmsim.loading import load_sensor
+    from cmmsim.from_photographs import photographs_for, sensor_for
     from identify.verification.photograph_figures import teaching_residuals
 
     folder = context.with_resource(new_run_folder(out)).path
-    known = load_sensor(sensor, renderer=RENDERER)
+    known = sensor_for(sensor)
     pairs = photographs_for(known, left, right, colour)
     with terminal_progress(quiet, "pairs/s").stage("find stickers", len(pairs)) as advance:
         found = known.teach_from(pairs, advance)

@@ -7,11 +7,15 @@ import pytest
 
 import cmmsim
 from cmmsim.detection.cramer_rao import cramer_rao_bound
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.from_photographs import sensor_for
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import apply, invert, pose_to_transform, rotation_log
 from cmmsim.photographs.pairs import numbered
+from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
 from tests.cmmsim.photographed import spread_poses
 from tests.cmmsim.plain import rigid_start
+from tests.cmmsim.sensors import refused
 
 PAIRS = 24
 
@@ -166,3 +170,61 @@ def test_a_sensor_measures_with_what_it_was_taught_from_frames(tmp_path):
         measured = one.measure(one.home)
         error = measured.pose - one.home
         assert error @ np.linalg.solve(measured.single_covariance, error) < 22.5
+
+
+@pytest.mark.slow
+def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_stated():
+    """20 rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
+    normalised errors, with deviations of 0.05, 0.07 and 0.13."""
+    truth, true_rig = statistical().truth, statistical().rig
+    poses, near = spread_poses(PAIRS, 7), spread_poses(60, 8, 0.009, 0.035)
+    file, free = read_sensor_file("ctrack780"), np.flatnonzero(np.diag(PHOTOGRAPHED))
+    std = np.sqrt(np.diag(PHOTOGRAPHED)[free])
+    taught, rigs, common, gains = [], [], [], []
+    for k in range(20):
+        known = KnownRig.drawn(true_rig, PHOTOGRAPHED, np.random.default_rng([3, k]))
+        sensor = cmmsim.Sensor(file, seed=50 + k, renderer="statistical", known=known)
+        found = sensor.teach_from(numbered((sensor.look(pose) for pose in poses), 60.0))
+        errors = np.concatenate(
+            [
+                base_error(found.taught, truth),
+                (found.taught.platform_places - truth.platform_places).ravel(),
+            ]
+        )
+        taught.append(np.divide(*normalised(errors, found.frames.covariance[:60, :60])))
+        errors = (found.taught.known.rig.parameters - true_rig.parameters)[free] / std
+        spread = found.taught.known.covariance[np.ix_(free, free)] / np.outer(std, std)
+        rigs.append(np.divide(*normalised(errors, spread)))
+        gains.append(np.sqrt(np.diag(spread)))
+        errors, shared = pose_errors(found.taught, near)
+        mean = errors.mean(axis=0)
+        common.append(mean @ np.linalg.solve(shared + np.cov(errors.T) / 60, mean) / 6.0)
+    assert np.mean(taught) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(rigs) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(common) == pytest.approx(1.0, abs=0.4)
+    assert np.max(gains) < 1.0
+    assert np.mean(gains) < 0.7
+
+
+def test_a_sensor_file_states_the_covariance_of_its_cameras(tmp_path):
+    path = tmp_path / "mine.toml"
+    rows = "".join(f"{row},\n" for row in PHOTOGRAPHED.tolist())
+    text = f'name = "mine"\nbased_on = "ctrack780"\n[rig.covariance]\nmatrix = [\n{rows}]\n'
+    path.write_text(text)
+    sensor = statistical(seed=3)
+    images = [sensor.look(pose) for pose in spread_poses(6, 3)]
+    found = sensor_for(path).teach_from(numbered(images, 60.0))
+    assert np.all(np.diag(found.taught.known.covariance) <= np.diag(PHOTOGRAPHED))
+    found.save(tmp_path / "taught.json")
+    read = cmmsim.read_taught(tmp_path / "taught.json")
+    np.testing.assert_allclose(
+        read.known.rig.parameters, found.taught.known.rig.parameters, rtol=1e-12, atol=1e-15
+    )
+    again = cmmsim.load_sensor(path, renderer="statistical", taught=read)
+    assert again.measure(again.home).ok
+    path.write_text(text.replace("matrix = [\n[1.0", "matrix = [\n[-1.0"))
+    refused(
+        lambda: sensor_for(path),
+        "mine.toml: rig.covariance.matrix: .*left.fx_px is negative",
+        cmmsim.SensorFileError,
+    )
