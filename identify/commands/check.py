@@ -1,7 +1,8 @@
-"""Command ``check``: checks a robot file before anything is built or run."""
+"""Command ``check``: checks a robot, or the telemetry of a run, before anything is identified."""
 
+from pathlib import Path
 from textwrap import shorten
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -9,14 +10,17 @@ from identify.commands.options import (
     JsonFile,
     Plugins,
     Quiet,
-    RobotArgument,
     Settings,
     chosen_scenario,
     completion,
+    named,
     tell,
 )
 from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
+
+if TYPE_CHECKING:
+    from identify.verification.robot_check import Finding
 
 LONGEST = 160
 """Largest number of characters of a finding in the error message.
@@ -24,16 +28,28 @@ LONGEST = 160
 The table and the JSON hold the whole text.
 """
 
+OF_ROBOTS = ("--scenario", "--parameters", "--set")
+"""Options for robots. A record states its own scenario."""
+
 
 def check(
-    robot: RobotArgument,
-    scenario: Annotated[
+    robot: Annotated[
         str,
+        named(
+            "robot",
+            "Built-in robot, or the path of a robot file; or a record of your own: a netCDF file, "
+            "or a log with its TOML file.",
+            metavar="ROBOT|RECORD",
+        ),
+    ],
+    scenario: Annotated[
+        str | None,
         typer.Option(
             help="Scenario that gives the servo, timing and limits.",
+            show_default="paper",
             autocompletion=completion("scenario"),
         ),
-    ] = "paper",
+    ] = None,
     parameters: Annotated[
         str | None,
         typer.Option(
@@ -43,28 +59,79 @@ def check(
         ),
     ] = None,
     settings: Settings = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page", metavar="FILE", help="Page about a record.", show_default="RECORD-check.html"
+        ),
+    ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Check the design of a robot, on one page.
+    """Check the design of a robot, or the telemetry of a record, on one page.
 
-    The checks of the mechanism are reach, travel and singularities at home and over the travel,
-    assembly modes, holding torques, identifiable parameters, and physically possible inertias. The
-    checks of the loop are its stability, the largest stable gains and lowest stable frame rate, the
-    bandwidth and damping of its gains, and the gains for the bandwidth and damping that the
-    scenario's [control] requests. The platform in the scenario's sensor file must be the robot's
-    platform. Each finding has its value, its limit, and the leg that it concerns.
+    Robot: the checks of the mechanism are reach, travel and singularities at home and over the
+    travel, assembly modes, holding torques, identifiable parameters, and physically possible
+    inertias. The checks of the loop are its stability, the largest stable gains and lowest stable
+    frame rate, the bandwidth and damping of its gains, and the gains for the bandwidth and damping
+    that the scenario's [control] requests. The platform in the scenario's sensor file must be the
+    robot's platform. Each finding has its value, its limit, and the leg that it concerns.
 
-    Reads a robot file and a scenario. Writes only the JSON: whether all checks pass, and the
-    findings.
+    Record: the checks are rates and jitter of the times, gaps and whether commands changed in them,
+    noise of the poses beside the stated one, jumps and frozen poses, travel and spectrum of the
+    motion, commands at the end of their range, units, axes, directions and zeros that are likely
+    wrong, the clocks of poses and commands, and the groups of parameters that the motion can show.
+
+    Reads a robot file and a scenario, or a record and the TOML file that describes it. Writes the
+    JSON: whether all checks pass, and the findings. For a record it also writes an HTML page with
+    the findings and pictures.
 
     \b
     Examples:
       cmmsim check mine.toml
       cmmsim check ups6 --scenario quick --json findings.json
       cmmsim check ups6 --set control.servo_bandwidth_rad_s=4.0
+      cmmsim check mine.csv
     """
+    from identify.record.own_record import is_record
+
+    path = Path(robot)
+    if is_record(path):
+        given = (scenario, parameters, settings)
+        for option, value in zip(OF_ROBOTS, given, strict=True):
+            if value:
+                raise typer.BadParameter(
+                    f"{robot} is a record, which states its own scenario", param_hint=option
+                )
+        _check_record(path, page or Path(f"{path.stem}-check.html"), json, quiet)
+        return
+    if page is not None:
+        raise typer.BadParameter(f"{robot} is a robot, and has no page", param_hint="--page")
+    _check_robot(robot, scenario or "paper", parameters, settings, json, quiet)
+
+
+def _check_record(path: Path, page: Path, json: Path | None, quiet: bool) -> None:
+    from identify.files.atomic import check_writable, write_text
+    from identify.verification.logged_run import read_logged_run
+    from identify.verification.telemetry_check import check_telemetry
+    from identify.verification.telemetry_page import telemetry_page
+
+    check_writable(page)
+    logged = read_logged_run(path)
+    findings = check_telemetry(logged, terminal_progress(quiet))
+    write_text(page, telemetry_page(logged, findings, path.name))
+    _tell(findings, f"{path.name}, page: {page}", path.name, json, quiet)
+
+
+def _check_robot(
+    robot: str,
+    scenario: str,
+    parameters: str | None,
+    settings: list[str] | None,
+    json: Path | None,
+    quiet: bool,
+) -> None:
     from dynamics import load_robot
     from identify.experiment.law_in_loop import feedback
     from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
@@ -86,6 +153,13 @@ def check(
         sensor_file=given.sensor_file(),
     )
     findings = check_robot(chosen, values, around, terminal_progress(quiet))
+    _tell(findings, f"{chosen.name}, parameters `{name}`", chosen.name, json, quiet)
+
+
+def _tell(
+    findings: "list[Finding]", title: str, about: str, json: Path | None, quiet: bool
+) -> None:
+    """Output findings, and raise VerificationError if any of them fails."""
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (
@@ -97,12 +171,14 @@ def check(
         for finding in findings
     ]
     header = ("ok", "check", "limit", "finding")
-    title = f"{chosen.name}, parameters `{name}`"
-    entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
+    entry: dict[str, Any] = {
+        "ok": not failed,
+        "findings": [finding.entry() for finding in findings],
+    }
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
         lines = [f"{finding.check}: {finding.text}" for finding in failed]
         said = "; ".join(shorten(line, LONGEST, placeholder=" …") for line in lines)
         raise VerificationError(
-            f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}"
+            f"{len(failed)} of {len(findings)} findings about {about} fail: {said}"
         )

@@ -184,14 +184,12 @@ def record(
     from dynamics import load_robot
     from dynamics.files import parse_toml
     from identify.errors import RecordError
-    from identify.record.own_record import (
+    from identify.record.own_record import description_file, is_log, read_own_records
+    from identify.record.record_template import (
         FRAME_RATE_HZ,
         SCHEMA,
-        description_file,
         description_text,
-        is_log,
         proposed,
-        read_own_records,
         table_text,
     )
 

@@ -205,8 +205,9 @@ def identify(
         typer.Option(
             "--record",
             metavar="FILE",
-            help="Identify from a record of your own, netCDF or CSV. Repeat the option for a "
-            "record of the same robot under a known load, if that load fixes the scale.",
+            help="Identify from a record of your own: netCDF, CSV, or a log of Motive, Vicon or "
+            "ROS 2. Repeat the option for a record of the same robot under a known load, if it "
+            "fixes the scale.",
             show_default=False,
         ),
     ] = None,
@@ -220,7 +221,8 @@ def identify(
     Reads scenario.toml, trajectories.json and experiment.nc from the folder, or a record of your
     own. A record of your own is a netCDF file like experiment.nc, or a CSV table with a TOML file
     of the same name beside it that describes the experiment. cmmsim new record mine.csv writes a
-    template of both, with comments that explain the columns and these rules:
+    template of both, with comments that explain the columns and the rules below. Its option --from
+    describes a log of another program: an export of Motive or Vicon, or a bag of ROS 2 or MCAP.
 
     A record begins at rest: before its first row the robot has stood still at the first reference
     pose. It has one row per frame, without gaps. A lost frame has a row with empty measured

@@ -58,6 +58,8 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
     >>> round(found.seconds, 4)
     0.05
     """
+    if min(len(time), len(command_time)) < FEWEST:
+        return MotionLag(0.0, 0.0)
     duration = min(np.ptp(time), np.ptp(command_time)) / 2
     step = max(float(np.median(np.diff(time))) / 2, FINEST_S)
     for reach in (min(CLOSE_S, duration), duration):

@@ -5,14 +5,11 @@ motion capture or a bag of ROS 2, and has a TOML file of the same name beside it
 scenario; only its sections robot, timing, servo, model, filter, identification and payload are
 used. Its additional table `[record]` holds further measurements, and `[columns]` says what the
 columns of a log are called.
-
-The template for a user's record is a table with two example rows, and its TOML file.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import wrap
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,12 +22,11 @@ from dynamics.files import is_file, is_name, parse_toml, read_text
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.columns import Columns
-from identify.record.csv_record import RULES, columns_of, read_table
+from identify.record.csv_record import read_table
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
-from identify.record.readers.mapped import open_log, read_mapped
-from identify.record.readers.proposal import Proposal, propose
+from identify.record.readers.mapped import read_mapped
 from identify.record.recording import build_record, read
 from identify.record.suspicions import check_plausible
 from identify.record.telemetry import ReferenceLog, Telemetry
@@ -39,7 +35,7 @@ from identify.scenario.payload import Payload
 from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.section import Section, quantity
 from identify.scenario.sections import Excitation, Identification, Validation
-from identify.scenario.settings_file import one_line, starting_toml
+from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"
 """Name of the table of that file with further measurements."""
@@ -100,6 +96,16 @@ def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
 def is_log(path: Path) -> bool:
     """Return whether a path is a log or the description of one, by its name or as a folder."""
     return path.suffix.lower() in (*TABLES, ".toml") or is_bag(path)
+
+
+def is_record(path: Path) -> bool:
+    """Return whether a path is a record: netCDF, a log, or a description with a table of one."""
+    if path.suffix.lower() == ".toml":
+        if not is_file(path):
+            return False
+        content = parse_toml(read_text(path, str(path), RecordError), str(path), RecordError)
+        return DESCRIPTION in content or COLUMNS in content
+    return path.suffix.lower() == ".nc" or is_log(path)
 
 
 def description_file(path: Path) -> Path:
@@ -201,12 +207,12 @@ def read_description(path: Path, log: Path) -> Description:
     columns = None if named is None else _section(Columns, named, f"{path}: [{COLUMNS}]")
     # A scenario needs a name, but this file does not have to state it.
     name = path.stem if is_name(path.stem) else DESCRIPTION
-    whole = _with_whole_frames({"name": name} | content)
+    whole = with_whole_frames({"name": name} | content)
     scenario = SCENARIOS.from_dict(whole, str(path), path.parent)
     return Description(scenario, measured, columns)
 
 
-def _with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
+def with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario whose planned runs have whole frames at the rate of a record.
 
     A record does not read these runs, and its rate can be any.
@@ -293,92 +299,3 @@ def _state_anchor(
 def _state_payload(record: xr.Dataset, payload: Payload) -> None:
     """Store with a record the load on the platform and its standard deviations."""
     store_load(record, np.array(payload.figures), np.array(payload.figures_std))
-
-
-SCHEMA = Path(__file__).parent / "record.schema.json"
-
-SHOWN_ROWS = 2
-WIDTH = 96
-SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
-"""Sections of a scenario that describe the recorded experiment or that an identification reads."""
-
-# Example values in the template, for the user to replace.
-FRAME_RATE_HZ = 60.0
-POSITION_STD_M = 5e-6
-ORIENTATION_STD_RAD = 2e-5
-
-
-def table_text(robot: Robot) -> str:
-    """Return a table with comments, the columns of a robot, and rows at rest at the home pose."""
-    groups = columns_of(robot)
-    comments = [*wrap(RULES, WIDTH), ""]
-    for group in groups.values():
-        shown = ", ".join(
-            group.names if len(group.names) <= 6 else (*group.names[:3], "...", group.names[-1])
-        )
-        comments += wrap(f"{'Optional: ' if group.optional else ''}{group.meaning}: {shown}", WIDTH)
-    comments += [
-        "",
-        f"Replace the {SHOWN_ROWS} rows, in which {robot.name} stands still at its home pose.",
-    ]
-    written = {name: groups[name] for name in ("time", "reference", "measured", "command")}
-    pose = [f"{value:.9g}" for value in robot.home_pose]
-    command = [f"{value:.9g}" for value in robot.inverse_kinematics(robot.home_pose)]
-    rows = [[f"{row / FRAME_RATE_HZ:.6f}", *pose, *pose, *command] for row in range(SHOWN_ROWS)]
-    header = [column for group in written.values() for column in group.names]
-    lines = [f"# {line}".rstrip() for line in comments] + [
-        ",".join(cells) for cells in [header, *rows]
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def proposed(
-    logs: Sequence[Path], record: Path, robot: Robot, body: str | None, commands: str | None
-) -> Proposal:
-    """Propose the columns of logs for the description beside the path of a record.
-
-    Raises the RecordError of `propose`.
-    """
-    files = {_relative(log, record.parent): open_log(log) for log in logs}
-    return propose(files, robot, body, commands)
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Return a path relative to a folder if it lies in it, and else its absolute path."""
-    whole, inside = path.resolve(), folder.resolve()
-    return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)
-
-
-def description_text(
-    robot: Robot, name_or_path: str, table: str, rate_hz: float = FRAME_RATE_HZ
-) -> str:
-    """Return the text of the TOML file for a table: robot, timing, servo and scale.
-
-    The user replaces the example values. `rate_hz` is the frame rate.
-    """
-    mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
-    made_with = Scenario.model_validate(
-        _with_whole_frames(
-            {
-                "name": "record",
-                "robot": name_or_path,
-                "timing": {"frame_rate_hz": rate_hz, "latency_s": 0.0, "hold": "zero"},
-                "servo": {
-                    name: getattr(Scenario.model_fields["servo"].default, name)
-                    for name in ("kp", "kd", "ki")
-                },
-                "identification": {"scale_anchor": "platform_mass", "anchor_std": 0.005},
-            }
-        )
-    )
-    measured = Measured(
-        anchor_value=mass, position_std_m=POSITION_STD_M, orientation_std_rad=ORIENTATION_STD_RAD
-    )
-    head = [
-        f"# Description of the record {table}. Entries that are commented out show the default "
-        "value. Replace the values of",
-        "# the other entries by the values of your machine and its controller.",
-    ]
-    own = starting_toml(measured).rstrip("\n").split("\n")
-    sections = starting_toml(made_with, SECTIONS)
-    return "\n".join([*head, sections, f"[{DESCRIPTION}]", *own]) + "\n"

@@ -20,7 +20,7 @@ from identify.errors import RecordError
 from identify.record.motion_lag import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 
-TRIED = 400
+TRIED = 200
 """Number of poses with which other units and axes are tried."""
 
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
@@ -112,11 +112,14 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[Suspicion]:
         return
     alike = np.diagonal(_correlations(held, coordinates))
     order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates)
-    if np.abs(alike).min() > FITS:
-        yield from _of_joints(held, coordinates, alike, robot, order)
-        return
-    hint = order or _fitting(telemetry, robot, alike.mean())
-    if hint:
+    fits = np.flatnonzero(np.abs(alike) > FITS)
+    hint = ""
+    if len(fits) < len(alike):
+        hint = order or _fitting(telemetry, robot, alike.mean())
+    if not hint:
+        # A joint whose drive does not follow says nothing about its own zero.
+        yield from _of_joints(fits, held, coordinates, alike, robot, order)
+    else:
         yield Suspicion(
             "the measured motion is not that of the commands (correlations of the joints from "
             f"{alike.min():.2f} to {alike.max():.2f}); {hint}"
@@ -135,15 +138,22 @@ def _other_order(telemetry: Telemetry, time: Array, coordinates: Array) -> str:
 
 
 def _of_joints(
-    held: Array, coordinates: Array, alike: Array, robot: Robot, order: str
+    joints: NDArray[np.intp],
+    held: Array,
+    coordinates: Array,
+    alike: Array,
+    robot: Robot,
+    order: str,
 ) -> Iterator[Suspicion]:
-    """Yield wrong directions, units and zeros of joints that move as their commands do.
+    """Yield wrong directions, units and zeros of joints (k,) that move as their commands do.
 
     `order` says in which other order the commands would fit.
     """
+    if not len(joints):
+        return
     prismatic = robot.layout.prismatic
     unit = robot.layout.joint_unit
-    against = np.flatnonzero(alike < OPPOSES)
+    against = joints[alike[joints] < OPPOSES]
     if len(against):
         listed = ", ".join(str(joint + 1) for joint in against)
         yield Suspicion(
@@ -152,7 +162,8 @@ def _of_joints(
             + (f"; or {order}" if order else "")
         )
         return
-    slope = float(np.median(alike * coordinates.std(axis=0) / held.std(axis=0)))
+    slopes = alike * coordinates.std(axis=0) / held.std(axis=0)
+    slope = float(np.median(slopes[joints]))
     for factor, said in (LENGTHS_TRIED if prismatic else ANGLES_TRIED).items():
         if said and abs(np.log(slope / factor)) < np.log(SCALE):
             yield Suspicion(
@@ -160,7 +171,8 @@ def _of_joints(
                 f"are {said.partition(' ')[2]} (columns.command.unit)"
             )
             return
-    for joint, gap in enumerate(np.median(coordinates - held, axis=0)):
+    gaps = np.median(coordinates - held, axis=0)
+    for joint, gap in zip(joints, gaps[joints], strict=True):
         turns = 0 if prismatic else round(gap / (2 * np.pi))
         lies = (
             f"the commands of joint {joint + 1} lie {-gap:.4g} {unit} from the joint coordinates "

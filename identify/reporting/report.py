@@ -87,33 +87,57 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
 
     ``drawings`` holds the pictures as HTML elements, by their names.
     """
+    said = verdict(data.result, data.cameras_consistent)
+    goals = check_goals(data.result)
+    return (
+        page_environment()
+        .get_template("report.html.j2")
+        .render(
+            title=f"Identification of {data.robot}",
+            subtitle=_subtitle(data.result),
+            verdict=said,
+            numbers=key_numbers(data.result),
+            goals=goals_table(data.result),
+            missed=sum(not goal.passed for goal in goals),
+            goal_count=len(goals),
+            warnings=[
+                _sentence(text) for text in data.result["identification"].get("warnings", [])
+            ],
+            first_look=[name for name in FIRST_LOOK if name in shown],
+            sections=[build(data) for build in SECTIONS],
+            pictures=shown,
+            drawings={
+                n: text if shown[n].as_image else _coloured(text) for n, text in drawings.items()
+            },
+            paper=paper,
+        )
+    )
+
+
+def page_environment() -> jinja2.Environment:
+    """Return the environment in which the templates of pages are rendered."""
     # The texts come from files, and can have characters with a meaning in HTML.
-    environment = jinja2.Environment(
+    return jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    said = verdict(data.result, data.cameras_consistent)
-    goals = check_goals(data.result)
-    return environment.get_template("report.html.j2").render(
-        title=f"Identification of {data.robot}",
-        subtitle=_subtitle(data.result),
-        verdict=said,
-        numbers=key_numbers(data.result),
-        goals=goals_table(data.result),
-        missed=sum(not goal.passed for goal in goals),
-        goal_count=len(goals),
-        warnings=[_sentence(text) for text in data.result["identification"].get("warnings", [])],
-        first_look=[name for name in FIRST_LOOK if name in shown],
-        sections=[build(data) for build in SECTIONS],
-        pictures=shown,
-        drawings={
-            n: text if shown[n].as_image else _coloured(text) for n, text in drawings.items()
-        },
-        paper=paper,
-    )
+
+
+def picture_elements(shown: Mapping[str, Picture]) -> dict[str, str]:
+    """Draw pictures, and return them as HTML elements by their names."""
+    elements = {}
+    for name, picture in shown.items():
+        figure = drawn(picture.draw)
+        # An SVG with many strokes would be larger than the image, and slow to display.
+        elements[name] = (
+            image_element(figure_bytes(figure, ".png"))
+            if picture.as_image
+            else _coloured(svg_text(figure, name))
+        )
+    return elements
 
 
 def image_element(png: bytes) -> str:

@@ -1,0 +1,213 @@
+"""Telemetry of a run with what is derived from it before anything is identified.
+
+The guessed model runs under the logged commands, from rest at the first measured pose. It is the
+initial guess, with ordinary friction where that has none: a robot without friction would swing at
+each command.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from dynamics import closed_loop, load_robot
+from dynamics.closed_loop import ClosedLoopRun, Reference
+from dynamics.errors import DynamicsError
+from identify.arrays import Array
+from identify.estimation.base_parameters import structure
+from identify.estimation.identifiability import group_rows, identifiability
+from identify.estimation.prior import (
+    MEASURING,
+    default_std,
+    friction,
+    measured_parameter,
+    model_guess,
+)
+from identify.model.from_record import ModelSide, model_side
+from identify.record.conditions import COMMAND_TIME
+from identify.record.motion_lag import MotionLag
+from identify.record.own_record import (
+    description_file,
+    is_log,
+    read_description,
+    read_telemetry,
+)
+from identify.record.pose_noise import GAP, PoseNoise, Spectrum, pose_noise, spectrum
+from identify.record.provenance import recorded_scenario
+from identify.record.recording import poses, read, recorded_reference
+from identify.record.servo_delay import ServoDelay, servo_delay
+from identify.record.suspicions import lag_of
+from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
+from identify.scenario.sections import Identification
+
+ONCE = 1.5
+"""Largest ratio of the rows of commands to those of poses, if each command is logged once."""
+
+MOST_FRAMES = 10_000
+"""Largest number of frames for which the model runs."""
+
+
+@dataclass(frozen=True)
+class LoggedRun:
+    """Telemetry with what an experimenter states about it.
+
+    Attributes
+    ----------
+    telemetry : Telemetry
+        Poses and commands.
+    side : ModelSide
+        Robot and loop as the estimator knows them.
+    settings : Identification
+        Settings of the identification: its prior and its scale anchor.
+    stated : ndarray, shape (6,), or None
+        Stated standard deviations of a measured pose, m and rad.
+    """
+
+    telemetry: Telemetry
+    side: ModelSide
+    settings: Identification
+    stated: Array | None
+
+    @property
+    def time(self) -> Array:
+        """Times (K,) of the measured poses, s."""
+        return self.telemetry.poses.time[self.telemetry.poses.ok]
+
+    @property
+    def poses(self) -> Array:
+        """Measured poses (K, 6), m and rad, without those that were lost."""
+        return self.telemetry.poses.pose[self.telemetry.poses.ok]
+
+    @cached_property
+    def noise(self) -> PoseNoise:
+        """Noise and jumps of the poses."""
+        return pose_noise(self.time, self.poses)
+
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Spectrum of the poses."""
+        return spectrum(self.time, self.poses)
+
+    @cached_property
+    def lag(self) -> MotionLag:
+        """Lag of the measured motion behind the commands."""
+        return lag_of(self.telemetry, self.side.robot)
+
+    @cached_property
+    def delay(self) -> ServoDelay | None:
+        """Delay from a pose to its command, or None if no servo was on these poses."""
+        return servo_delay(self.telemetry, self.side.robot)
+
+    @property
+    def repeats_commands(self) -> bool:
+        """Whether commands are logged more often than poses, each in several rows."""
+        return len(self.telemetry.commands.time) > ONCE * len(self.telemetry.poses.time)
+
+    @cached_property
+    def gaps(self) -> Array:
+        """Times (G, 2) between which no pose was measured, though one was due, s."""
+        between = np.diff(self.time)
+        wide = between > GAP * np.median(np.diff(self.telemetry.poses.time))
+        return np.stack([self.time[:-1][wide], self.time[1:][wide]], axis=1)
+
+    def commands_at(self, time: Array) -> Array:
+        """Return the commands (K, n) that were logged last at times (K,)."""
+        commands = self.telemetry.commands
+        places = np.searchsorted(commands.time, time, side="right") - 1
+        return np.asarray(commands.command[np.maximum(places, 0)])
+
+    @cached_property
+    def grid(self) -> Array:
+        """Times (K,) of even frames over the poses, s."""
+        timing = self.side.timing
+        count = int(np.ptp(self.time) * timing.frame_rate_hz) + 1
+        steps = np.arange(max(min(count, MOST_FRAMES), 2))
+        return np.asarray(self.time[0] + steps * timing.frame_period_s)
+
+    @cached_property
+    def model_run(self) -> ClosedLoopRun | DynamicsError:
+        """Run of the guessed model under the logged commands, or why it fails."""
+        robot = self.side.robot
+        first = robot.pose(robot.coordinates(self.poses[0]))
+        reference = Reference(np.tile(first, (len(self.grid), 1)), np.zeros((len(self.grid), 6)))
+        guess = model_guess(robot, self.side.model, self.settings)
+        sizes = identifiability(guess, robot).sizes
+        bare = friction(robot.layout) & (guess.values == 0)
+        ordinary = np.where(bare, sizes, guess.values)
+        try:
+            return closed_loop.differentiate_commands(
+                robot, ordinary, reference, self.side.settings, self.commands_at(self.grid)
+            )
+        except DynamicsError as error:
+            return error
+
+    def commands_change(self, begin: float, end: float) -> bool:
+        """Return whether commands changed between two times, apart from those of the last pose."""
+        commands = self.telemetry.commands
+        period = self.side.timing.frame_period_s
+        inside = (commands.time > begin + period / 2) & (commands.time < end - period / 2)
+        held = commands.command[inside]
+        return len(held) > 1 and bool(np.ptp(held, axis=0).any())
+
+    def can_show(self, run: ClosedLoopRun) -> NDArray[np.bool_]:
+        """Return which groups (rank,) the poses can identify, as an identification judges them."""
+        robot = self.side.robot
+        guess = model_guess(robot, self.side.model, self.settings)
+        std = self.noise.std if self.stated is None else self.stated
+        assert run.pose_sensitivity is not None
+        # Only frames near a measured pose count.
+        near = np.searchsorted(self.grid, self.time).clip(0, len(run.pose_sensitivity) - 1)
+        rows = run.pose_sensitivity[np.unique(near)] / std[:, None]
+        scaled = rows.reshape(-1, len(guess.std)) * guess.std
+        information = scaled.T @ scaled + np.eye(len(guess.std))
+        anchor = self.settings.scale_anchor
+        if anchor in MEASURING:
+            place = robot.layout.names.index(measured_parameter(anchor, robot.layout))
+            known = self.settings.anchor_std or default_std(anchor, robot.layout)
+            information[place, place] += (guess.std[place] / known) ** 2
+        covariance = np.linalg.inv(information) * np.outer(guess.std, guess.std)
+        rows_of_groups = group_rows(structure(robot), robot.layout)
+        return identifiability(guess, robot).judge(rows_of_groups, covariance)
+
+
+def read_logged_run(path: Path) -> LoggedRun:
+    """Read a record, and what its description or its scenario states about it.
+
+    Raises the errors of `read_own_records`, except those of a motion or a clock that is not as it
+    should be.
+    """
+    if is_log(path):
+        about = read_description(description_file(path), path)
+        scenario = about.scenario
+        robot = load_robot(scenario.robot)
+        telemetry = read_telemetry(path, about, robot)
+        measured = about.measured
+        stds = [measured.position_std_m, measured.orientation_std_rad]
+        stated = None if None in stds else np.repeat(np.array(stds, dtype=float), 3)
+    else:
+        record = read(path)
+        scenario = recorded_scenario(record)
+        robot = load_robot(scenario.robot)
+        telemetry = recorded_telemetry(record, str(path))
+        stated = None
+    if telemetry.poses.covariance is not None:
+        covariance = telemetry.poses.covariance[telemetry.poses.ok]
+        stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
+    return LoggedRun(telemetry, model_side(robot, scenario), scenario.identification, stated)
+
+
+def recorded_telemetry(record: xr.Dataset, source: str) -> Telemetry:
+    """Return the logs of a record. `source` names it in messages."""
+    time = np.asarray(record["time"].values, dtype=float)
+    rows = Rows(source, range(len(time)), "frame")
+    reference = recorded_reference(record)
+    ok = record["measured_ok"].values.astype(bool)
+    written = record[COMMAND_TIME].values if COMMAND_TIME in record else None
+    return Telemetry(
+        PoseLog(time, poses(record, "measured"), ok, rows, record["measured_covariance"].values),
+        CommandLog(time, np.asarray(record["command"].values, dtype=float), rows, written),
+        ReferenceLog(time, reference.poses, rows, reference.rates),
+    )

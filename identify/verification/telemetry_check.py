@@ -1,0 +1,370 @@
+"""Check of the telemetry of a run before anything is identified from it.
+
+The findings concern the times, gaps and noise of the poses, the size and the frequencies of the
+motion, the clocks, and whether the motion can show the parameters. Two of them need the
+guessed model, which runs under the logged commands.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynamics.errors import DynamicsError
+from identify.arrays import Array
+from identify.estimation.base_parameters import structure
+from identify.files.dataset import POSE
+from identify.progress import Progress, SilentProgress
+from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
+from identify.record.pose_noise import JUMPS
+from identify.record.suspicions import joint_motion, suspicions
+from identify.verification.logged_run import LoggedRun
+from identify.verification.robot_check import Finding
+
+RATE = 0.01
+"""Largest relative difference of a frame rate from the stated one."""
+
+NOISE = 2.0
+"""Largest factor between the noise of the poses and the stated one."""
+
+FROZEN = 0.01
+"""Largest share of poses that are equal to the pose before in all digits."""
+
+JUMPED = 0.1
+"""Largest share of poses that jump."""
+
+FRAMES_A_PERIOD = 6.0
+"""Smallest number of frames in a period of the highest frequency of a motion."""
+
+SATURATED = 0.01
+"""Largest share of commands that stay at the end of their range while the robot moves."""
+
+STUCK = 3
+"""Smallest number of equal commands in a row that count as staying."""
+
+FOLLOWS = 0.8
+"""Smallest mean correlation of the joints with their commands."""
+
+BEFORE_S = 0.1
+"""Largest time, s, by which a motion can seem to be before its commands."""
+
+CLOCK = 0.05
+"""Largest offset of the clocks, in frames."""
+
+SHOWN_GROUPS = 0.5
+"""Smallest share of the groups of parameters that the motion can show."""
+
+LISTED = 5
+"""Largest number of names or times in a finding."""
+
+
+def check_telemetry(logged: LoggedRun, progress: Progress | None = None) -> list[Finding]:
+    """Return all findings about the telemetry of a run."""
+    questions: list[Callable[[LoggedRun], Iterator[Finding]]] = [
+        _rates,
+        _gaps,
+        _noise,
+        _frozen,
+        _motion,
+        _saturation,
+        _plausible,
+        _clocks,
+        _parameters,
+    ]
+    found = []
+    with (progress or SilentProgress()).stage("check", len(questions)) as advance:
+        for question in questions:
+            found += list(question(logged))
+            advance()
+    return found
+
+
+def _rates(logged: LoggedRun) -> Iterator[Finding]:
+    wanted = logged.side.timing.frame_rate_hz
+    time = logged.telemetry.poses.time
+    steps = np.diff(time)
+    rate = 1 / float(np.median(steps))
+    yield Finding(
+        "pose rate",
+        abs(rate / wanted - 1) <= RATE,
+        rate,
+        wanted,
+        "Hz",
+        None,
+        f"{len(time)} rows of poses in {np.ptp(time):.4g} s, with a median interval of "
+        f"{1e3 * float(np.median(steps)):.6g} ms; timing.frame_rate_hz is "
+        f"{wanted:g}",
+    )
+    # Rows that are lost do not count as jitter.
+    even = np.round(steps * rate)
+    off = np.abs(steps - even / rate)
+    text = (
+        f"times between rows differ from whole frames by {1e3 * float(off.max()):.3g} ms at "
+        f"most, {1e3 * _rms(off):.3g} ms RMS"
+    )
+    for name, digits in (("milliseconds", 3), ("microseconds", 6)):
+        if np.allclose(time, np.round(time, digits), rtol=0, atol=1e-9):
+            text += f"; times are rounded to {name}"
+            break
+    yield Finding("pose jitter", True, float(off.max()), None, "s", None, text)
+    commands = np.diff(logged.telemetry.commands.time)
+    rows = len(commands) + 1
+    yield Finding(
+        "command rate",
+        True,
+        1 / float(np.median(commands)),
+        None,
+        "Hz",
+        None,
+        f"{rows} rows of commands in {commands.sum():.4g} s",
+    )
+
+
+def _gaps(logged: LoggedRun) -> Iterator[Finding]:
+    poses = logged.telemetry.poses
+    due = round(np.ptp(poses.time) / float(np.median(np.diff(poses.time)))) + 1
+    lost = max(due - int(poses.ok.sum()), 0)
+    yield Finding(
+        "lost poses",
+        lost <= MINIMUM_GOOD_SHARE * due,
+        lost / due,
+        MINIMUM_GOOD_SHARE,
+        "1",
+        None,
+        f"{lost} of {due} poses were lost, in {len(logged.gaps)} gaps",
+    )
+    if not len(logged.gaps):
+        return
+    widths = np.diff(logged.gaps, axis=1)[:, 0]
+    longest = int(np.argmax(widths))
+    begin, end = logged.gaps[longest]
+    changed = sum(logged.commands_change(*gap) for gap in logged.gaps)
+    yield Finding(
+        "longest gap",
+        bool(widths[longest] <= LONG_GAP_S),
+        float(widths[longest]),
+        LONG_GAP_S,
+        "s",
+        None,
+        f"no pose from {begin:.4f} to {end:.4f} s; commands changed in {changed} of "
+        f"{len(widths)} gaps"
+        + (", in which the servo had poses that the log has not" if changed else ""),
+    )
+
+
+def _noise(logged: LoggedRun) -> Iterator[Finding]:
+    for kind, unit, scale, word in (
+        (slice(0, 3), "m", 1e6, "um"),
+        (slice(3, 6), "rad", 1e6, "urad"),
+    ):
+        name = "position noise" if unit == "m" else "orientation noise"
+        own = logged.noise.std[kind]
+        value = _rms(own)
+        listed = ", ".join(
+            f"{axis} {scale * one:.3g}" for axis, one in zip(POSE[kind], own, strict=True)
+        )
+        text = f"standard deviations of the poses beside their neighbours: {listed} {word}"
+        if not np.isfinite(value):
+            text = "no poses are near enough in time to tell their noise"
+            yield Finding(name, False, None, None, unit, None, text)
+            continue
+        stated = (
+            None if logged.stated is None else float(np.sqrt(np.mean(logged.stated[kind] ** 2)))
+        )
+        ok = stated is None or 1 / NOISE <= value / stated <= NOISE
+        if stated is not None:
+            text += f"; stated are {scale * stated:.3g} {word}, {value / stated:.2g} times that"
+        yield Finding(name, ok, value, stated, unit, None, text)
+    jumps = logged.noise.time[logged.noise.jumped]
+    listed = ", ".join(f"{one:.4f}" for one in jumps[:LISTED])
+    more = f" and {len(jumps) - LISTED} more" if len(jumps) > LISTED else ""
+    yield Finding(
+        "jumps",
+        len(jumps) <= JUMPED * len(logged.time),
+        len(jumps) / len(logged.time),
+        JUMPED,
+        "1",
+        None,
+        f"{len(jumps)} poses are more than {JUMPS:g} standard deviations beside their "
+        "neighbours" + (f", at {listed} s{more}" if len(jumps) else ""),
+    )
+
+
+def _frozen(logged: LoggedRun) -> Iterator[Finding]:
+    same = (np.diff(logged.poses, axis=0) == 0).all(axis=1)
+    first = f", the first at {logged.time[1:][same][0]:.4f} s" if same.any() else ""
+    yield Finding(
+        "frozen poses",
+        bool(same.mean() <= FROZEN),
+        float(same.mean()),
+        FROZEN,
+        "1",
+        None,
+        f"{same.sum()} poses are the pose before in all digits{first}",
+    )
+
+
+def _motion(logged: LoggedRun) -> Iterator[Finding]:
+    robot = logged.side.robot
+    _, joints = joint_motion(logged.telemetry, robot)
+    unit = robot.layout.joint_unit
+    if len(joints):
+        largest = np.abs(joints).max(axis=0)
+        joint = int(np.argmax(largest))
+        yield Finding(
+            "travel",
+            bool(largest[joint] <= robot.travel_limit),
+            float(largest[joint]),
+            robot.travel_limit,
+            unit,
+            joint + 1,
+            f"joint coordinates of the poses reach {largest[joint]:.4g} {unit} of "
+            f"{robot.travel_limit:.4g}; the poses move by "
+            + ", ".join(
+                f"{name} {value:.3g}"
+                for name, value in zip(POSE, np.ptp(logged.poses, axis=0), strict=True)
+            )
+            + " m and rad",
+        )
+    highest = logged.spectrum.highest_hz
+    rate = 1 / float(np.median(np.diff(logged.time)))
+    yield Finding(
+        "spectrum",
+        highest * FRAMES_A_PERIOD <= rate,
+        highest,
+        rate / FRAMES_A_PERIOD,
+        "Hz",
+        None,
+        f"99 % of the power of the motion lies below {highest:.3g} Hz, "
+        f"{rate / max(highest, 1e-9):.3g} frames a period",
+    )
+
+
+def _saturation(logged: LoggedRun) -> Iterator[Finding]:
+    commands = logged.telemetry.commands.command
+    shares = [float(_at_ends(one).mean()) for one in commands.T]
+    joint = int(np.argmax(shares))
+    most = np.abs(commands).max(axis=0)
+    yield Finding(
+        "saturation",
+        shares[joint] <= SATURATED,
+        shares[joint],
+        SATURATED,
+        "1",
+        joint + 1 if shares[joint] > 0 else None,
+        f"the largest command is {most.max():.4g} {logged.side.robot.layout.joint_unit}, of joint "
+        f"{int(np.argmax(most)) + 1}; "
+        + (
+            f"commands of joint {joint + 1} stay at the end of their range in {shares[joint]:.1%} "
+            "of the rows between rest and rest"
+            if shares[joint] > 0
+            else "no command stays at the end of its range"
+        ),
+    )
+
+
+def _plausible(logged: LoggedRun) -> Iterator[Finding]:
+    found = suspicions(logged.telemetry, logged.side.robot)
+    if not found:
+        text = "nothing contradicts the units, axes, directions and zeros of the robot file"
+        yield Finding("units and frames", True, 0, 0, "1", None, text)
+    for one in found:
+        yield Finding("units and frames", False, len(found), 0, "1", None, one.text)
+
+
+def _clocks(logged: LoggedRun) -> Iterator[Finding]:
+    lag = logged.lag
+    yield Finding(
+        "motion behind commands",
+        lag.correlation >= FOLLOWS and lag.seconds >= -BEFORE_S,
+        lag.seconds,
+        -BEFORE_S,
+        "s",
+        None,
+        f"the motion follows the commands by {1e3 * lag.seconds:.1f} ms, with a correlation of "
+        f"{lag.correlation:.3f}: drives, friction, latency and the clocks",
+    )
+    delay = logged.delay
+    timing = logged.side.timing
+    if delay is None:
+        text = (
+            "the commands show no noise of the poses: no servo was on these poses, or the clocks "
+            "differ by more than half a second"
+        )
+        yield Finding("clock offset", True, None, None, "s", None, text)
+        return
+    # The row of a command without its own time is that of its pose.
+    expected = 0.0 if logged.telemetry.commands.written is None else timing.latency_s
+    offset = delay.seconds - expected
+    allowed = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
+    yield Finding(
+        "clock offset",
+        abs(offset) <= allowed,
+        offset,
+        allowed,
+        "s",
+        None,
+        f"the noise of a pose is in the command {1e3 * delay.seconds:.3f} ms later (correlation "
+        f"{delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
+        f"{1e3 * expected:.3f} ms: the clock of the commands is ahead by {1e3 * offset:.3f} ms, or "
+        "the latency is another",
+    )
+    duration = float(np.ptp(logged.time))
+    grown = delay.drift * duration
+    yield Finding(
+        "clock drift",
+        abs(grown) <= allowed,
+        delay.drift,
+        allowed / duration,
+        "1",
+        None,
+        f"this delay grows by {1e6 * delay.drift:.1f} us in a second, {1e3 * grown:.3f} ms over "
+        "the run",
+    )
+
+
+def _parameters(logged: LoggedRun) -> Iterator[Finding]:
+    run = logged.model_run
+    robot = logged.side.robot
+    base = structure(robot)
+    names = base.group_names()
+    limit = SHOWN_GROUPS * len(names)
+    if isinstance(run, DynamicsError):
+        text = f"the guessed model does not run under the commands: {run}"
+        yield Finding("parameters", False, None, limit, "1", None, text)
+        return
+    shown = logged.can_show(run)
+    weak = [name for name, seen in zip(names, shown, strict=True) if not seen]
+    more = f" and {len(weak) - LISTED} more" if len(weak) > LISTED else ""
+    yield Finding(
+        "parameters",
+        bool(shown.sum() >= limit),
+        int(shown.sum()),
+        limit,
+        "1",
+        None,
+        f"the motion can show {shown.sum()} of {len(names)} groups of parameters, by the guessed "
+        "model" + (f"; not {', '.join(weak[:LISTED])}{more}" if weak else ""),
+    )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _at_ends(values: Array) -> NDArray[np.bool_]:
+    """Return where (K,) a command stays at an end of its range, apart from rest at first and last.
+
+    K counts the rows between the first and the last change.
+    """
+    changes = np.flatnonzero(np.diff(values))
+    if not len(changes):
+        return np.zeros(1, dtype=bool)
+    moving = values[changes[0] + 1 : changes[-1] + 1]
+    if not len(moving):
+        return np.zeros(1, dtype=bool)
+    at_end = (moving == values.max()) | (moving == values.min())
+    # Runs of equal commands, by the place of the run of each row.
+    starts = np.concatenate([[True], np.diff(moving) != 0])
+    run = np.cumsum(starts) - 1
+    return np.asarray(at_end & (np.bincount(run)[run] >= STUCK))
