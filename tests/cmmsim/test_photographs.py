@@ -13,9 +13,9 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import apply, invert, pose_to_transform, rotation_log
 from cmmsim.photographs.pairs import numbered
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
-from tests.cmmsim.photographed import spread_poses
+from tests.cmmsim.photographed import photographed, spread_poses
 from tests.cmmsim.plain import rigid_start
-from tests.cmmsim.sensors import refused
+from tests.cmmsim.sensors import refused, require_true, squares
 
 PAIRS = 24
 
@@ -120,7 +120,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
     true_base = apply(invert(truth.base_from_camera), truth.base_places)
     stand, bound = fisher(sensor, spread_poses(PAIRS, 7), sensor.base, sensor.platform)
     near = spread_poses(100, 8, 0.009, 0.035)
-    squares, freedom, shapes, bases, common, scatter = 0.0, 0, [], [], [], []
+    total, freedom, shapes, bases, common, scatter = 0.0, 0, [], [], [], []
     for k, found in enumerate(teachings(100, 7)):
         taught = found.taught
         for errors, covariance in (
@@ -131,7 +131,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
             ),
         ):
             square, determined = normalised(errors, covariance)
-            squares += square
+            total += square
             freedom += determined
         shapes.append(shape_error(taught.platform_places, truth.platform_places))
         bases.append(found.bundle.state.places[:18] - true_base)
@@ -141,7 +141,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
             mean = errors.mean(axis=0)
             common.append(mean @ np.linalg.solve(shared + np.cov(errors.T) / 100, mean) / 6.0)
     assert freedom == 100 * (6 + 48)
-    assert squares / freedom == pytest.approx(1.0, abs=0.05)
+    assert total / freedom == pytest.approx(1.0, abs=0.05)
     assert np.mean(common) == pytest.approx(1.0, abs=0.4)
     for errors, covariance in (
         (shapes, bound / 54.0),
@@ -228,3 +228,30 @@ def test_a_sensor_file_states_the_covariance_of_its_cameras(tmp_path):
         "mine.toml: rig.covariance.matrix: .*left.fx_px is negative",
         cmmsim.SensorFileError,
     )
+
+
+DARK = {
+    "stickers.sticker_level": 20,
+    "stickers.ring_level": 220,
+    "stickers.body_level": 200,
+    "stickers.background_level": 200,
+}
+SIXTEEN_BIT = {"camera.bit_depth": 16, "camera.gain": 33.28, "camera.black_level": 4096.0}
+
+
+@pytest.mark.parametrize("changes", [DARK, SIXTEEN_BIT], ids=["dark discs", "16 bit"])
+def test_other_kinds_of_images_are_taught_and_measured_with_a_true_covariance(changes):
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=4, changes=changes)
+    frames = [photographed(sensor, pose) for pose in spread_poses(6, 5)]
+    found = sensor.teach_from(numbered(frames, 60.0))
+    assert (found.rejected_pairs, found.rejected_stickers, found.warnings) == ({}, {}, ())
+    assert found.bundle.factor == pytest.approx(1.0, abs=0.15)
+    sensor.teach(frames=frames)
+    near = spread_poses(40, 6, 0.009, 0.035)
+    measured = sensor.measure_many(near)
+    errors = measured.poses - near
+    require_true(squares(errors - errors.mean(axis=0), measured.covariances) * 40 / 39)
+    mean = errors.mean(axis=0)
+    spread = sensor.estimator.common_at(sensor.home) + measured.covariances.mean(axis=0) / 40
+    assert mean @ np.linalg.solve(spread, mean) < 22.5
+    assert cmmsim.measure_frame(frames[0], sensor.estimator).ok
