@@ -193,7 +193,9 @@ class Columns(Section):
 
     measured: PoseColumns
     command: CommandColumns
-    reference: PoseColumns | None = None
+    reference: PoseColumns | None = Field(
+        None, description="columns of the desired poses, with the keys of [columns.measured]"
+    )
 
     @model_validator(mode="after")
     def _agree(self) -> "Columns":
