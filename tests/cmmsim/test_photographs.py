@@ -173,15 +173,34 @@ def test_a_sensor_measures_with_what_it_was_taught_from_frames(tmp_path):
 
 
 @pytest.mark.slow
+def test_places_from_rendered_images_are_as_accurate_as_stated():
+    """Two sensors with 24 pairs each: the mean of 108 squares has a deviation of 0.14."""
+    squared = []
+    for seed in range(2):
+        sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=seed)
+        frames = [photographed(sensor, pose) for pose in spread_poses(PAIRS, 40 + seed)]
+        found = sensor.teach_from(numbered(frames, 60.0))
+        assert found.bundle.factor == pytest.approx(1.0, abs=0.1)
+        errors = np.concatenate(
+            [
+                base_error(found.taught, sensor.truth),
+                (found.taught.platform_places - sensor.truth.platform_places).ravel(),
+            ]
+        )
+        squared.append(np.divide(*normalised(errors, found.frames.covariance[:60, :60])))
+    assert np.mean(squared) == pytest.approx(1.0, abs=0.4)
+
+
+@pytest.mark.slow
 def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_stated():
-    """20 rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
-    normalised errors, with deviations of 0.05, 0.07 and 0.13."""
+    """15 rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
+    normalised errors, with deviations of 0.05, 0.08 and 0.15."""
     truth, true_rig = statistical().truth, statistical().rig
     poses, near = spread_poses(PAIRS, 7), spread_poses(60, 8, 0.009, 0.035)
     file, free = read_sensor_file("ctrack780"), np.flatnonzero(np.diag(PHOTOGRAPHED))
     std = np.sqrt(np.diag(PHOTOGRAPHED)[free])
     taught, rigs, common, gains = [], [], [], []
-    for k in range(20):
+    for k in range(15):
         known = KnownRig.drawn(true_rig, PHOTOGRAPHED, np.random.default_rng([3, k]))
         sensor = cmmsim.Sensor(file, seed=50 + k, renderer="statistical", known=known)
         found = sensor.teach_from(numbered((sensor.look(pose) for pose in poses), 60.0))
@@ -200,8 +219,8 @@ def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_sta
         mean = errors.mean(axis=0)
         common.append(mean @ np.linalg.solve(shared + np.cov(errors.T) / 60, mean) / 6.0)
     assert np.mean(taught) == pytest.approx(1.0, abs=0.15)
-    assert np.mean(rigs) == pytest.approx(1.0, abs=0.2)
-    assert np.mean(common) == pytest.approx(1.0, abs=0.4)
+    assert np.mean(rigs) == pytest.approx(1.0, abs=0.24)
+    assert np.mean(common) == pytest.approx(1.0, abs=0.45)
     assert np.max(gains) < 1.0
     assert np.mean(gains) < 0.7
 
@@ -255,3 +274,28 @@ def test_other_kinds_of_images_are_taught_and_measured_with_a_true_covariance(ch
     spread = sensor.estimator.common_at(sensor.home) + measured.covariances.mean(axis=0) / 40
     assert mean @ np.linalg.solve(spread, mean) < 22.5
     assert cmmsim.measure_frame(frames[0], sensor.estimator).ok
+
+
+def test_rough_places_may_be_off_by_millimetres():
+    """Each sticker lies up to 4 mm from where the file says, and the frames are still right."""
+    planes = read_sensor_file("ctrack780").platform.planes
+    rng = np.random.default_rng(6)
+    changes = {
+        f"platform.planes.{name}.stickers": (
+            np.array(plane.stickers) + rng.uniform(-4e-3, 4e-3, (6, 2))
+        ).tolist()
+        for name, plane in planes
+    }
+    sensor = statistical(seed=6, changes=changes)
+    exposures = [sensor.look(pose) for pose in spread_poses(8, 6)]
+    found = statistical().teach_from(numbered(exposures, 60.0))
+    assert len(found.taught.platform_places) == 18
+    assert np.ptp(found.taught.platform_places - statistical().platform.nominal) > 4e-3
+    errors = np.concatenate(
+        [
+            base_error(found.taught, sensor.truth),
+            (found.taught.platform_places - sensor.truth.platform_places).ravel(),
+        ]
+    )
+    square, freedom = normalised(errors, found.frames.covariance[:60, :60])
+    assert square / freedom == pytest.approx(1.0, abs=0.6)
