@@ -16,6 +16,7 @@ from dynamics.kinematics.platform import FREEDOMS, Chart, base_from_platform
 from dynamics.legs.geometric_numbers import POINTS, deviations, moved, unit_of, values
 from dynamics.legs.leg import Leg
 from dynamics.parameters import ParameterLayout, parameter_layout
+from dynamics.unstated import EXACT, Unstated
 
 SAME_PLACE = 1e-6
 """Distance, m, below which joints of two legs coincide."""
@@ -31,7 +32,8 @@ class RobotGeometry:
     are the names of the bodies with ten inertial parameters instead of four (see
     `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
     if all joints share them. `passive_friction` are the names of the parameters of passive joints
-    (see `parameters.passive_parameters`).
+    (see `parameters.passive_parameters`). `unstated` says how far bodies and joints can be from
+    this form of them.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -44,6 +46,7 @@ class RobotGeometry:
     full_bodies: tuple[str, ...] = ()
     own_gains: bool = False
     passive_friction: tuple[str, ...] = ()
+    unstated: Unstated = EXACT
 
     def __post_init__(self) -> None:
         gravity = np.array(self.gravity, dtype=float)

@@ -16,6 +16,7 @@ from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.parameter_set import Parameters, ParameterSet, Strict, parameter_set
+from dynamics.unstated import Unstated
 
 MOST_COMPLAINTS = 24
 """Largest number of faults in a message: four for each of six legs."""
@@ -64,6 +65,11 @@ class RobotFile(Strict):
         "centred",
         description="full: bodies have ten inertial parameters instead of four; for all bodies, or "
         'a table by body or kind of body, such as { platform = "full", link3 = "full" }',
+    )
+    unstated: Unstated = Field(
+        Unstated(),
+        description="standard deviations of what centred bodies and passive joints without "
+        "friction are taken to be; 0 for bodies and joints that are exactly so",
     )
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
         description="a table for each leg; with a family also a single table, in which each key "
@@ -250,6 +256,7 @@ def _geometry(content: RobotFile) -> RobotGeometry:
         full,
         own_gains=any(values.own_gains for values in content.parameters.values()),
         passive_friction=tuple(passive),
+        unstated=content.unstated,
     )
 
 

@@ -35,6 +35,8 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     if any(layout.full):
         table = ", ".join(f'{body} = "full"' for body in layout.full_bodies)
         lines += ['inertia = "full"' if all(layout.full) else f"inertia = {{ {table} }}"]
+    lines += ["", "[unstated]"]
+    lines += [f"{name} = {_value(value)}" for name, value in geometry.unstated]
     for number, leg in enumerate(geometry.legs, 1):
         lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
     for name, values in robot.parameter_sets.items():

@@ -20,7 +20,6 @@ from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import Array, apply, invert
-from cmmsim.geometry.registration import rigid_starts
 from cmmsim.measuring.layout_search import (
     ENOUGH,
     LINE_STDS,
@@ -39,8 +38,7 @@ STANDING_SHARE = 0.6
 STANDING_PX = 0.7
 # Fewest candidates of a pair that are recognised as a rigid body.
 FEWEST_MOVING = 6
-# Most rough places may be off by the first tolerance, or else by the second, and single ones by the
-# second, m.
+# Rough places may be off by the first tolerance, or else by the second, m.
 ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
 # Number of pairs that are tried as the first model of the platform.
@@ -294,20 +292,9 @@ def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDA
     """
     for tolerance in ROUGH:
         try:
-            place, _, _ = find_layout(body.nominal, points, tolerance, FEWEST_NOMINAL, body.name)
+            return find_layout(body.nominal, points, tolerance, FEWEST_NOMINAL, body.name)
         except LostError as error:
             said = error
-            continue
-        # Stickers that lie farther from their rough places are found once the body is.
-        for _ in range(2):
-            gaps = np.linalg.norm(apply(place, body.nominal)[:, None] - points, axis=2)
-            own = gaps.argmin(axis=1)
-            mutual = gaps.argmin(axis=0)[own] == np.arange(len(own))
-            stickers = np.flatnonzero(mutual & (gaps.min(axis=1) < ROUGH[-1]))
-            own = own[stickers]
-            even = np.ones((1, len(own)))
-            place = rigid_starts(body.nominal[stickers], points[own][None], even)[0]
-        return place, stickers, own
     raise said
 
 

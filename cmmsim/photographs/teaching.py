@@ -97,7 +97,6 @@ class PhotographedTeaching:
         dict
         """
         return taught_as_dict(self.taught) | {
-            "base_stickers": self.frames.base_ids.tolist(),
             "residual_rms_px": self.rms_px,
             "variance_factor": self.bundle.factor,
             "pairs": list(self.pairs),

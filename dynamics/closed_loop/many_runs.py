@@ -33,6 +33,8 @@ def repeat_servo(
     noises: np.ndarray,
     *,
     lost: np.ndarray | None = None,
+    start: StartState | None = None,
+    feedforward: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
     compiled: bool = True,
 ) -> list[ClosedLoopRun | LoopFailure]:
@@ -43,7 +45,7 @@ def repeat_servo(
 
     Parameters
     ----------
-    robot, parameters, reference, settings, latencies, compiled
+    robot, parameters, reference, settings, start, feedforward, latencies, compiled
         As for `simulate_servo`.
     noises : ndarray, shape (N, frames, 6)
         Noise of each run, m and rad, which is added to the measured poses.
@@ -71,8 +73,8 @@ def repeat_servo(
     problem = servo_problem(
         *(robot, parameters, reference, settings, IdealSensor(lost)),
         servo_robot=None,
-        start=None,
-        feedforward=None,
+        start=start,
+        feedforward=feedforward,
         latencies=latencies,
     )
     return _repeat(problem, noises, compiled)

@@ -34,6 +34,7 @@ from dynamics.rigid_body.virtual_work import mass_matrix
 from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import MOMENTS
+from dynamics.unstated import Unstated
 
 DIAGONAL = 1e-9
 """Share of the largest moment below which products of inertia count as rounding errors."""
@@ -88,7 +89,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
         home = (*home[:3], 0.0, 0.0, home[5])
         chart = _upright(axes, legs, home)
     travel = plain.travel_limit or _travel(plain, found, legs, notes)
-    geometry = RobotGeometry(tuple(legs), chart, travel, plain.gravity)
+    geometry = RobotGeometry(tuple(legs), chart, travel, plain.gravity, unstated=Unstated())
     of_platform = full_body(platform.mass, np.zeros(3), np.diag(moments))
     bodies = _bodies(geometry, found, of_platform)
     full = [

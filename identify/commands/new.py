@@ -57,7 +57,8 @@ def robot(file: File, like: Annotated[str, _like("robot")] = "rss6", quiet: Quie
     """
     from dynamics.robot_file import read_robot_file
 
-    _write({_toml(file): _copy("robot", like, file)}, read_robot_file)
+    text = _of_a_workshop(_copy("robot", like, file))
+    _write({_toml(file): text}, read_robot_file)
     _say(quiet, file, f"judge it with: cmmsim check {file}")
 
 
@@ -226,6 +227,22 @@ def _copy(kind: str, like: str, file: Path) -> str:
     """Return the text of a built-in file under the name of another file."""
     text = (built_in_folder(kind) / f"{_known(kind, like)}.toml").read_text(encoding="utf-8")
     return _with_schema(_schema(kind), _named(text, file))
+
+
+def _of_a_workshop(text: str) -> str:
+    """Return the text of a built-in robot file with bodies and joints known as in a workshop."""
+    from dynamics.unstated import Unstated
+
+    for name, std in Unstated():
+        text = re.sub(rf"^{name} = 0\.0 *#", f"{name} = {std}  #", text, flags=re.MULTILINE)
+    return re.sub(
+        "^# Bodies and joints are exactly as .*$",
+        "# How far bodies and joints can be from their model: standard deviations, those of an "
+        "ordinary workshop.\n# They widen the intervals of an identification. 0 is for a robot "
+        "that is exactly as this file says.",
+        text,
+        flags=re.MULTILINE,
+    )
 
 
 def _named(text: str, file: Path) -> str:

@@ -53,10 +53,10 @@ class OutputErrorProblem:
         """True if the model is not linear in its common errors.
 
         The model is nonlinear if the servo measures poses with these errors, or if there are errors
-        in the loop.
+        in the loop or of bodies.
         """
         return any(
-            run.common.loop_std or (run.common.names and not run.driven)
+            run.common.loop_std or run.common.body_std or (run.common.names and not run.driven)
             for run in self.runs
             if run.marginal
         )

@@ -24,6 +24,9 @@ from identify.progress import Advance, Progress
 LINEARISATIONS = 6
 """Largest number of linearisations in the common errors."""
 
+FULL_STEPS = 2
+"""Linearisations after which steps of the common errors are halved, because they can alternate."""
+
 SETTLED = 0.02
 """Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
@@ -91,10 +94,13 @@ def search_with_common_errors(
     """
     problem, start = _with_common_errors(problem, starts)
     solution = search(problem, start, advance)
-    for _ in range(LINEARISATIONS if problem.bends else 0):
+    for turn in range(LINEARISATIONS if problem.bends else 0):
         errors = most_likely_errors(problem, solution.parameters)
         if problem.has(errors, SETTLED):
             break
+        if turn >= FULL_STEPS:
+            before = [run.errors_had for run in problem.runs]
+            errors = [(one + other) / 2.0 for one, other in zip(errors, before, strict=True)]
         problem = problem.having(errors).with_common_errors(solution.parameters)
         # The progress bar expects only one search.
         again = search(problem, solution.parameters, lambda n=1: None)

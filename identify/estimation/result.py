@@ -32,6 +32,7 @@ from identify.estimation.prior import ScaleAnchor, gains_among
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result
 from identify.loop_parameters import known_value
+from identify.record.stored_common_errors import ASSUMPTIONS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -257,11 +258,27 @@ class IdentificationResult:
             "nuisances": dict(zip(common.names, common.std.tolist(), strict=True)),
             "nuisance_estimates": common.learned,
             "nuisance_prior_std": dict(zip(common.names, common.prior_std.tolist(), strict=True)),
+            "assumptions": self._assumptions(),
             "base_rank": self.base_rank,
             "drive": self._drive(),
             "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},
             "groups": {name: self._group(k) for k, name in enumerate(self.groups.names)},
         }
+
+    def _assumptions(self) -> dict[str, dict[str, Any]]:
+        """Return what each assumption on bodies and passive joints costs, by kind.
+
+        It is the identified parameter whose interval it widens most, and the factor.
+        """
+        shown = np.flatnonzero(self.identifiable)
+        found = {}
+        for kind in ASSUMPTIONS if len(shown) else ():
+            if kind in self.common_share:
+                share = self.common_share[kind][shown]
+                worst = int(np.argmax(share))
+                by = float(1.0 / np.sqrt(1.0 - share[worst]))
+                found[kind] = {"widens_most": self.names[shown[worst]], "by": by}
+        return found
 
     def _drive(self) -> dict[str, Any]:
         """Return the law of the drives with its probability, and the gains of a cascade."""

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
 
+LEAST_COMMAND = 1e-10
+"""Largest change of a command, rad, m, N m or N, that counts as none."""
+
+
 def error_modes(
     run: "LoopModel",
     parameters: Array,
@@ -35,6 +39,11 @@ def error_modes(
         modes[:, :, :count] = beside
     moving = [] if beside is not None else list(range(count))[: run.common.noticed]
     moving += range(count, len(drawn))
+    if run.bodies is not None:
+        # A crank about a vertical axis, for example, needs no torque for most of its errors.
+        without = np.abs(run.bodies).max(axis=(1, 2)) < LEAST_COMMAND
+        still = len(drawn) - len(without) + np.flatnonzero(without)
+        moving = [k for k in moving if k not in still]
     ends = [
         np.maximum(drawn + sign * np.eye(len(drawn))[k], run.lowest_drawn)
         for k in moving

@@ -12,6 +12,7 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
 from identify.errors import EstimationError
 from identify.loop_parameters import carrying, drives_of, in_form, loop_settings
+from identify.model.body_errors import body_error_stds
 from identify.model.loop_errors import loop_error_stds
 from identify.model.loop_model import LoopModel
 from identify.model.torque_model import torque_model
@@ -171,5 +172,10 @@ def _common_errors(record: xr.Dataset, side: ModelSide, run: LoopModel) -> Commo
     if takes_torques(record):
         # no zero and no scale of joint commands acts under torques
         stds = {name: std for name, std in stds.items() if name == LATENCY}
-    of_poses = read_common_errors(record, kinds)
-    return replace(of_poses, loop_std=stds, geometry=geometry, whitener=run.whitener)
+    return replace(
+        read_common_errors(record, kinds),
+        loop_std=stds,
+        geometry=geometry,
+        body_std=body_error_stds(run.robot, side.model, kinds),
+        whitener=run.whitener,
+    )

@@ -29,6 +29,7 @@ from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
+from identify.model.body_errors import body_errors, fed_forward
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
 from identify.model.loop_errors import lowest_errors, settings_with_errors
@@ -63,6 +64,9 @@ class LoopModel:
     torques : ndarray, shape (N, n), optional
         Torques or forces that the joints need at the frames beside those of the model, if the
         logged commands drive it. See `joint_torques`.
+    bodies : ndarray, shape (k, N, n), optional
+        Changes of the commands with the effect of one standard deviation of each error of bodies,
+        see `body_errors`. `with_common_errors` computes them.
     groups : RigidGroups, optional
         Combinations of the inertial parameters on which the motion depends. If they are given,
         sensitivities are with respect to their pivots and to all other parameters.
@@ -83,6 +87,7 @@ class LoopModel:
     drawn: Array | None = None
     marginal: Marginal | None = None
     torques: Array | None = None
+    bodies: Array | None = None
     groups: RigidGroups | None = None
 
     def driven_by_commands(self) -> "LoopModel":
@@ -109,12 +114,13 @@ class LoopModel:
         """
         if not self.common.all_names:
             return self
-        seen = self.modes(parameters)[self.ok]
+        run = replace(self, bodies=body_errors(self, parameters))
+        seen = run.modes(parameters)[self.ok]
         modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
         # Errors of measured poses have no effect on a model without a servo.
         inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
         had = modes[:, inside] @ self.errors_had[inside]
-        return replace(self, marginal=Marginal.of(modes, had))
+        return replace(run, marginal=Marginal.of(modes, had))
 
     def modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the measured poses against the model by the common errors.
@@ -158,19 +164,22 @@ class LoopModel:
             return {}
         own = self.drawn[len(self.common.names) :].tolist()
         stds = self.common.loop_std.items()
-        return {name: std * value for (name, std), value in zip(stds, own, strict=True)}
+        # errors of bodies follow
+        return {name: std * value for (name, std), value in zip(stds, own, strict=False)}
 
     @property
     def lowest_drawn(self) -> Array:
         """Smallest allowed values (k,) of the common errors, see `lowest_errors`."""
         mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
         free = np.full(len(self.common.names), -np.inf)
-        return np.concatenate([free, lowest_errors(self.common.loop_std, float(mean))])
+        inside = self.common.loop_std | self.common.body_std
+        return np.concatenate([free, lowest_errors(inside, float(mean))])
 
     @property
     def errors_had(self) -> Array:
-        """Common errors (k,) that the model contains: errors of the poses, then of the loop."""
-        count = len(self.common.names) + len(self.common.loop_std)
+        """Common errors (k,) that the model contains: of the poses, the loop and the bodies."""
+        common = self.common
+        count = len(common.names) + len(common.loop_std) + len(common.body_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
     def simulate(
@@ -206,10 +215,11 @@ class LoopModel:
             if sensitivities:
                 return differentiate_commands(*known, sensor, latencies=late, groups=self.groups)
             return simulate_commands(*known, sensor, latencies=late)
+        fed = fed_forward(self, *given)
         if sensitivities:
-            return differentiate_servo(*given, sensor, latencies=late, groups=self.groups)
+            return differentiate_servo(*given, sensor, latencies=late, groups=self.groups, **fed)
         # The servo always uses the robot that it knows, even if another robot moves.
-        return simulate_servo(*given, sensor, servo_robot=self.robot, latencies=late)
+        return simulate_servo(*given, sensor, servo_robot=self.robot, latencies=late, **fed)
 
     def simulate_repeats(
         self, parameters: Array, noises: Array
@@ -225,19 +235,30 @@ class LoopModel:
             return repeat_commands(
                 *given, self._commands(parameters), sensed, latencies=self.latencies
             )
-        return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies)
+        fed = fed_forward(self, *given)
+        return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies, **fed)
 
     def drive_law(self, parameters: Array) -> JointLaw:
         """Return the law of the drives with its gains among parameters (p,)."""
         return self.settings.drives.joint_law(self.robot.layout.split(parameters)[3])
 
     def _commands(self, parameters: Array) -> Array:
-        """Return the logged commands (N, n), changed by what the drives need for `torques`."""
-        if self.torques is None:
-            return self.logged
-        late = self.stated_latencies if self.latencies is None else self.latencies
-        law = self.drive_law(parameters)
-        return self.logged - equivalent_commands(self.torques, late, law, self.settings.timing)
+        """Return the logged commands (N, n), changed for `torques` and for errors of bodies."""
+        commands = self.logged
+        if self.torques is not None:
+            late = self.stated_latencies if self.latencies is None else self.latencies
+            law = self.drive_law(parameters)
+            timing = self.settings.timing
+            commands = commands - equivalent_commands(self.torques, late, law, timing)
+        change = self.body_commands
+        return commands if change is None else commands + change
+
+    @property
+    def body_commands(self) -> Array | None:
+        """Changes (N, n) of commands with the effect of the errors of bodies in the model."""
+        if self.drawn is None or self.bodies is None:
+            return None
+        return np.tensordot(self.drawn[-len(self.bodies) :], self.bodies, 1)
 
     def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
         """Return the robot that moves in a run, and its parameters (p,) with the known load."""

@@ -239,7 +239,7 @@ class TorqueModel(LoopModel):
             parameters,
             Reference(self.reference.poses[frames], self.reference.rates[frames]),
             self.settings,
-            self.logged[frames],
+            self._commands(parameters)[frames],
             start=begin,
             by_start=True,
             latencies=None if self.latencies is None else self.latencies[frames],

@@ -193,9 +193,7 @@ class Columns(Section):
 
     measured: PoseColumns
     command: CommandColumns
-    reference: PoseColumns | None = Field(
-        None, description="columns of the desired poses, with the keys of [columns.measured]"
-    )
+    reference: PoseColumns | None = None
 
     @model_validator(mode="after")
     def _agree(self) -> "Columns":

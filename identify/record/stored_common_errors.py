@@ -34,6 +34,9 @@ LATENCY = "timing.latency_s"
 ZERO = "zeros.joint"
 SCALE = "scale.commands"
 
+ASSUMPTIONS = ("centres", "products", "passive_friction")
+"""Kinds of errors of bodies and passive joints that a model has in a simpler form."""
+
 
 @dataclass(frozen=True)
 class CommonErrors:
@@ -54,6 +57,9 @@ class CommonErrors:
     geometry : GeometryErrors, optional
         Errors of the robot's geometry. Their effect needs a model of the loop, too. None if the
         geometry is exact.
+    body_std : dict of str to float
+        Standard deviations of errors of bodies and passive joints by name, with the same need. See
+        `identify.model.body_errors`.
     whitener : ndarray, shape (6, 6), optional
         Whitener of the noise of the poses. It determines the noticed directions of the errors. If
         None, all directions count as noticed.
@@ -64,19 +70,21 @@ class CommonErrors:
     covariance: Array
     loop_std: dict[str, float] = field(default_factory=dict)
     geometry: GeometryErrors | None = None
+    body_std: dict[str, float] = field(default_factory=dict)
     whitener: Array | None = None
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors: errors of the poses, then of the loop, then of the geometry."""
-        return (*self.names, *self.loop_std, *(self.geometry.names if self.geometry else ()))
+        """Names of all errors: of the poses, the loop, the bodies, and the geometry."""
+        of_geometry = self.geometry.names if self.geometry else ()
+        return (*self.names, *self.loop_std, *self.body_std, *of_geometry)
 
     @property
     def whole_factor(self) -> Array:
         """`factor` of all errors, in the order of `all_names`."""
         geometry = [self.geometry.factor] if self.geometry else []
-        loop = [np.full((1, 1), std) for std in self.loop_std.values()]
-        return np.asarray(block_diag(self.factor, *loop, *geometry))
+        stds = (*self.loop_std.values(), *self.body_std.values())
+        return np.asarray(block_diag(self.factor, np.diag(stds), *geometry))
 
     def known_as(self, other: "CommonErrors") -> bool:
         """Return whether other errors have the same names and covariances."""
@@ -84,6 +92,7 @@ class CommonErrors:
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
         same = self.all_names == other.all_names and self.loop_std == other.loop_std
+        same = same and self.body_std == other.body_std
         return same and all(np.array_equal(*pair) for pair in pairs)
 
     def by_kind(self, modes: Array) -> dict[str, Array]:
@@ -223,12 +232,6 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 def kind_of(name: str) -> str:
     """Return the kind of a common error, as `identification.nuisances` names it."""
-    kinds = {
-        "taught": "teaching",
-        "exposure": "exposure",
-        "timing": "latency",
-        "geometry": "geometry",
-        "zeros": "zeros",
-        "scale": "scale",
-    }
+    same = ("exposure", "geometry", "zeros", "scale", *ASSUMPTIONS)
+    kinds = {"taught": "teaching", "timing": "latency", **dict(zip(same, same, strict=True))}
     return kinds.get(name.split(".")[0], "rig")

@@ -128,14 +128,22 @@ def common_error_table(result: dict[str, Any]) -> Table:
     )
     note = (
         "True minus known value, in the unit at the end of the name; geometric errors are in m and "
-        "rad. A visual servo compensates such errors, so that the record can tell little of them."
+        "rad. Centres of mass are first moments of all bodies of a kind. A visual servo "
+        "compensates errors of the poses, so that the record can tell little of them."
         f"{_shares(found)}"
     )
     header = ("error", "prior standard deviation", "estimate ± standard deviation")
     return Table("Errors common to all frames", header, rows, note, folded=True)
 
 
-KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "delay between exposures"}
+KINDS = {
+    "rig": "cameras",
+    "teaching": "taught frames",
+    "exposure": "delay between exposures",
+    "centres": "centres of mass",
+    "products": "products of inertia",
+    "passive_friction": "friction of passive joints",
+}
 """Words for kinds of common errors whose names need an explanation."""
 
 

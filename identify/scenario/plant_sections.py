@@ -326,6 +326,28 @@ class Model(_Side):
         ge=0,
         le=0.1,
     )
+    centre_std: float | None = quantity(
+        None,
+        "1",
+        "standard deviation of each coordinate of the centre of mass of a centred body, as a share "
+        "of its length; by default that of the robot file, which is 0 for the built-in robots",
+        ge=0,
+        le=1,
+    )
+    product_std: float | None = quantity(
+        None,
+        "1",
+        "the same of each product of inertia, as a share of the body's mean moment of inertia",
+        ge=0,
+        le=1,
+    )
+    passive_viscous_std_N_m_s_rad: float | None = quantity(
+        None,
+        "N m s/rad",
+        "the same of the viscous friction of passive joints without such a parameter",
+        ge=0,
+        le=1e3,
+    )
     steps_per_frame: int = quantity(
         4,
         "1",

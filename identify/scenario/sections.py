@@ -200,9 +200,31 @@ class Identification(Section):
         "std } }",
     )
     nuisances: list[
-        Literal["rig", "teaching", "exposure", "latency", "zeros", "scale", "geometry"]
+        Literal[
+            "rig",
+            "teaching",
+            "exposure",
+            "latency",
+            "zeros",
+            "scale",
+            "geometry",
+            "centres",
+            "products",
+            "passive_friction",
+        ]
     ] = Field(
-        ["rig", "teaching", "exposure", "latency", "zeros", "scale", "geometry"],
+        [
+            "rig",
+            "teaching",
+            "exposure",
+            "latency",
+            "zeros",
+            "scale",
+            "geometry",
+            "centres",
+            "products",
+            "passive_friction",
+        ],
         description="errors common to all poses that are estimated beside the parameters",
     )
     physical_consistency: bool = Field(

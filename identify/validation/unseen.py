@@ -32,6 +32,7 @@ from identify.excitation.design import Design, unseen_trajectories
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import SensorPlan
+from identify.model.body_errors import body_errors
 from identify.model.from_record import ModelSide, predicting_model
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
@@ -219,7 +220,7 @@ def predict_poses(
     """
     likely, root, known = _known_in_common(run, covariance, len(parameters), learned or {})
     inside = len(run.errors_had)
-    run = run.having(likely[:inside])
+    run = replace(run, bodies=body_errors(run, parameters)).having(likely[:inside])
     model = run.simulate(parameters, sensitivities=True)
     assert model.pose_sensitivity is not None
     drawn = []

@@ -327,7 +327,7 @@ def test_records_that_share_a_draw_do_not_average_it():
             without_common=lambda rows: marginal.whiten(rows.reshape(6 * frames, -1)).reshape(rows.shape),
             whitened_modes=modes[number] @ turn,
             common=SimpleNamespace(**{"known_as": common.known_as, "whole_factor": common.factor @ turn},
-                by_kind=common.by_kind, covariance=common.covariance, geometry=None, loop_std={},
+                by_kind=common.by_kind, covariance=common.covariance, geometry=None, loop_std={}, body_std={},
                 all_names=common.all_names),
             driven=True,
             ok=np.ones(frames, dtype=bool),

@@ -1,0 +1,163 @@
+"""Errors of the bodies and passive joints that a model has in a simpler form.
+
+A model with centred bodies takes centres of mass to be in their places and products of inertia to
+be zero. A model without friction of passive joints lets them turn freely. Most of what a real robot
+has beside this leaves no residual, because the parameters take it up, with wrong values. Its
+standard deviations are therefore stated, in the robot file or in the scenario. It is estimated
+beside the parameters, as errors that all poses of a record have in common, and widens their
+intervals.
+
+All bodies of a kind have the same error, each in its own axes, and so have the passive joints at
+one place of all legs, because they are made alike. The errors act as torques at the joints
+(`body_torques`, `joint_torques`). Their effect on the poses is taken as linear.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dynamics import Robot
+from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, equilibrium
+from dynamics.parameters import passive_parameters
+from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
+from identify.arrays import Array
+from identify.loop_parameters import check_parameter_set
+from identify.model.body_torques import full_regressor, passive_columns, run_motion
+from identify.model.joint_torques import equivalent_commands
+from identify.scenario import Model
+
+if TYPE_CHECKING:
+    from identify.model.loop_model import LoopModel
+
+
+@dataclass(frozen=True)
+class BodyError:
+    """Error that all bodies of a kind, or the passive joints at one place, have in common.
+
+    Attributes
+    ----------
+    kind, name : str
+        Kind of the error, as `identification.nuisances` names it, and its name, which begins with
+        the kind and ends with the unit.
+    owners : tuple of int
+        Rows of the bodies in the layout of the robot. There are none for a passive joint.
+    parameters : tuple of str
+        Parameters that are zero in the model, one for each owner, or the friction of the joint.
+    """
+
+    kind: str
+    name: str
+    owners: tuple[int, ...]
+    parameters: tuple[str, ...]
+
+
+def body_error_stds(robot: Robot, model: Model, kinds: tuple[str, ...]) -> dict[str, float]:
+    """Return the standard deviations of the errors of bodies and passive joints, of some kinds.
+
+    They are those of the model or, if it states none, of the robot file. Errors that are assumed to
+    be zero are left out. Raises the ScenarioError of `check_parameter_set`.
+    """
+    check_parameter_set(robot, model.start_parameters)
+    in_file = robot.geometry.unstated
+    pairs = {
+        "centres": (model.centre_std, in_file.centre_std),
+        "products": (model.product_std, in_file.product_std),
+        "passive_friction": (model.passive_viscous_std_N_m_s_rad, in_file.passive_viscous_std),
+    }
+    stated = {kind: known if own is None else own for kind, (own, known) in pairs.items()}
+    values = robot.parameter_sets[model.start_parameters].dynamic
+    bodies = robot.layout.bodies_of(values[robot.layout.rigid])
+    sizes = {
+        "centres": bodies[:, 0] * robot.geometry.body_lengths,
+        "products": bodies[:, 4:7].mean(axis=1),
+    }
+    stds = {}
+    for one in _errors(robot):
+        size = float(sizes[one.kind][list(one.owners)].mean()) if one.owners else 1.0
+        if (std := stated[one.kind] * size) and one.kind in kinds:
+            stds[one.name] = std
+    return stds
+
+
+def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
+    """Return the changes (k, N, n) of commands with the effect of each error of a run's bodies.
+
+    They are those for one standard deviation of each error, along the motion with parameters (p,):
+    rad or m, or N m or N if the drives take torques. None: there are no such errors. Raises
+    LoopFailure if the model is unstable.
+    """
+    if not run.common.body_std:
+        return None
+    torques = _torques(run, parameters, run.simulate(parameters))
+    if run.settings.drives.torques:
+        return -torques
+    late = run.stated_latencies if run.latencies is None else run.latencies
+    law = run.drive_law(parameters)
+    count, frames, joints = torques.shape
+    # all errors at once, as if each had joints of its own
+    gains = [np.tile(one, count) for one in (law.lp, law.li, law.ld)]
+    tiled = law._replace(lp=gains[0], li=gains[1], ld=gains[2])
+    side_by_side = torques.transpose(1, 0, 2).reshape(frames, -1)
+    needed = equivalent_commands(side_by_side, late, tiled, run.settings.timing)
+    return -needed.reshape(frames, count, joints).transpose(1, 0, 2)
+
+
+def fed_forward(
+    run: "LoopModel", robot: Robot, parameters: Array, reference: Reference, loop: LoopSettings
+) -> dict[str, Any]:
+    """Return the arguments by which a servo's commands get the effect of a run's errors of bodies.
+
+    They are arguments of `dynamics.closed_loop.simulate_servo` beside those that are given. The
+    servo begins at rest as without the errors. Without errors there are no arguments.
+    """
+    change = run.body_commands
+    if change is None:
+        return {}
+    at_rest = robot, parameters, reference.poses[0], loop.servo, run.robot
+    return {"start": equilibrium(*at_rest, drives=loop.drives), "feedforward": change}
+
+
+def _torques(run: "LoopModel", parameters: Array, found: ClosedLoopRun) -> Array:
+    """Return the torques (k, N, n) that the joints need for one standard deviation of each error.
+
+    found: run of the model at parameters (p,). Drives with an integral already hold what the robot
+    needs at rest before the motion.
+    """
+    geometry = run.robot.geometry
+    passive = passive_parameters(geometry.legs)
+    whole = replace(geometry, full_bodies=("all",), passive_friction=passive).layout.rigid_names
+    stds = run.common.body_std
+    changes = np.zeros((len(whole), len(stds)))
+    for one in _errors(run.robot):
+        if one.name in stds:
+            rows = [whole.index(name) for name in one.parameters]
+            changes[rows, list(stds).index(one.name)] = stds[one.name]
+    motion = run_motion(run, found)
+    columns = [full_regressor(geometry, motion), passive_columns(geometry, motion)]
+    wrenches = np.concatenate(columns, axis=2) @ changes
+    torques = np.einsum("tij,tjk->kti", motion.torque_maps, wrenches)
+    if run.settings.drives.torques or not run.drive_law(parameters).integrates:
+        return np.asarray(torques)
+    return np.asarray(torques - torques[:, :1])
+
+
+def _errors(robot: Robot) -> Iterator[BodyError]:
+    """Yield the possible errors of centred bodies, and of passive joints without friction."""
+    layout = robot.layout
+    for kind in dict.fromkeys(one.name for one in layout.kinds):
+        rows = tuple(
+            row for row, one in enumerate(layout.kinds) if one.name == kind and not layout.full[row]
+        )
+        for entry in (*FIRST_MOMENTS, *PRODUCTS) if rows else ():
+            names = tuple(f"{layout.bodies[row]}.{entry}" for row in rows)
+            if entry in FIRST_MOMENTS:
+                yield BodyError("centres", f"centres.{kind}.{entry}_kg m", rows, names)
+            else:
+                yield BodyError("products", f"products.{kind}.{entry}_kg m^2", rows, names)
+    for name in passive_parameters(robot.geometry.legs):
+        joint, law = name.split(".")
+        if law == "viscous" and name not in layout.passive_names:
+            said = f"passive_friction.{joint}_N m s/rad"
+            yield BodyError("passive_friction", said, (), (name,))
