@@ -43,6 +43,9 @@ DESCRIPTION = "record"
 COLUMNS = "columns"
 """Name of the table of that file with the columns of a log."""
 
+MOST_HZ = 1e6
+"""Frame rate, Hz, that no record has. A scenario names its own limit."""
+
 TABLES = (".csv", ".tsv", ".txt")
 """Endings of the names of tables."""
 
@@ -220,7 +223,7 @@ def with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
     timing = content.get("timing")
     rate = timing.get("frame_rate_hz") if isinstance(timing, Mapping) else None
     whole = dict(content)
-    if isinstance(rate, int | float) and rate > 0:
+    if isinstance(rate, int | float) and 0 < rate < MOST_HZ:
         for section, planned in (("excitation", Excitation()), ("validation", Validation())):
             frames = round(planned.duration_s * rate)
             if frames != planned.duration_s * rate and section not in content:

@@ -33,6 +33,7 @@ from identify.experiment.rig_as_known import stated_covariance
 from identify.loop_parameters import choose_parameters
 from identify.record.csv_record import columns_of
 from identify.record.own_record import read_own_records
+from identify.record.readers.tables import LoggedTable
 from identify.record.record_template import description_text, table_text
 from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import SCENARIOS
@@ -327,6 +328,38 @@ def read_record(path):
         )
 
 
+EXPORT = """Format Version,1.23,Rotation Type,Quaternion,Length Units,Meters
+
+,,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body
+,,Plate,Plate,Plate,Plate,Plate,Plate,Plate
+,,1,1,1,1,1,1,1
+,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position
+Frame,Time (Seconds),X,Y,Z,W,X,Y,Z
+0,0.000000,0,0,0,1,0.001,0.002,0.2
+1,0.016667,0,0,0.00100000,0.99999950,0.0011,0.002,0.201
+2,0.033333,,,,,,,
+3,0.050000,0,0,0,1,-0.5e-3,0.002,0.2
+"""
+TURNS = tuple(f"Plate Rotation {axis}" for axis in "XYZW")
+PLACES = tuple(f"Plate Position {axis}" for axis in "XYZ")
+
+
+def read_export(path):
+    """In an export with its own header, the cells of a line are the numbers of a row."""
+    found = LoggedTable(path).read("", ("Time (Seconds)", *TURNS, *PLACES))
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    numbers = np.stack([found.numbers(name) for name in (*TURNS, *PLACES)], axis=1)
+    moments = found.moments("Time (Seconds)", "s", 60.0)
+    if not set(EXPORT.splitlines()[2:7]) <= set(lines):
+        return
+    for row, number in enumerate(found.rows.numbers):
+        cells = [cell.strip() for cell in next(csv.reader([lines[number - 1]]))]
+        stated = [float(cell) if cell else np.nan for cell in cells[2:]]
+        stated += [np.nan] * (len(numbers[row]) - len(stated))
+        np.testing.assert_array_equal(numbers[row], stated)
+        assert float(moments[row]) == float(cells[1])
+
+
 def read_board_file(path):
     found = read_board(path)
     assert same(stated_in(path), found.model_dump())
@@ -397,11 +430,12 @@ KINDS = {
     "study": (read_study, study_texts, "x.toml", 300),
     "description": (read_record, lambda: [description_of_record()], "x.toml", 100),
     "table": (read_record, lambda: [table_of_record()], "x.csv", 100),
+    "export": (read_export, lambda: [EXPORT], "x.csv", 100),
     "board": (read_board_file, lambda: [BOARD], "x.toml", 50),
     "calibration": (read_calibration, lambda: [calibration_text()], "x.json", 50),
     "result": (read_result, lambda: [result_text()], "x.json", 100),
 }  # fmt: skip
-"""How each kind of file is read and compared, the texts that are changed, and how many: 2,000."""
+"""How each kind of file is read and compared, the texts that are changed, and how many: 2,100."""
 
 
 def check_changed(kind, part, tmp_path):
