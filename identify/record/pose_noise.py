@@ -31,6 +31,9 @@ JUMPS = 8.0
 MOVING = 0.99
 """Share of the power of a motion that lies below its highest frequency."""
 
+MOVES = 2.0
+"""Smallest standard deviation of what moves, in that of its noise."""
+
 SEGMENTS = 4
 """Number of segments of the spectrum, and more as they overlap."""
 
@@ -141,7 +144,8 @@ class Spectrum:
     power : ndarray, shape (F, 6)
         Power of each entry of a pose, m2/Hz and rad2/Hz.
     highest_hz : float
-        Frequency below which 99 % of the power of the positions and of the angles lies.
+        Frequency below which 99 % of the power of the positions and of the angles lies, zero if
+        nothing moves.
     """
 
     frequency: Array
@@ -149,10 +153,20 @@ class Spectrum:
     highest_hz: float
 
 
-def spectrum(time: Array, poses: Array) -> Spectrum:
+def mean_rate(time: Array) -> float:
+    """Return the rate of rows at times (N,), Hz, without their gaps.
+
+    Times that are rounded, as to milliseconds, have another median interval than the rate.
+    """
+    steps = np.diff(time)
+    return 1 / float(steps[steps <= GAP * np.median(steps)].mean())
+
+
+def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     """Return the spectrum of poses (N, 6) that were measured at times (N,).
 
-    Poses are interpolated at even times, which are as many.
+    Poses are interpolated at even times, which are as many. Positions or angles that move no more
+    than their noise (6,), m and rad, have no highest frequency.
     """
     even = np.linspace(time[0], time[-1], len(time))
     rate = (len(time) - 1) / (time[-1] - time[0])
@@ -162,7 +176,7 @@ def spectrum(time: Array, poses: Array) -> Spectrum:
     highest = 0.0
     for kind in (slice(0, 3), slice(3, 6)):
         total = np.cumsum(power[:, kind].sum(axis=1))
-        if total[-1] > 0:
+        if (values[:, kind].std(axis=0) > MOVES * noise[kind]).any():
             place = int(np.searchsorted(total, MOVING * total[-1]))
             highest = max(highest, float(frequency[place]))
     return Spectrum(frequency, power, highest)

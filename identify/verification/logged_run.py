@@ -89,7 +89,7 @@ class LoggedRun:
     @cached_property
     def spectrum(self) -> Spectrum:
         """Spectrum of the poses."""
-        return spectrum(self.time, self.poses)
+        return spectrum(self.time, self.poses, np.nan_to_num(self.noise.std))
 
     @cached_property
     def lag(self) -> MotionLag:

@@ -16,7 +16,7 @@ from identify.estimation.base_parameters import structure
 from identify.files.dataset import POSE
 from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
-from identify.record.pose_noise import JUMPS
+from identify.record.pose_noise import JUMPS, mean_rate
 from identify.record.suspicions import joint_motion, suspicions
 from identify.verification.logged_run import LoggedRun
 from identify.verification.robot_check import Finding
@@ -83,7 +83,7 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
     wanted = logged.side.timing.frame_rate_hz
     time = logged.telemetry.poses.time
     steps = np.diff(time)
-    rate = 1 / float(np.median(steps))
+    rate = mean_rate(time)
     yield Finding(
         "pose rate",
         abs(rate / wanted - 1) <= RATE,
@@ -91,9 +91,8 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         wanted,
         "Hz",
         None,
-        f"{len(time)} rows of poses in {np.ptp(time):.4g} s, with a median interval of "
-        f"{1e3 * float(np.median(steps)):.6g} ms; timing.frame_rate_hz is "
-        f"{wanted:g}",
+        f"{len(time)} rows of poses in {np.ptp(time):.4g} s, {rate:.6g} a second without gaps; "
+        f"timing.frame_rate_hz is {wanted:g}",
     )
     # Rows that are lost do not count as jitter.
     even = np.round(steps * rate)
@@ -107,22 +106,21 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
             text += f"; times are rounded to {name}"
             break
     yield Finding("pose jitter", True, float(off.max()), None, "s", None, text)
-    commands = np.diff(logged.telemetry.commands.time)
-    rows = len(commands) + 1
+    commands = logged.telemetry.commands.time
     yield Finding(
         "command rate",
         True,
-        1 / float(np.median(commands)),
+        mean_rate(commands),
         None,
         "Hz",
         None,
-        f"{rows} rows of commands in {commands.sum():.4g} s",
+        f"{len(commands)} rows of commands in {np.ptp(commands):.4g} s",
     )
 
 
 def _gaps(logged: LoggedRun) -> Iterator[Finding]:
     poses = logged.telemetry.poses
-    due = round(np.ptp(poses.time) / float(np.median(np.diff(poses.time)))) + 1
+    due = round(np.ptp(poses.time) * mean_rate(poses.time)) + 1
     lost = max(due - int(poses.ok.sum()), 0)
     yield Finding(
         "lost poses",
@@ -227,7 +225,7 @@ def _motion(logged: LoggedRun) -> Iterator[Finding]:
             + " m and rad",
         )
     highest = logged.spectrum.highest_hz
-    rate = 1 / float(np.median(np.diff(logged.time)))
+    rate = mean_rate(logged.time)
     yield Finding(
         "spectrum",
         highest * FRAMES_A_PERIOD <= rate,

@@ -27,7 +27,9 @@ def test_noise_is_found_to_a_tenth_and_jumps_by_their_times_though_times_jitter(
     found = pose_noise(time, measured)
     np.testing.assert_allclose(found.std, SIGMA, rtol=0.1)
     np.testing.assert_array_equal(found.time[found.jumped], time[list(JUMPED_AT)])
-    assert spectrum(time, measured).highest_hz == pytest.approx(2.0, abs=0.25)
+    assert spectrum(time, measured, SIGMA).highest_hz == pytest.approx(2.0, abs=0.25)
+    still = SIGMA * np.random.default_rng(0).standard_normal((len(time), 6))
+    assert spectrum(time, still, SIGMA).highest_hz == 0.0
 
 
 def test_poses_too_far_apart_tell_no_noise():
