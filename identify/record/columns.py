@@ -76,7 +76,9 @@ class Log(Section):
         None, description="topic of a bag, or section of a Vicon export, with these columns"
     )
     time: str | None = Field(
-        None, description="column of the times; without it, that of the measured poses"
+        None,
+        description="column of the times; without it, that of the measured poses. A row in which "
+        "it is empty is no row of these columns",
     )
     time_unit: Literal["s", "ms", "us", "ns", "frames"] = Field(
         "s", description="unit of the times; frames are those of timing.frame_rate_hz"
@@ -152,7 +154,9 @@ class PoseColumns(Log):
 class CommandColumns(Log):
     """Columns of the joint commands.
 
-    A joint coordinate of the robot file is sign · unit · (column - zero).
+    If they name the time of the poses again, a row may hold a pose, a command or both. Otherwise
+    each row of the poses holds a command. A joint coordinate of the robot file is sign · unit ·
+    (column - zero).
     """
 
     names: list[str] = Field(description="columns of the commands of joints 1, 2, ...")
@@ -194,6 +198,15 @@ class Columns(Section):
     measured: PoseColumns
     command: CommandColumns
     reference: PoseColumns | None = None
+
+    @property
+    def holds_events(self) -> bool:
+        """Whether each row of a table is a pose or a command, at a time of the same column.
+
+        Commands then name the time of the poses again. A row without a pose is no lost pose.
+        """
+        places = [(log.file, log.topic, log.time) for log in (self.measured, self.command)]
+        return places[0] == places[1]
 
     @model_validator(mode="after")
     def _agree(self) -> "Columns":

@@ -262,6 +262,34 @@ def test_a_left_handed_log_with_y_up_is_the_same_record_with_its_axes_named(reco
     )
 
 
+def test_rows_of_events_and_columns_of_two_lengths_are_two_logs(record, tmp_path):
+    """Commands are logged in rows of their own, between those of the poses or beside them."""
+    whole = telemetry_of(as_our_table(tmp_path, record))
+    table = pd.read_csv(tmp_path / "mine.csv")
+    commands = [name for name in table if name.startswith("command_") and "time" not in name]
+    measured = [name for name in table if name.startswith("measured_")]
+    seen = table[measured].notna().all(axis=1)
+    poses_ = table.loc[seen, ["time_s", *measured]]
+    written = table[["time_s", *commands]].assign(time_s=table["time_s"] + 0.005)
+    listed = ", ".join(f'"{name}"' for name in commands)
+    head = ONE_TABLE.split("[columns.reference]")[0]
+    events = pd.concat([poses_, written]).sort_values("time_s")
+    beside = pd.concat(
+        [poses_.reset_index(drop=True), written.rename(columns={"time_s": "t"})], axis=1
+    )
+    for rows, time in ((events, "time_s"), (beside, "t")):
+        path = tmp_path / "other.csv"
+        rows.to_csv(path, index=False)
+        told = f'[columns.command]\ntime = "{time}"\nnames = [{listed}]\nunit = "rad"\n'
+        found = telemetry_of(described(path, head + told))
+        np.testing.assert_allclose(found.poses.pose, whole.poses.pose[seen], rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(found.commands.command, whole.commands.command)
+        np.testing.assert_allclose(
+            found.commands.time, whole.commands.time + 0.005, rtol=0, atol=1e-12
+        )
+        assert found.poses.ok.all()
+
+
 def test_a_description_alone_names_its_log(record, tmp_path):
     """Bags are folders with dots in their names, and one description can name several files."""
     path = as_motive(tmp_path, record)

@@ -76,21 +76,21 @@ class _Reader:
     def telemetry(self, columns: Columns, robot: Robot) -> Telemetry:
         """Return the logs of a record."""
         measured = columns.measured
-        stream = self._stream(measured, _pose_names(measured))
+        events = columns.holds_events
+        stream = self._stream(measured, _pose_names(measured), events)
         moments = self._moments(stream, measured, measured.time)
         start = moments[0]
         poses, ok = _poses(stream, measured)
         log = PoseLog(_since(moments, start), _near_home(poses, robot), ok, stream.rows)
-        commands = self._commands(columns.command, measured, start, robot)
+        commands = self._commands(columns, start, robot)
         _check_overlap(log, commands)
         return Telemetry(log, commands, self._reference(columns, start, robot))
 
-    def _commands(
-        self, given: CommandColumns, measured: PoseColumns, start: Decimal, robot: Robot
-    ) -> CommandLog:
-        own = given if given.is_own else _shared(given, measured)
+    def _commands(self, columns: Columns, start: Decimal, robot: Robot) -> CommandLog:
+        given = columns.command
+        own = given if given.is_own else _shared(given, columns.measured)
         written = [] if given.written is None else [given.written]
-        stream = self._stream(own, [*given.names, *written])
+        stream = self._stream(own, [*given.names, *written], columns.holds_events)
         time = _since(self._moments(stream, own, own.time), start)
         commands = _joint_coordinates(stream, given, robot)
         if given.is_own:
@@ -103,11 +103,9 @@ class _Reader:
         """Return the times (M,) at which commands were written, NaN in rows without one."""
         if name is None:
             return None
-        kept = [row for row, cell in enumerate(stream.columns[name]) if cell not in (None, "")]
-        cells = [stream.columns[name][row] for row in kept]
-        places = Rows(stream.rows.source, [stream.rows.numbers[row] for row in kept])
+        kept = stream.filled([name])
         found = np.full(len(stream.rows.numbers), np.nan)
-        found[kept] = _since(self._moments(Stream({name: cells}, places), own, name), start)
+        found[kept] = _since(self._moments(stream.kept(kept), own, name), start)
         return found
 
     def _reference(self, columns: Columns, start: Decimal, robot: Robot) -> ReferenceLog | None:
@@ -115,7 +113,7 @@ class _Reader:
         if given is None:
             return None
         own = given if given.is_own else _shared(given, columns.measured)
-        stream = self._stream(own, _pose_names(given))
+        stream = self._stream(own, _pose_names(given), columns.holds_events)
         poses, ok = _poses(stream, given)
         if not ok.all():
             row = int(np.argmin(ok))
@@ -123,7 +121,8 @@ class _Reader:
         time = _since(self._moments(stream, own, own.time), start)
         return ReferenceLog(time, _near_home(poses, robot), stream.rows)
 
-    def _stream(self, log: Log, names: list[str]) -> Stream:
+    def _stream(self, log: Log, names: list[str], events: bool) -> Stream:
+        """Return the rows of columns: those with a time, and of events those with any cell."""
         path = self.path if log.file is None else self.path.parent / log.file
         file = self.opened.setdefault(path, open_log(path))
         topic = checked_topic(file.headers, log.topic, str(path))
@@ -133,7 +132,17 @@ class _Reader:
                 f"{path} states {stated:g} frames per second, and timing.frame_rate_hz is "
                 f"{self.rate_hz:g}, by which its times would be counted"
             )
-        return file.read(topic, [str(log.time), *names])
+        time = str(log.time)
+        stream = file.read(topic, [time, *names])
+        rows = stream.filled([time])
+        if events:
+            told = set(stream.filled(names))
+            rows = [row for row in rows if row in told]
+        if not rows:
+            raise RecordError(
+                f"{path}: no row has a time in {time} and a cell of {', '.join(names)}"
+            )
+        return stream.kept(rows)
 
     def _moments(self, stream: Stream, log: Log, name: str | None) -> list[Decimal]:
         offset = Decimal(repr(log.time_offset_s))

@@ -44,6 +44,20 @@ class Stream:
     columns: Mapping[str, Sequence[Cell]]
     rows: Rows
 
+    def filled(self, names: Sequence[str]) -> list[int]:
+        """Return the rows in which any of some columns is not empty."""
+        columns = [self.columns[name] for name in names]
+        cells = zip(*columns, strict=True)
+        return [row for row, some in enumerate(cells) if any(c not in (None, "") for c in some)]
+
+    def kept(self, rows: Sequence[int]) -> "Stream":
+        """Return the stream with only these rows."""
+        if len(rows) == len(self.rows.numbers):
+            return self
+        columns = {name: [cells[row] for row in rows] for name, cells in self.columns.items()}
+        numbers = [self.rows.numbers[row] for row in rows]
+        return Stream(columns, Rows(self.rows.source, numbers, self.rows.word))
+
     def numbers(self, name: str) -> Array:
         """Return a column (N,). Empty cells are NaN. Raises RecordError with the row."""
         cells = self.columns[name]
