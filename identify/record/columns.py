@@ -35,7 +35,9 @@ COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vec
 
 EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
 
-CONVENTIONS = (*COUNTS, "euler_XYZ", "euler_ZYX", "euler_xyz", "...")
+EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
+
+CONVENTIONS = (*COUNTS, *EULER_USUAL, "...")
 
 
 def _check_convention(name: str) -> str:
@@ -136,6 +138,14 @@ class PoseColumns(Log):
     ok: str | None = Field(
         None, description="column that is 1 where the pose was measured, and 0 where it was lost"
     )
+
+    @property
+    def other_conventions(self) -> tuple[str, ...]:
+        """Conventions with as many columns, those that are often mistaken for each other."""
+        alike = {3: ("rotation_vector", *EULER_USUAL), 4: ("quaternion_xyzw", "quaternion_wxyz")}
+        return tuple(
+            name for name in alike.get(len(self.orientation), ()) if name != self.convention
+        )
 
     @model_validator(mode="after")
     def _agree(self) -> "PoseColumns":

@@ -8,7 +8,8 @@ columns of a log are called.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,7 +29,7 @@ from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
 from identify.record.readers.mapped import read_mapped
 from identify.record.recording import build_record, read
-from identify.record.suspicions import check_plausible
+from identify.record.suspicions import fits, suspicions
 from identify.record.telemetry import ReferenceLog, Telemetry
 from identify.scenario import Scenario
 from identify.scenario.payload import Payload
@@ -147,13 +148,29 @@ def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
     return record, recorded_scenario(record)
 
 
+def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: Robot) -> list[str]:
+    """Return what is likely wrong with a log, and the convention of rotations that would fit."""
+    found = suspicions(telemetry, robot)
+    columns = about.columns
+    if not found or columns is None:
+        return found
+    for convention in columns.measured.other_conventions:
+        measured = columns.measured.model_copy(update={"convention": convention})
+        tried = replace(about, columns=columns.model_copy(update={"measured": measured}))
+        with suppress(RecordError):
+            if fits(read_telemetry(path, tried, robot), robot):
+                found[-1] += f"; with convention = {convention!r} of the poses it would fit"
+                break
+    return found
+
+
 def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:
     about = read_description(description_file(path), path)
     scenario, measured = about.scenario, about.measured
     robot = load_robot(scenario.robot)
     telemetry = read_telemetry(path, about, robot)
-    if about.columns is not None:
-        check_plausible(telemetry, robot)
+    if about.columns is not None and (found := log_suspicions(path, about, telemetry, robot)):
+        raise RecordError("; ".join(found))
     record = _record(telemetry, robot, scenario, measured, path)
     _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:

@@ -6,7 +6,6 @@ axes and mirrored, and the commands in other units, directions, orders and zeros
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
@@ -16,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.errors import RecordError
 from identify.record.motion_lag import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 
@@ -65,23 +63,19 @@ ANGLES_TRIED = {
 NAMES = ("x", "y", "z")
 
 
-@dataclass(frozen=True)
-class Suspicion:
-    """Sentence about what is likely wrong, with the evidence."""
-
-    text: str
-
-
-def check_plausible(telemetry: Telemetry, robot: Robot) -> None:
-    """Raise RecordError if units, frames or joints of telemetry are likely wrong."""
-    found = suspicions(telemetry, robot)
-    if found:
-        raise RecordError("; ".join(one.text for one in found))
-
-
-def suspicions(telemetry: Telemetry, robot: Robot) -> list[Suspicion]:
-    """Return what is likely wrong with the units, frames and joints of telemetry."""
+def suspicions(telemetry: Telemetry, robot: Robot) -> list[str]:
+    """Return what is likely wrong with the units, frames and joints of telemetry, as sentences."""
     return list(_found(telemetry, robot))
+
+
+def fits(telemetry: Telemetry, robot: Robot) -> bool:
+    """Return whether the poses are in reach, and all joints move as their commands do."""
+    poses = telemetry.poses
+    if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
+        return False
+    time, coordinates = joint_motion(telemetry, robot)
+    held = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    return bool(np.diagonal(_correlations(held, coordinates)).min() > FITS)
 
 
 def joint_motion(telemetry: Telemetry, robot: Robot) -> tuple[Array, Array]:
@@ -99,7 +93,7 @@ def lag_of(telemetry: Telemetry, robot: Robot) -> MotionLag:
     return motion_lag(time, coordinates, commands.time, commands.command)
 
 
-def _found(telemetry: Telemetry, robot: Robot) -> Iterator[Suspicion]:
+def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
     poses = telemetry.poses
     reached = _reached(_on_chart(poses.pose[poses.ok], robot), robot)
     if reached.mean() < IN_REACH:
@@ -112,15 +106,15 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[Suspicion]:
         return
     alike = np.diagonal(_correlations(held, coordinates))
     order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates)
-    fits = np.flatnonzero(np.abs(alike) > FITS)
+    sure = np.flatnonzero(np.abs(alike) > FITS)
     hint = ""
-    if len(fits) < len(alike):
+    if len(sure) < len(alike):
         hint = order or _fitting(telemetry, robot, alike.mean())
     if not hint:
         # A joint whose drive does not follow says nothing about its own zero.
-        yield from _of_joints(fits, held, coordinates, alike, robot, order)
+        yield from _of_joints(sure, held, coordinates, alike, robot, order)
     else:
-        yield Suspicion(
+        yield (
             "the measured motion is not that of the commands (correlations of the joints from "
             f"{alike.min():.2f} to {alike.max():.2f}); {hint}"
         )
@@ -144,7 +138,7 @@ def _of_joints(
     alike: Array,
     robot: Robot,
     order: str,
-) -> Iterator[Suspicion]:
+) -> Iterator[str]:
     """Yield wrong directions, units and zeros of joints (k,) that move as their commands do.
 
     `order` says in which other order the commands would fit.
@@ -156,7 +150,7 @@ def _of_joints(
     against = joints[alike[joints] < OPPOSES]
     if len(against):
         listed = ", ".join(str(joint + 1) for joint in against)
-        yield Suspicion(
+        yield (
             f"the commands of joint {listed} count against the direction of the robot file: their "
             f"correlation with the poses is {alike[against[0]]:.2f} (columns.command.signs)"
             + (f"; or {order}" if order else "")
@@ -166,7 +160,7 @@ def _of_joints(
     slope = float(np.median(slopes[joints]))
     for factor, said in (LENGTHS_TRIED if prismatic else ANGLES_TRIED).items():
         if said and abs(np.log(slope / factor)) < np.log(SCALE):
-            yield Suspicion(
+            yield (
                 f"the commands are {1 / slope:.3g} times the joint coordinates of the poses: they "
                 f"are {said.partition(' ')[2]} (columns.command.unit)"
             )
@@ -180,15 +174,15 @@ def _of_joints(
         )
         if turns and abs(gap - 2 * np.pi * turns) < NEAR_TURN:
             by = "a turn" if abs(turns) == 1 else f"{abs(turns)} turns"
-            yield Suspicion(f"{lies}: its zero is off by {by} (columns.command.zeros)")
+            yield f"{lies}: its zero is off by {by} (columns.command.zeros)"
         elif abs(gap) > ZERO * robot.travel_limit:
-            yield Suspicion(
+            yield (
                 f"{lies}, {abs(gap) / robot.travel_limit:.0%} of the travel limit: its zero, or "
                 "the frame of the poses, differs from the robot file"
             )
 
 
-def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]) -> Suspicion:
+def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]) -> str:
     """Say that poses are out of reach, with the row of the first, and what would fit."""
     poses = telemetry.poses
     row = int(np.flatnonzero(poses.ok)[np.argmin(reached)])
@@ -196,7 +190,7 @@ def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]
     pose = ", ".join(f"{value:.6g}" for value in poses.pose[row])
     leg = int(np.argmin(robot.reach_margin(_on_chart(poses.pose[row], robot)))) + 1
     hint = _fitting(telemetry, robot, 0.0)
-    return Suspicion(
+    return (
         f"{place}: leg {leg} of {robot.name} cannot reach the measured pose [{pose}], m and rad, "
         f"as {1 - reached.mean():.0%} of the poses; "
         + (hint or "its units, its frame (base_from_frame) or its body differ from the robot file")

@@ -32,6 +32,7 @@ from identify.record.motion_lag import MotionLag
 from identify.record.own_record import (
     description_file,
     is_log,
+    log_suspicions,
     read_description,
     read_telemetry,
 )
@@ -39,7 +40,7 @@ from identify.record.pose_noise import GAP, PoseNoise, Spectrum, pose_noise, spe
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import poses, read, recorded_reference
 from identify.record.servo_delay import ServoDelay, servo_delay
-from identify.record.suspicions import lag_of
+from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification
 
@@ -64,12 +65,15 @@ class LoggedRun:
         Settings of the identification: its prior and its scale anchor.
     stated : ndarray, shape (6,), or None
         Stated standard deviations of a measured pose, m and rad.
+    suspicions : tuple of str
+        What is likely wrong with the units, frames and joints.
     """
 
     telemetry: Telemetry
     side: ModelSide
     settings: Identification
     stated: Array | None
+    suspicions: tuple[str, ...]
 
     @property
     def time(self) -> Array:
@@ -184,6 +188,7 @@ def read_logged_run(path: Path) -> LoggedRun:
         scenario = about.scenario
         robot = load_robot(scenario.robot)
         telemetry = read_telemetry(path, about, robot)
+        found = log_suspicions(path, about, telemetry, robot)
         measured = about.measured
         stds = [measured.position_std_m, measured.orientation_std_rad]
         stated = None if None in stds else np.repeat(np.array(stds, dtype=float), 3)
@@ -192,11 +197,14 @@ def read_logged_run(path: Path) -> LoggedRun:
         scenario = recorded_scenario(record)
         robot = load_robot(scenario.robot)
         telemetry = recorded_telemetry(record, str(path))
+        found = suspicions(telemetry, robot)
         stated = None
     if telemetry.poses.covariance is not None:
         covariance = telemetry.poses.covariance[telemetry.poses.ok]
         stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
-    return LoggedRun(telemetry, model_side(robot, scenario), scenario.identification, stated)
+    return LoggedRun(
+        telemetry, model_side(robot, scenario), scenario.identification, stated, tuple(found)
+    )
 
 
 def recorded_telemetry(record: xr.Dataset, source: str) -> Telemetry:

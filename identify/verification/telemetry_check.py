@@ -17,7 +17,7 @@ from identify.files.dataset import POSE
 from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
 from identify.record.pose_noise import JUMPS, mean_rate
-from identify.record.suspicions import joint_motion, suspicions
+from identify.record.suspicions import joint_motion
 from identify.verification.logged_run import LoggedRun
 from identify.verification.robot_check import Finding
 
@@ -262,12 +262,12 @@ def _saturation(logged: LoggedRun) -> Iterator[Finding]:
 
 
 def _plausible(logged: LoggedRun) -> Iterator[Finding]:
-    found = suspicions(logged.telemetry, logged.side.robot)
-    if not found:
+    if not logged.suspicions:
         text = "nothing contradicts the units, axes, directions and zeros of the robot file"
         yield Finding("units and frames", True, 0, 0, "1", None, text)
-    for one in found:
-        yield Finding("units and frames", False, len(found), 0, "1", None, one.text)
+    for one in logged.suspicions:
+        count = len(logged.suspicions)
+        yield Finding("units and frames", False, count, 0, "1", None, one)
 
 
 def _clocks(logged: LoggedRun) -> Iterator[Finding]:

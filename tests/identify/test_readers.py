@@ -290,6 +290,25 @@ def test_rows_of_events_and_columns_of_two_lengths_are_two_logs(record, tmp_path
         assert found.poses.ok.all()
 
 
+def test_a_quaternion_of_the_other_order_is_named(record, tmp_path):
+    """All poses are then turned by half a turn, out of reach."""
+    path = as_table(tmp_path, record)
+    ok = record["measured_ok"].values == 1
+    table = pd.read_csv(path)
+    turned = Rotation.from_euler("XYZ", poses(record, "measured")[ok, 3:])
+    table.loc[ok, ["qw", "qx", "qy", "qz"]] = turned.as_quat(scalar_first=True)
+    table.to_csv(path, index=False)
+    change(
+        path.with_suffix(".toml"),
+        'orientation = ["measured_alpha_rad", "measured_beta_rad", "measured_gamma_rad"]\n'
+        'convention = "euler_XYZ"',
+        'orientation = ["qw", "qx", "qy", "qz"]\nconvention = "quaternion_xyzw"',
+    )
+    said = "cannot reach .* with convention = 'quaternion_wxyz' of the poses it would fit"
+    with pytest.raises(RecordError, match=said):
+        read_own_records([path])
+
+
 def test_a_description_alone_names_its_log(record, tmp_path):
     """Bags are folders with dots in their names, and one description can name several files."""
     path = as_motive(tmp_path, record)

@@ -11,11 +11,12 @@ import pytest
 
 from identify.commands.help import BEYOND_LIMIT, DONE, MISUSED, NOT_DONE
 from identify.record.recording import write
+from identify.record.suspicions import suspicions
 from identify.record.telemetry import Telemetry
 from identify.verification.logged_run import LoggedRun, recorded_telemetry
 from identify.verification.telemetry_check import check_telemetry
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import SIGMA, quick, run_plant, side_of
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, side_of
 from tests.identify.test_readers import as_motive, change
 
 SCENARIO = quick(**{"timing.latency_s": 0.004})
@@ -28,7 +29,8 @@ def record():
 
 
 def findings(telemetry, stated=SIGMA):
-    logged = LoggedRun(telemetry, side_of(SCENARIO), SCENARIO.identification, stated)
+    found = tuple(suspicions(telemetry, rss6()))
+    logged = LoggedRun(telemetry, side_of(SCENARIO), SCENARIO.identification, stated, found)
     return {one.check: one for one in check_telemetry(logged)}
 
 
