@@ -8,7 +8,7 @@ number outside its range is usually a typing error or a wrong unit. Schemas for 
 ranges.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
@@ -201,6 +201,26 @@ class Within:
             "minimum": max(least, shown.get("minimum", least)),
             "maximum": min(self.most, shown.get("maximum", self.most)),
         }
+
+
+INERTIA_FORMS = ("centred", "full")
+"""Forms of a body: with four or with ten inertial parameters."""
+
+
+def check_inertia_forms(value: object) -> object:
+    """Return a form of all bodies, or a table of forms by body or kind of body.
+
+    Raises ValueError, with the valid forms, for anything else.
+    """
+    forms = value.items() if isinstance(value, Mapping) else [("", value)]
+    for body, form in forms:
+        if form not in INERTIA_FORMS:
+            owner = f"{body} = " if body else ""
+            raise ValueError(
+                f"{owner}{form!r} is no form of a body; valid: {' or '.join(INERTIA_FORMS)}, or a "
+                'table of these by body or kind of body, such as { platform = "full" }'
+            )
+    return value
 
 
 def within(quantity: Any) -> Within:

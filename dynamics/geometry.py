@@ -145,6 +145,21 @@ class RobotGeometry:
                 found[body] = np.linalg.norm(segment.rod[1] - segment.rod[0])
         return found
 
+    @property
+    def body_reaches(self) -> np.ndarray:
+        """Distance (bodies,), m, that the drawing of each body reaches from its reference point.
+
+        The platform reaches to its farthest joint, and a body of a leg to the end of its rod.
+        """
+        farthest = np.linalg.norm(self.platform_joints, axis=1).max()
+        found = np.full(len(self.layout.bodies), farthest)
+        for leg, of_leg in zip(self.legs, self.layout.of_leg, strict=True):
+            for body, segment in zip(of_leg, leg.segments(), strict=True):
+                to_ends = np.linalg.norm(segment.rod - segment.centre, axis=1).max()
+                aside = np.linalg.norm(segment.copies, axis=1).max()
+                found[body] = to_ends + aside + segment.radius
+        return found
+
     def joints_at(self, pose: np.ndarray) -> np.ndarray:
         """Platform joints A (legs, 3) at a pose (6,), in the axes of the base, m."""
         return np.asarray(pose[:3] + self.platform_joints @ base_from_platform(pose).T)

@@ -152,9 +152,10 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
     halves = sum(moments[name] / 2 for name in others)
     if moments[largest] / 2 <= (1 + rounding) * halves:
         return ""
+    excess = moments[largest] / 2 - halves
     return (
         f"{largest} {moments[largest]:g} > "
-        f"{' + '.join(f'{name} {moments[name]:g}' for name in others)}"
+        f"{' + '.join(f'{name} {moments[name]:g}' for name in others)} by {2 * excess:.2g}"
     )
 
 

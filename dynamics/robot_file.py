@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from dynamics.checks import Acceleration, Place, Travel, shown
+from dynamics.checks import Acceleration, Place, Travel, check_inertia_forms, shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.files import Name, check_name, is_file, parse_toml, read_text
 from dynamics.geometry import RobotGeometry
@@ -78,6 +78,11 @@ class RobotFile(Strict):
     parameters: dict[str, Parameters] = Field(
         description="named sets; `initial` has the initial guess of identification"
     )
+
+    @field_validator("inertia", mode="before")
+    @classmethod
+    def _forms_are_known(cls, value: object) -> object:
+        return check_inertia_forms(value)
 
     @model_validator(mode="before")
     @classmethod

@@ -46,6 +46,7 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
+from identify.estimation.full_bodies import full_body_warnings
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import (
     ScaleAnchor,
@@ -292,16 +293,20 @@ def judge(
         reference_regressor(run.robot, run.reference, run.settings.timing.frame_rate_hz)
         for run in problem.runs
     ]
+    groups = group_estimates(base, guess, criterion, estimate, uncertainty)
+    identifiable = criterion.judge(each, uncertainty.covariance)
+    in_groups = group_rows(base, robot.layout)[groups.identifiable] != 0
+    shown = identifiable | np.any(in_groups, axis=0)
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
-        identifiable=criterion.judge(each, uncertainty.covariance),
+        identifiable=identifiable,
         prior_share=prior_share,
         common_share={
             kind: variance_share(each, part, uncertainty.covariance)
             for kind, part in uncertainty.of_common.items()
         },
         intervals=bounded.intervals(each),
-        groups=group_estimates(base, guess, criterion, estimate, uncertainty),
+        groups=groups,
         group_intervals=bounded.intervals(group_rows(base, robot.layout)),
         conditioning=conditioned,
         base_rank=rank_by_threshold(np.concatenate(excited), qr_threshold),
@@ -311,6 +316,7 @@ def judge(
             *uncertainty.warnings(),
             *explanation.warnings(),
             *bounded.warnings(),
+            *full_body_warnings(robot, estimate, uncertainty.covariance, shown),
             *conditioned.warnings(),
             *scale_warnings(
                 problem.anchor, robot.layout.names[gain], gain_left, float(prior_share[gain])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics import Robot
+from dynamics.closed_loop.drives import READS
 from dynamics.errors import ParameterError
 from dynamics.parameters import (
     JOINT_PID,
@@ -18,7 +19,7 @@ from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess
-from identify.loop_parameters import in_form, of_actuators
+from identify.loop_parameters import in_form, is_gain, of_actuators
 from identify.random_streams import ENCODER_OFFSETS, JOINT_ZEROS, TRUE_GEOMETRY, child
 from identify.record.known_geometry import KnownGeometry
 from identify.record.run_error_covariance import factor
@@ -51,6 +52,11 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
                 f"{', '.join(possible)}, and {_gains(stated)}"
             )
         body, entry = name.split(".")
+        if is_gain(name) and entry not in READS[switches.drive]:
+            raise ScenarioError(
+                f"plant.values.{name} = {switches.values[name]:g}, but the law {switches.drive} of "
+                f"the drives has only {', '.join(READS[switches.drive])}"
+            )
         if entry in SIGNED:
             full.add(body)
         if name in possible:

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from dynamics.checks import Gain, within
+from dynamics.checks import Gain, check_inertia_forms, within
 from identify.own_parts import LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
@@ -147,6 +147,11 @@ class _Side(Section):
     stribeck_velocity_m_s: float | None = quantity(
         None, "m/s", "the same for actuators that slide", gt=0
     )
+
+    @field_validator("inertia", mode="before")
+    @classmethod
+    def _forms_are_known(cls, value: object) -> object:
+        return None if value is None else check_inertia_forms(value)
 
     @model_validator(mode="after")
     def _constants_fit_the_law(self) -> "_Side":

@@ -93,6 +93,7 @@ def check_robot(
         lambda: _holding(robot, parameters, around.settings.drives.torque_limit),
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
+        lambda: _centres(robot, parameters),
         lambda: _loop(robot, parameters, around.settings),
         lambda: _designed(robot, parameters, around),
         lambda: _seen(robot, around.sensor, around.sensor_file),
@@ -229,6 +230,26 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
     yield Finding(
         "inertias", largest <= NEGLIGIBLE_CHANGE, largest, NEGLIGIBLE_CHANGE, "1", leg, text
     )
+
+
+def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
+    """Check that the centres of mass of full bodies are within their drawings."""
+    layout = robot.layout
+    bodies = layout.bodies_of(parameters[layout.rigid])
+    full = np.flatnonzero(np.array(layout.full) & (bodies[:, 0] > 0))
+    if not len(full):
+        return
+    off = np.linalg.norm(bodies[full, 1:4], axis=1) / bodies[full, 0]
+    reach = robot.geometry.body_reaches[full]
+    worst = int(np.argmax(off / reach))
+    body = layout.bodies[full[worst]]
+    leg = next((k + 1 for k, own in enumerate(layout.of_leg) if full[worst] in own), None)
+    text = (
+        f"the centre of mass of {body} is {off[worst]:.3g} m from where that of a centred body is; "
+        f"its drawing reaches {reach[worst]:.3g} m"
+    )
+    share = float(off[worst] / reach[worst])
+    yield Finding("centres of mass", share <= 1.0, share, 1.0, "1", leg, text)
 
 
 def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Iterator[Finding]:
