@@ -23,8 +23,8 @@ from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.measuring.frame_solver import SolvedFrames, solve_frames
 from cmmsim.measuring.measurement import MeasuredPoses, Measurement, lost_measurement
-from cmmsim.measuring.observation import ManyExposures
 from cmmsim.measuring.pose_estimator import PoseEstimator
+from cmmsim.radiometry.stereo_images import ManyExposures
 from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
 T = TypeVar("T")

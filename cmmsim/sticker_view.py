@@ -65,6 +65,7 @@ class StickerView:
             centre_error_px=centre_error_px,
             exposed_share=timing.exposure * timing.frame_rate,
             line_error_px=0.0 if self.known is None else self.known.line_std(self._stickers),
+            dark=self.file.stickers.dark,
         )
 
     @property

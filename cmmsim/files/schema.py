@@ -180,7 +180,7 @@ class Camera(Section):
     full_well: Electrons = quantity(..., "electrons", "saturation capacity of a pixel")
     black_level: Grey = quantity(0.0, "grey values", "grey value without light")
     noise: bool = quantity(True, "", "true for images with noise")
-    bit_depth: Literal[8, 10, 12] = quantity(8, "bit", "number of bits of a grey value")
+    bit_depth: Literal[8, 10, 12, 14, 16] = quantity(8, "bit", "number of bits of a grey value")
     prnu: Annotated[float, Field(ge=0.0, le=0.2)] = quantity(
         0.0, "", "relative differences between the sensitivities of pixels, rms"
     )
@@ -232,7 +232,10 @@ class Detection(Section):
 
 
 class Stickers(Section):
-    """Stickers, which are bright discs in dark rings, and grey levels of the scene.
+    """Stickers, which are bright discs in dark rings or the reverse, and grey levels of the scene.
+
+    With ``sticker_level`` below ``ring_level``, stickers are dark discs in bright rings, such as
+    the dots of a board.
 
     ``per_plane`` replaces the listed stickers on each plane of the platform by this number of
     stickers, evenly distributed on an ellipse.
@@ -254,16 +257,16 @@ class Stickers(Section):
     )
 
     @model_validator(mode="after")
-    def _bright_on_dark(self) -> Stickers:
+    def _disc_in_ring(self) -> Stickers:
         if self.ring_radius < self.radius:
             raise ValueError(
                 f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "
-                "stickers are detected as bright discs in dark rings"
+                "stickers are detected as discs in rings"
             )
-        if self.sticker_level <= self.ring_level:
+        if self.sticker_level == self.ring_level:
             raise ValueError(
-                f"sticker_level {self.sticker_level} must be above ring_level {self.ring_level}: "
-                "stickers are detected as bright discs in dark rings"
+                f"sticker_level {self.sticker_level} must not be ring_level: stickers are detected "
+                "as bright discs in dark rings, or as dark discs in bright rings"
             )
         if self.placement[0] > self.placement[1]:
             raise ValueError(
@@ -271,6 +274,11 @@ class Stickers(Section):
                 "distance, in this order"
             )
         return self
+
+    @property
+    def dark(self) -> bool:
+        """True if stickers are darker than their rings."""
+        return self.sticker_level < self.ring_level
 
 
 class HalfSpace(Section):

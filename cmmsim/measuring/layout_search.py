@@ -31,6 +31,8 @@ SMALLEST_AREA_PX = 8
 LARGEST_SHARE = 25 / 36
 # Share of the pixels of an image that count as the brightest.
 BRIGHT_SHARE = 1e-4
+# Share of the pixels that count as the darkest.
+DARK_SHARE = 1e-3
 # Smallest step from the ground to the brightest pixels, as a share of the largest grey value.
 SMALLEST_STEP = 40.0 / 255.0
 SMALLEST_WINDOW_PX = 24
@@ -60,12 +62,12 @@ def bright_ellipses(
     if isinstance(images, StickerExposure):
         return images.bright(observer)
     frame = images.full()
-    noise = observer.noise
+    noise = observer.upright
     settings = observer.settings
     size = max(SMALLEST_WINDOW_PX, settings.window_size + ROOM_PX)
     limits = replace(settings.limits, largest_misfit=np.inf)
     found = []
-    for image in (frame.left, frame.right):
+    for image in (noise.bright(frame.left), noise.bright(frame.right)):
         corners = np.rint(find_blobs(image, noise.white_level, size) - 0.5 * (size - 1)).astype(int)
         windows = cut_windows(image, corners, size)
         found.append(
@@ -84,7 +86,7 @@ def candidate_points(
     They are triangulated from pairs of ellipses within ``limits``; some pairs are false. Raises
     LostError if an image has no bright spots.
     """
-    left, right = (fits.centres[fits.within(limits, observer.noise).good] for fits in ellipses)
+    left, right = (fits.centres[fits.within(limits, observer.upright).good] for fits in ellipses)
     if not len(left) or not len(right):
         raise LostError(
             f"{len(left)} bright spots in the left image and {len(right)} in the right, at least "
@@ -107,6 +109,9 @@ def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
     from_top = np.cumsum(counts[::-1])
     bright = len(counts) - 1 - int(np.searchsorted(from_top, max(1.0, BRIGHT_SHARE * image.size)))
     ground = int(np.searchsorted(np.cumsum(counts), 0.5 * image.size))
+    if bright - ground < SMALLEST_STEP * white_level:
+        # Most of the image is as bright as the spots, so their rings are the darkest part.
+        ground = int(np.searchsorted(np.cumsum(counts), DARK_SHARE * image.size))
     if bright - ground < SMALLEST_STEP * white_level:
         return np.zeros((0, 2))
     mask = (image > 0.5 * (bright + ground)).astype(np.uint8)

@@ -31,7 +31,7 @@ from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply_each
 from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.radiometry.stereo_images import StereoImages, Windows
+from cmmsim.radiometry.stereo_images import ManyExposures, StereoImages, Windows
 
 # A smear is the movement of a sticker's image during the exposure. The longest smear that can be
 # measured is about the size of a sticker.
@@ -59,6 +59,7 @@ class DetectionSettings:
     exposed_share    ratio of exposure time to frame period
     line_error_px    standard deviation of an image's distance from its epipolar line that errors of
                      the rig cause; it increases the allowed distance between two rays
+    dark             True for dark stickers in bright rings
     """
 
     window_size: int = 16
@@ -71,6 +72,7 @@ class DetectionSettings:
     optics: Optics = field(default_factory=Optics)
     exposed_share: float = 0.0
     line_error_px: float = 0.0
+    dark: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,20 +129,6 @@ class StickerExposure(Protocol):
         """Return the ellipses in the left and in the right image."""
 
 
-@runtime_checkable
-class ManyExposures(Protocol):
-    """Several exposures of two cameras, from which windows can be read."""
-
-    def windows_of(
-        self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
-    ) -> Windows:
-        """Return the grey values (2, n, size, size) of windows of several exposures.
-
-        The windows have first pixels ``corners`` (2, n, 2) and belong to ``exposures`` (n,), which
-        are in rising order.
-        """
-
-
 @dataclass(frozen=True)
 class Observer:
     """Observer of stickers, with the known rig, its camera noise, and detection settings."""
@@ -148,6 +136,11 @@ class Observer:
     rig: StereoRig
     noise: CameraNoise
     settings: DetectionSettings
+
+    @property
+    def upright(self) -> CameraNoise:
+        """Noise of the grey values in which stickers are bright."""
+        return replace(self.noise, inverted=True) if self.settings.dark else self.noise
 
     @property
     def detector(self) -> Detector:
@@ -201,6 +194,7 @@ class Observer:
                 windows = self.evenly_lit(images.windows_of(exposures, corners, size), corners)
             else:
                 windows = self.evenly_lit(images.windows(corners, size), corners)
+            windows = self.upright.bright(windows)
             offsets = np.stack(
                 [
                     centre_offset(camera, c[index], t[index], self.settings.radius)
@@ -242,7 +236,8 @@ class StickerWindows:
     camera_from_body  (4, 4) or (N, 4, 4), expected place of the body in each exposure
     places, normals   (k, 3), of the stickers, in body axes, m
     corners           (2, k, 2), first pixels of the windows
-    windows           (2, k, h, h), grey values without vignetting; empty without images
+    windows           (2, k, h, h), grey values without vignetting in which stickers are bright;
+                      empty without images
     offsets           (2, k, 2), eccentricities of the ellipses, px
     found             result of the detector for exposures without images, otherwise None
     """
@@ -298,7 +293,7 @@ class StickerWindows:
         limits = replace(settings.limits, largest_misfit=np.inf)
         return fit_ellipses(
             *self._flat,
-            self.observer.noise,
+            self.observer.upright,
             settings.fit_size,
             limits,
             psf_px=settings.optics.psf_px,
@@ -316,7 +311,7 @@ class StickerWindows:
     def _detected(self, smears: Array | None = None) -> DetectedCentres:
         """Return the centres that the detector finds in the windows."""
         detector = self.observer.detector
-        noise = self.observer.noise
+        noise = self.observer.upright
         settings = self.observer.settings
         if detector is MAXIMUM_LIKELIHOOD:
             fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)

@@ -20,6 +20,7 @@ from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.registration import rigid_starts
 from cmmsim.measuring.layout_search import (
     ENOUGH,
     LINE_STDS,
@@ -38,7 +39,8 @@ STANDING_SHARE = 0.6
 STANDING_PX = 0.7
 # Fewest candidates of a pair that are recognised as a rigid body.
 FEWEST_MOVING = 6
-# Rough places may be off by the first tolerance, or else by the second, m.
+# Most rough places may be off by the first tolerance, or else by the second, and single ones by the
+# second, m.
 ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
 # Number of pairs that are tried as the first model of the platform.
@@ -133,12 +135,11 @@ class FoundBody:
         )
 
 
-def standing(pairs: Sequence[Candidates], share: float = STANDING_SHARE) -> NDArray[np.int_]:
-    """Return the candidates (g, K) of g standing points in K pairs, or NONE where one is missing.
+def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
+    """Return the candidates (g, K) of g points in K pairs, or NONE where one is missing.
 
-    A point that stands has the same pixels in at least this ``share`` of the pairs.
+    A point has the same pixels in two pairs or more.
     """
-    fewest = max(2.0, share * len(pairs))
     counts = [len(one.points) for one in pairs]
     owner = np.repeat(np.arange(len(pairs)), counts)
     number = np.concatenate([np.arange(count) for count in counts])
@@ -149,9 +150,9 @@ def standing(pairs: Sequence[Candidates], share: float = STANDING_SHARE) -> NDAr
     found = []
     for k in np.argsort(-pairs_near, kind="stable").tolist():
         own = np.array([j for j in near[k] if free[j]], dtype=int)
-        if pairs_near[k] < fewest:
+        if pairs_near[k] < 2:
             break
-        if not free[k] or len(set(owner[own])) < fewest:
+        if not free[k] or len(set(owner[own])) < 2:
             continue
         members = np.full(len(pairs), NONE)
         # Of two candidates of one pair, the one nearer to the point that most agree on is taken.
@@ -292,9 +293,20 @@ def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDA
     """
     for tolerance in ROUGH:
         try:
-            return find_layout(body.nominal, points, tolerance, FEWEST_NOMINAL, body.name)
+            place, _, _ = find_layout(body.nominal, points, tolerance, FEWEST_NOMINAL, body.name)
         except LostError as error:
             said = error
+            continue
+        # Stickers that lie farther from their rough places are found once the body is.
+        for _ in range(2):
+            gaps = np.linalg.norm(apply(place, body.nominal)[:, None] - points, axis=2)
+            own = gaps.argmin(axis=1)
+            mutual = gaps.argmin(axis=0)[own] == np.arange(len(own))
+            stickers = np.flatnonzero(mutual & (gaps.min(axis=1) < ROUGH[-1]))
+            own = own[stickers]
+            even = np.ones((1, len(own)))
+            place = rigid_starts(body.nominal[stickers], points[own][None], even)[0]
+        return place, stickers, own
     raise said
 
 
@@ -302,12 +314,13 @@ def match(
     pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody, names: Sequence[str]
 ) -> list[FoundBody]:
     """Return the stickers of base and platform in K pairs with these names. Raises LostError."""
-    still = standing(pairs)
-    stood = places_of(pairs, still)
+    # Points that stand for a while tell when a sticker has moved.
+    briefly = standing(pairs)
+    often = np.sum(briefly != NONE, axis=1) >= STANDING_SHARE * len(pairs)
+    places = places_of(pairs, briefly)
+    still, stood = briefly[often], places[often]
     place, stickers, own = named(base, stood)
-    # Also points that stand for a while, which tell when a sticker has moved.
-    briefly = standing(pairs, 0.0)
-    lost = _missing(base, place, stickers, places_of(pairs, briefly), briefly, names)
+    lost = _missing(base, place, stickers, places, briefly, names)
     stays = np.tile(np.eye(4), (len(pairs), 1, 1)), np.ones(len(pairs), dtype=bool)
     found = [FoundBody(stickers, still[own], stood[own], *stays, {}).with_missing(lost)]
     try:

@@ -35,6 +35,7 @@ class TaughtFrames:
     places            (n, 3), of the platform's stickers in platform axes, m
     covariance        (6 + 3 n + 24,) squared: small error of base_from_camera, places, and the
                       parameters of the rig
+    base_ids          (k,), names of the base's stickers
     platform_ids      (n,), names of the platform's stickers
     effect            (6, 3 n), small error of the platform frame that errors of places cause in a
                       pose by registration
@@ -44,6 +45,7 @@ class TaughtFrames:
     base_places: Array
     places: Array
     covariance: Array
+    base_ids: NDArray[np.str_]
     platform_ids: NDArray[np.str_]
     effect: Array
 
@@ -117,6 +119,7 @@ def taught_frames(
         apply_each(base_from_camera, stand),
         turned,
         slopes @ bundle.covariance @ slopes.T,
+        base.sticker_ids,
         platform.sticker_ids,
         _effect(bundle, seen, turned, body_from_model[:3, :3]),
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,8 @@ from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
 FEWEST_PAIRS = 3
+# Of more pairs, such as those of a video, some are used.
+MOST_PAIRS = 500
 # A warning is given if the squared residuals exceed the stated noise by this factor.
 LARGEST_FACTOR = 1.5
 # A warning is given if the platform moves by less in all images.
@@ -97,6 +99,7 @@ class PhotographedTeaching:
         dict
         """
         return taught_as_dict(self.taught) | {
+            "base_stickers": self.frames.base_ids.tolist(),
             "residual_rms_px": self.rms_px,
             "variance_factor": self.bundle.factor,
             "pairs": list(self.pairs),
@@ -138,11 +141,20 @@ def teach_from(
         advance()
     if len(spots) < FEWEST_PAIRS:
         raise TeachingError(f"teaching failed: {len(spots)} pairs, at least {FEWEST_PAIRS} needed")
+    left_out = max(len(spots) - MOST_PAIRS, 0)
+    if left_out:
+        chosen = np.linspace(0, len(spots) - 1, MOST_PAIRS).astype(int).tolist()
+        spots = [spots[k] for k in chosen]
+        names = [names[k] for k in chosen]
     try:
-        return _taught(spots, names, observer, (base, platform), name, known)
+        found = _taught(spots, names, observer, (base, platform), name, known)
     except LostError as error:
         cause = cause_of(spots, names, observer, base, platform)
         raise TeachingError(f"teaching failed: {cause or error}") from error
+    if not left_out:
+        return found
+    said = f"{left_out} pairs are not used: {MOST_PAIRS} pairs, spread over all, are enough"
+    return replace(found, warnings=(said, *found.warnings))
 
 
 def _taught(

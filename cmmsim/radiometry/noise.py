@@ -6,7 +6,7 @@ noise is drawn from a normal distribution with the variance of the Poisson distr
 """
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
-BIT_DEPTHS = (8, 10, 12)
+BIT_DEPTHS = (8, 10, 12, 14, 16)
 # Number of terms of the series in rounding_excess. Without noise, the series is 0.25, and the terms
 # that are left out add up to 0.002.
 ROUNDING_TERMS = 50
@@ -83,11 +83,12 @@ class CameraNoise:
     full_well           saturation capacity, e-
     black_level         grey value without light
     enabled             False for no noise; grey values are rounded nevertheless
-    bit_depth           bits of a grey value: 8, 10 or 12; images with more than 8 bits are uint16
+    bit_depth           bits of a grey value, of BIT_DEPTHS; with more than 8, images are uint16
     prnu                standard deviation of the pixels' sensitivities, relative to their mean
     dsnu                standard deviation of the pixels' offsets, e-
     frames              number of exposures averaged in each grey value; averaging reduces the
                         temporal noise, but not the fixed pattern
+    inverted            True if grey values are subtracted from the largest one, for dark stickers
     """
 
     electrons_at_white: float
@@ -100,6 +101,7 @@ class CameraNoise:
     prnu: float = 0.0
     dsnu: float = 0.0
     frames: int = 1
+    inverted: bool = False
 
     def __post_init__(self) -> None:
         if min(self.electrons_at_white, self.gain, self.full_well) <= 0.0 or self.dark_noise < 0.0:
@@ -130,9 +132,15 @@ class CameraNoise:
 
         It is the sum of shot noise, dark noise, fixed pattern and rounding.
         """
+        if self.inverted:
+            mean_grey = self.white_level - mean_grey
         electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
         constant, linear, quadratic = self.variance_coefficients
         return constant + electrons * (linear + electrons * quadratic)
+
+    def bright(self, grey: NDArray[Any]) -> NDArray[Any]:
+        """Return grey values in which stickers are bright, of the same type."""
+        return grey.dtype.type(self.white_level) - grey if self.inverted else grey
 
     def rounding_excess(self, mean_grey: Array) -> Array:
         """Return the ratio of the largest to the average variance of grey values near a mean.

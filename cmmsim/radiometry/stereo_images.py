@@ -128,6 +128,20 @@ class StereoImages(Protocol):
         """
 
 
+@runtime_checkable
+class ManyExposures(Protocol):
+    """Several exposures of two cameras, from which windows can be read."""
+
+    def windows_of(
+        self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
+    ) -> Windows:
+        """Return the grey values (2, n, size, size) of windows of several exposures.
+
+        The windows have first pixels ``corners`` (2, n, 2) and belong to ``exposures`` (n,), which
+        are in rising order.
+        """
+
+
 class FrameImages:
     """Images of a stereo frame, from which windows can be read.
 

@@ -71,6 +71,7 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
     detector = file.detection.detector
     wrong = [
         (detector != DEFAULT_DETECTOR, f"detection.detector {detector!r}", DEFAULT_DETECTOR),
+        (stickers.dark, "dark stickers", "bright ones in dark rings"),
         (not noise.enabled, "camera.noise false", "true: without noise, rounding alone decides"),
         (noise.prnu > 0.0 or noise.dsnu > 0.0, f"camera.prnu {noise.prnu:g}, dsnu {noise.dsnu:g}",
          "0: a fixed pattern is the same in each frame"),

@@ -11,6 +11,7 @@ import cmmsim
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.photographs import teaching
 from cmmsim.photographs.pairs import Photograph
 from tests.cmmsim.photographed import spread_poses
 
@@ -130,6 +131,13 @@ def test_a_sticker_that_moved_between_pairs_is_left_out_and_measured_without(
     one = taught.measure(taught.home)
     assert one.ok
     assert (f"{plane}{sticker + 1}" in one.target_ids) == (body == "base")
+
+
+def test_of_very_many_pairs_some_are_used(sensor, good, monkeypatch):
+    monkeypatch.setattr(teaching, "MOST_PAIRS", 5)
+    found = teach(sensor, good)
+    assert found.pairs == ("00.png", "01.png", "03.png", "05.png", "07.png")
+    assert found.warnings == ("3 pairs are not used: 5 pairs, spread over all, are enough",)
 
 
 def test_a_plane_with_fewer_than_three_stickers_is_named(sensor, good):

@@ -13,9 +13,9 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import apply, invert, pose_to_transform, rotation_log
 from cmmsim.photographs.pairs import numbered
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
-from tests.cmmsim.photographed import spread_poses
+from tests.cmmsim.photographed import photographed, spread_poses
 from tests.cmmsim.plain import rigid_start
-from tests.cmmsim.sensors import refused
+from tests.cmmsim.sensors import LENSES, refused, require_true, squares
 
 PAIRS = 24
 
@@ -120,7 +120,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
     true_base = apply(invert(truth.base_from_camera), truth.base_places)
     stand, bound = fisher(sensor, spread_poses(PAIRS, 7), sensor.base, sensor.platform)
     near = spread_poses(100, 8, 0.009, 0.035)
-    squares, freedom, shapes, bases, common, scatter = 0.0, 0, [], [], [], []
+    total, freedom, shapes, bases, common, scatter = 0.0, 0, [], [], [], []
     for k, found in enumerate(teachings(100, 7)):
         taught = found.taught
         for errors, covariance in (
@@ -131,7 +131,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
             ),
         ):
             square, determined = normalised(errors, covariance)
-            squares += square
+            total += square
             freedom += determined
         shapes.append(shape_error(taught.platform_places, truth.platform_places))
         bases.append(found.bundle.state.places[:18] - true_base)
@@ -141,7 +141,7 @@ def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true()
             mean = errors.mean(axis=0)
             common.append(mean @ np.linalg.solve(shared + np.cov(errors.T) / 100, mean) / 6.0)
     assert freedom == 100 * (6 + 48)
-    assert squares / freedom == pytest.approx(1.0, abs=0.05)
+    assert total / freedom == pytest.approx(1.0, abs=0.05)
     assert np.mean(common) == pytest.approx(1.0, abs=0.4)
     for errors, covariance in (
         (shapes, bound / 54.0),
@@ -173,15 +173,47 @@ def test_a_sensor_measures_with_what_it_was_taught_from_frames(tmp_path):
 
 
 @pytest.mark.slow
+def test_with_ten_images_of_each_pose_poses_are_as_accurate_as_after_the_simulated_teaching():
+    sensor = statistical()
+    poses, near = np.repeat(spread_poses(PAIRS, 7), 10, axis=0), spread_poses(200, 8, 0.009, 0.035)
+    errors = []
+    for k in range(2):
+        sensor.start_run(700 + k)
+        found = sensor.teach_from(numbered((sensor.look(pose) for pose in poses), 60.0))
+        errors.append(pose_errors(found.taught, near)[0])
+    usual = pose_errors(statistical(seed=0).taught, near)[0]
+    for axes, largest in ((slice(0, 3), 3.3e-6), (slice(3, 6), 12.5e-6)):
+        ours = np.sqrt(np.mean(np.square(errors)[..., axes]))
+        assert ours < min(largest, 1.2 * np.sqrt(np.mean(usual[:, axes] ** 2)))
+
+
+@pytest.mark.slow
+def test_places_from_rendered_images_are_as_accurate_as_stated():
+    """24 pairs: the mean of 54 squares has a deviation of 0.19."""
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", changes=LENSES["distorted"])
+    frames = [photographed(sensor, pose) for pose in spread_poses(PAIRS, 40)]
+    found = sensor.teach_from(numbered(frames, 60.0))
+    assert found.bundle.factor == pytest.approx(1.0, abs=0.1)
+    errors = np.concatenate(
+        [
+            base_error(found.taught, sensor.truth),
+            (found.taught.platform_places - sensor.truth.platform_places).ravel(),
+        ]
+    )
+    square, freedom = normalised(errors, found.frames.covariance[:60, :60])
+    assert square / freedom == pytest.approx(1.0, abs=0.57)
+
+
+@pytest.mark.slow
 def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_stated():
-    """20 rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
-    normalised errors, with deviations of 0.05, 0.07 and 0.13."""
+    """Ten rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
+    normalised errors, with deviations of 0.06, 0.1 and 0.18."""
     truth, true_rig = statistical().truth, statistical().rig
     poses, near = spread_poses(PAIRS, 7), spread_poses(60, 8, 0.009, 0.035)
     file, free = read_sensor_file("ctrack780"), np.flatnonzero(np.diag(PHOTOGRAPHED))
     std = np.sqrt(np.diag(PHOTOGRAPHED)[free])
     taught, rigs, common, gains = [], [], [], []
-    for k in range(20):
+    for k in range(10):
         known = KnownRig.drawn(true_rig, PHOTOGRAPHED, np.random.default_rng([3, k]))
         sensor = cmmsim.Sensor(file, seed=50 + k, renderer="statistical", known=known)
         found = sensor.teach_from(numbered((sensor.look(pose) for pose in poses), 60.0))
@@ -199,9 +231,9 @@ def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_sta
         errors, shared = pose_errors(found.taught, near)
         mean = errors.mean(axis=0)
         common.append(mean @ np.linalg.solve(shared + np.cov(errors.T) / 60, mean) / 6.0)
-    assert np.mean(taught) == pytest.approx(1.0, abs=0.15)
-    assert np.mean(rigs) == pytest.approx(1.0, abs=0.2)
-    assert np.mean(common) == pytest.approx(1.0, abs=0.4)
+    assert np.mean(taught) == pytest.approx(1.0, abs=0.18)
+    assert np.mean(rigs) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(common) == pytest.approx(1.0, abs=0.55)
     assert np.max(gains) < 1.0
     assert np.mean(gains) < 0.7
 
@@ -228,3 +260,55 @@ def test_a_sensor_file_states_the_covariance_of_its_cameras(tmp_path):
         "mine.toml: rig.covariance.matrix: .*left.fx_px is negative",
         cmmsim.SensorFileError,
     )
+
+
+DARK = {
+    "stickers.sticker_level": 20,
+    "stickers.ring_level": 220,
+    "stickers.body_level": 200,
+    "stickers.background_level": 200,
+}
+SIXTEEN_BIT = {"camera.bit_depth": 16, "camera.gain": 33.28, "camera.black_level": 4096.0}
+
+
+@pytest.mark.parametrize("changes", [DARK, SIXTEEN_BIT], ids=["dark discs", "16 bit"])
+def test_other_kinds_of_images_are_taught_and_measured_with_a_true_covariance(changes):
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=4, changes=changes)
+    frames = [photographed(sensor, pose) for pose in spread_poses(6, 5)]
+    found = sensor.teach_from(numbered(frames, 60.0))
+    assert (found.rejected_pairs, found.rejected_stickers, found.warnings) == ({}, {}, ())
+    assert found.bundle.factor == pytest.approx(1.0, abs=0.15)
+    sensor.teach(frames=frames)
+    near = spread_poses(40, 6, 0.009, 0.035)
+    measured = sensor.measure_many(near)
+    errors = measured.poses - near
+    require_true(squares(errors - errors.mean(axis=0), measured.covariances) * 40 / 39)
+    mean = errors.mean(axis=0)
+    spread = sensor.estimator.common_at(sensor.home) + measured.covariances.mean(axis=0) / 40
+    assert mean @ np.linalg.solve(spread, mean) < 22.5
+    assert cmmsim.measure_frame(frames[0], sensor.estimator).ok
+
+
+def test_rough_places_may_be_off_by_millimetres():
+    """Each sticker lies up to 4 mm from where the file says, and the frames are still right."""
+    planes = read_sensor_file("ctrack780").platform.planes
+    rng = np.random.default_rng(6)
+    changes = {
+        f"platform.planes.{name}.stickers": (
+            np.array(plane.stickers) + rng.uniform(-4e-3, 4e-3, (6, 2))
+        ).tolist()
+        for name, plane in planes
+    }
+    sensor = statistical(seed=6, changes=changes)
+    exposures = [sensor.look(pose) for pose in spread_poses(8, 6)]
+    found = statistical().teach_from(numbered(exposures, 60.0))
+    assert len(found.taught.platform_places) == 18
+    assert np.ptp(found.taught.platform_places - statistical().platform.nominal) > 4e-3
+    errors = np.concatenate(
+        [
+            base_error(found.taught, sensor.truth),
+            (found.taught.platform_places - sensor.truth.platform_places).ravel(),
+        ]
+    )
+    square, freedom = normalised(errors, found.frames.covariance[:60, :60])
+    assert square / freedom == pytest.approx(1.0, abs=0.6)

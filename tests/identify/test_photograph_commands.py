@@ -72,6 +72,41 @@ def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(picture
     assert picture.shape == (1536, 4096, 3)
 
 
+def linked(pictures, folder):
+    """Folders with links to the pictures, to which other files can be added."""
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+        for path in (pictures / side).iterdir():
+            (folder / side / path.name).symlink_to(path)
+    return folder
+
+
+def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, tmp_path, capfd):
+    assert teach(pictures, tmp_path / "taught", "--quiet") == 0
+    linked(pictures, tmp_path)
+    for side in ("left", "right"):
+        dark = np.full((1536, 2048), 16 if side == "left" else 17, dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / side / "999.png"), dark)
+    measuring = ("measure", tmp_path / "left", tmp_path / "right", "--sensor", "ctrack780")
+    taught, out = tmp_path / "taught" / "taught.json", tmp_path / "poses.csv"
+    assert command(*measuring, "--taught", taught, "--out", out) == 0
+    said = capfd.readouterr()
+    assert "7 of 8 pairs measured" in said.out
+    assert "warning: 999.png: 0 bright spots in the left image" in said.err
+    with out.open() as file:
+        *good, lost = csv.DictReader(file)
+    assert all(row["ok"] == "1" for row in good)
+    assert (lost["pair"], lost["ok"], lost["stickers"], lost["measured_x_m"]) == (
+        *("999.png", "0", "0"),
+        "",
+    )
+    assert lost["why"].startswith("0 bright spots")
+    assert float(lost["time_s"]) == pytest.approx(COUNT / 60.0)
+    taught.write_text("{}")
+    assert command(*measuring, "--taught", taught, "--out", out) == 1
+    assert "taught.json is no taught.json of `cmmsim teach`" in one_line(capfd.readouterr().err)
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -83,10 +118,7 @@ def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(picture
 def test_an_image_that_does_not_fit_the_sensor_is_named_with_the_cause(
     pictures, tmp_path, capfd, spoil, message
 ):
-    for side in ("left", "right"):
-        (tmp_path / side).mkdir()
-        for path in (pictures / side).iterdir():
-            (tmp_path / side / path.name).symlink_to(path)
+    linked(pictures, tmp_path)
     first = tmp_path / "left" / "000.png"
     image = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
     first.unlink()
