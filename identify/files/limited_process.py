@@ -23,15 +23,16 @@ LIMIT_MEMORY = 1_000_000_000
 """Largest number of bytes that reading may allocate, on systems that can limit it."""
 
 CODE = "from identify.files.limited_process import serve; serve()"
-TOO_LONG = f"it cannot be read within {LIMIT_S} s"
 
 
 class UntrustedFileError(Exception):
     """Reason, in one line, why a file cannot be read."""
 
 
-def within_limits(read: Callable[..., Any], *given: object) -> Any:
+def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None = None) -> Any:
     """Call a function of a module in another process, within the limits, and return its result.
+
+    `limit_s` replaces the time limit, for files that take long in an honest way.
 
     Raises UntrustedFileError with the reason if a limit is exceeded, if the process dies, or if the
     function raises an exception. Exceptions of `dynamics` pass unchanged.
@@ -41,19 +42,21 @@ def within_limits(read: Callable[..., Any], *given: object) -> Any:
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
     }
+    limit = LIMIT_S if limit_s is None else limit_s
+    too_long = f"it cannot be read within {limit} s"
     try:
         done = subprocess.run(
             [sys.executable, "-c", CODE],
-            input=pickle.dumps((read, given)),
+            input=pickle.dumps((read, given, limit)),
             capture_output=True,
-            timeout=START_S + LIMIT_S,
+            timeout=START_S + limit,
             env=limited,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise UntrustedFileError(TOO_LONG) from None
+        raise UntrustedFileError(too_long) from None
     if _ended_by_alarm(done.returncode):
-        raise UntrustedFileError(TOO_LONG)
+        raise UntrustedFileError(too_long)
     if done.returncode:
         raise UntrustedFileError(f"the library that reads it ends with status {done.returncode}")
     found = pickle.loads(done.stdout)
@@ -72,13 +75,13 @@ def serve() -> None:
     out = sys.stdout
     sys.stdout = sys.stderr
     # Functions are pickled by name: this imports their modules, before the limits are set.
-    read, given = pickle.loads(sys.stdin.buffer.read())
+    read, given, limit = pickle.loads(sys.stdin.buffer.read())
     with suppress(ImportError, ValueError, OSError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_DATA, (LIMIT_MEMORY, LIMIT_MEMORY))
     if hasattr(signal, "alarm"):  # on other systems, only the calling process limits the time
-        signal.alarm(LIMIT_S)
+        signal.alarm(limit)
     try:
         found = read(*given)
     except DynamicsError as error:

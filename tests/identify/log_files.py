@@ -107,13 +107,57 @@ def write_commands(path, record, signs, zeros, offset_s=0.0):
     path.write_text("\n".join(lines) + "\n")
 
 
-def write_bag(folder, record, start_ns=1_700_000_000_000_000_000, mcap=True):
-    """A bag of ROS 2: stamped poses, commands as joint states in another order, and a text."""
-    from rosbags.rosbag2 import StoragePlugin, Writer
+def message_types():
+    """The types of messages of ROS 2 Humble: a store, and classes by their names."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    kinds = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    return store, {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+
+
+def write_transforms(folder, count):
+    """A bag of transforms, those of the plate in every second message, and arrays without stamp.
+
+    Message k is of k ms after 1.7e9 s, and written 5 us later; the plate is at x = 0.01 k.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store, kinds = message_types()
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics = {
+            kind: bag.add_connection(topic, kinds[kind].__msgtype__, typestore=store)
+            for topic, kind in (("/tf", "TFMessage"), ("/cmd", "Float64MultiArray"))
+        }
+        for k in range(count):
+            stamp = kinds["Time"](sec=1_700_000_000, nanosec=k * 1_000_000)
+            header = kinds["Header"](stamp=stamp, frame_id="world")
+            bodies = {"base": 0.0} | ({"vicon/plate.1": 0.01 * k} if k % 2 else {})
+            transforms = [
+                kinds["TransformStamped"](
+                    header=header,
+                    child_frame_id=name,
+                    transform=kinds["Transform"](
+                        translation=kinds["Vector3"](x, 0.0, 0.2),
+                        rotation=kinds["Quaternion"](0.0, 0.0, 0.0, 1.0),
+                    ),
+                )
+                for name, x in bodies.items()
+            ]
+            layout = kinds["MultiArrayLayout"](dim=[], data_offset=0)
+            moment = 1_700_000_000_000_000_000 + k * 1_000_000 + 5_000
+            for message in (
+                kinds["TFMessage"](transforms=transforms),
+                kinds["Float64MultiArray"](layout=layout, data=k + np.arange(6.0)),
+            ):
+                raw = store.serialize_cdr(message, message.__msgtype__)
+                bag.write(topics[type(message).__name__.rpartition("__")[2]], moment, raw)
+
+
+def write_bag(folder, record, start_ns=1_700_000_000_000_000_000, mcap=True):
+    """A bag of ROS 2: stamped poses, commands as joint states in another order, and a text."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store, kinds = message_types()
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
     moved = matrices(record)
     turned = quaternions(moved)

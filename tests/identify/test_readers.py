@@ -20,6 +20,7 @@ from identify.record.own_record import (
     read_own_records,
     read_telemetry,
 )
+from identify.record.readers.bags import Bag
 from identify.record.recording import poses, write
 from tests.identify.commands import command, one_line
 from tests.identify.log_files import (
@@ -27,6 +28,7 @@ from tests.identify.log_files import (
     write_bag,
     write_commands,
     write_motive,
+    write_transforms,
     write_vicon,
 )
 from tests.identify.synthetic import short_run
@@ -504,3 +506,18 @@ def test_a_bag_without_the_package_that_reads_it_is_one_line(record, tmp_path, m
     path = described(tmp_path / "run.mcap", BAG)
     with pytest.raises(RecordError, match=r"not installed: pip install 'cmmsim\[bags\]'"):
         telemetry_of(path)
+
+
+def test_a_transform_among_others_and_arrays_without_a_stamp_are_read_from_a_bag(tmp_path):
+    write_transforms(tmp_path / "bag", 20)
+    bag = Bag(tmp_path / "bag")
+    body = "transforms[vicon/plate.1]"
+    names = [f"{body}.header.stamp", f"{body}.transform.translation.x"]
+    plate = bag.read("/tf", names)
+    assert plate.rows.place(0) == f"{tmp_path / 'bag'} /tf message 2"
+    np.testing.assert_array_equal(plate.numbers(names[1]), 0.01 * np.arange(1, 20, 2))
+    moments = plate.moments(names[0], "s", 60.0)
+    assert [str(one - 1_700_000_000) for one in moments[:2]] == ["0.001000000", "0.003000000"]
+    array = bag.read("/cmd", ["log_time", "data[5]"])
+    np.testing.assert_array_equal(array.numbers("data[5]"), 5 + np.arange(20))
+    assert str(array.moments("log_time", "s", 60.0)[1]) == "1700000000.001005000"

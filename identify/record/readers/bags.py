@@ -26,6 +26,9 @@ METADATA = "metadata.yaml"
 LARGEST_METADATA = 1_000_000
 """Largest size of that file, bytes."""
 
+LIMIT_S = 120
+"""Time limit for reading a topic, s. Bags with images are large."""
+
 
 def is_bag(path: Path) -> bool:
     """Return whether a path is a bag: a file of its kind, or a folder with its metadata."""
@@ -70,7 +73,7 @@ class Bag:
         if about.is_file() and about.stat().st_size > LARGEST_METADATA:
             raise RecordError(f"{about} has more than {LARGEST_METADATA:,} bytes")
         try:
-            return within_limits(read, self.path.resolve(), *given)
+            return within_limits(read, self.path.resolve(), *given, limit_s=LIMIT_S)
         except UntrustedFileError as error:
             raise RecordError(f"cannot read the bag {self.path}: {error}") from None
 
