@@ -43,6 +43,8 @@ def command_schedule(problem: LoopProblem) -> CommandSchedule:
 
     Commands issued before the run have the latencies of the start state, or else of the timing.
     """
+    if problem.times is not None:
+        return _schedule_at_times(problem)
     timing = problem.settings.timing
     latencies = problem.latencies
     before = problem.start.latencies
@@ -106,6 +108,52 @@ def _schedule(
         steps=_fixed(
             [max(1, ceil(s / period * steps_per_frame - 1e-9)) for s in duration], np.intc
         ),
+    )
+
+
+SAME_S = 1e-9
+"""Largest difference, s, of instants of a run at given times that count as one."""
+
+
+def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
+    """Schedule of a run whose frames are at given times.
+
+    Commands issued before the run count as one period apart, the last one a period before the run.
+    """
+    timing = problem.settings.timing
+    times = problem.frame_times
+    assert problem.written is not None
+    period = problem.period
+    given = problem.start.latencies
+    before = np.array([timing.latency_s]) if given is None else given
+    late = np.full(len(times), timing.latency_s) if problem.latencies is None else problem.latencies
+    # the oldest command from before the run also stands for all earlier ones
+    old = np.arange(-len(before), 0)
+    new = np.flatnonzero(problem.written)
+    numbers = np.concatenate([old, new])
+    issued = np.concatenate([times[0] + old * period, times[new]])
+    arrivals = acting_times(issued, np.concatenate([before, late[new]]))
+    nearest = np.clip(np.searchsorted(times, arrivals - SAME_S), 0, len(times) - 1)
+    at_frame = np.abs(times[nearest] - arrivals) <= SAME_S
+    arrivals = np.where(at_frame, times[nearest], arrivals)
+    linear = timing.hold == "linear"
+    inside = np.concatenate([arrivals, arrivals + period] if linear else [arrivals])
+    inside = inside[(inside > times[0]) & (inside < times[-1])]
+    begins = np.unique(np.concatenate([times, inside]))
+    # an instant just before another one would only cost a step
+    kept = np.append(np.diff(begins) > SAME_S, True) | np.isin(begins, times)
+    begins = begins[kept]
+    newest = np.maximum(np.searchsorted(arrivals, begins, side="right") - 1, 0)
+    since = np.maximum(begins - arrivals[newest], 0.0)
+    under_way = linear & (since < period - SAME_S)
+    duration = np.diff(begins, append=begins[-1] + period)
+    steps = np.ceil(duration / period * problem.settings.steps_per_frame - 1e-9)
+    return CommandSchedule(
+        first=_fixed(np.append(np.searchsorted(begins, times), len(begins)), np.intc),
+        command=_fixed(numbers[newest], np.intc),
+        ramp=_fixed(np.where(under_way, since / period, 1.0), float),
+        duration=_fixed(duration, float),
+        steps=_fixed(np.maximum(steps, 1), np.intc),
     )
 
 

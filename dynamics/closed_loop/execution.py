@@ -147,7 +147,7 @@ def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -
         name: array if array.size else None for name, array in record._asdict().items()
     }
     found |= _poses(problem, found, measured)
-    time = np.arange(problem.frames) * problem.period
+    time = problem.frame_times.copy()
     events = int(now.events)
     return ClosedLoopRun(time=time, **found, events=events, start=problem.start)
 
@@ -392,7 +392,7 @@ def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFail
     limit = problem.settings.drives.torque_limit
     unit = problem.robot.layout.unit("joint1.coulomb")
     saturated = saturated_frames(record.torque[:frame], limit)
-    when = f"t = {frame * problem.period:.3f} s"
+    when = f"t = {problem.frame_times[frame]:.3f} s"
     # with weak actuators, the robot can leave its reach although the loop is stable
     if saturated:
         why = why.replace(UNSTABLE, "")

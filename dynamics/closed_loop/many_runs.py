@@ -124,6 +124,7 @@ def repeat_commands(
         *(robot, parameters, reference, settings, commands, IdealSensor()),
         start=None,
         latencies=latencies,
+        times=None,
     )
     return _repeat(problem, noises, compiled)
 

@@ -60,7 +60,11 @@ class Sizes:
 
 @dataclass(frozen=True)
 class LoopProblem:
-    """Checked arguments of one run, with its start state."""
+    """Checked arguments of one run, with its start state.
+
+    Frames are a period apart, or at `times` (frames,). At these, only the frames `written`
+    (frames,) issue a command, and the other rows of `commands` repeat the command before.
+    """
 
     robot: Robot
     parameters: np.ndarray
@@ -73,6 +77,8 @@ class LoopProblem:
     commands: np.ndarray | None = None
     feedforward: np.ndarray | None = None
     controller: Controller | EveryFrame | None = None
+    times: np.ndarray | None = None
+    written: np.ndarray | None = None
     sensitivities: bool = False
     start_sensitivities: bool = False
     groups: RigidGroups | None = None
@@ -92,6 +98,11 @@ class LoopProblem:
     def period(self) -> float:
         """Time between two frames, s."""
         return 1.0 / self.settings.timing.frame_rate_hz
+
+    @property
+    def frame_times(self) -> np.ndarray:
+        """Times (frames,) of the frames, s."""
+        return np.arange(self.frames) * self.period if self.times is None else self.times
 
     @property
     def ideal(self) -> IdealSensor | None:
@@ -154,6 +165,7 @@ def commands_problem(
     sensor: Sensor,
     start: StartState | None,
     latencies: np.ndarray | None,
+    times: np.ndarray | None,
 ) -> LoopProblem:
     """Problem of a run under commands.
 
@@ -161,7 +173,13 @@ def commands_problem(
     """
     problem = _problem(robot, parameters, reference, settings, sensor, start, latencies)
     shape = problem.frames, robot.layout.joints
-    return dataclasses.replace(problem, commands=_rows("commands", commands, shape))
+    if times is None:
+        return dataclasses.replace(problem, commands=_rows("commands", commands, shape))
+    held, written = _held(commands, shape, problem.start.commands[-1])
+    if start is None and not written[0]:
+        raise SimulationError("a run that begins without a command at its first frame needs a start")
+    times = _checked_times(times, problem.frames)
+    return dataclasses.replace(problem, commands=held, times=times, written=written)
 
 
 def controller_problem(
@@ -328,6 +346,39 @@ def _check_latencies(timing: FrameTiming, name: str, latencies: np.ndarray | Non
     """Raise SimulationError for a latency that is out of range."""
     for number, latency in enumerate([] if latencies is None else latencies.tolist()):
         timing.check_latency(f"{name} {number}", latency)
+
+
+def _checked_times(times: object, frames: int) -> np.ndarray:
+    """Times (frames,) of frames, s, which increase. Raises SimulationError."""
+    checked = floats("times", times, (frames,), error=SimulationError)
+    back = np.flatnonzero(np.diff(checked) <= 0)
+    if len(back):
+        first = int(back[0])
+        raise SimulationError(
+            f"times must increase, but frame {first + 1} is at {checked[first + 1]:.9g} s and "
+            f"frame {first} at {checked[first]:.9g} s"
+        )
+    return checked
+
+
+def _held(
+    commands: object, shape: tuple[int, int], before: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Commands (frames, n) with rows of NaN replaced by the command before, and which are given.
+
+    Raises SimulationError for a row of which only a part is NaN.
+    """
+    given = floats("commands", commands, shape, error=SimulationError, finite=False)
+    missing = np.isnan(given)
+    written = ~missing.all(axis=1)
+    if not np.isfinite(given[written]).all():
+        frame = int(np.flatnonzero(written & ~np.isfinite(given).all(axis=1))[0])
+        raise SimulationError(
+            f"commands of frame {frame} are {given[frame]}: a row is finite, or NaN as a whole"
+        )
+    newest = np.maximum.accumulate(np.where(written, np.arange(len(given)), -1))
+    held = np.where((newest >= 0)[:, None], given[newest], before)
+    return np.ascontiguousarray(held), written
 
 
 def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:

@@ -114,6 +114,7 @@ def simulate_commands(
     *,
     start: StartState | None = None,
     latencies: np.ndarray | None = None,
+    times: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the robot under given commands. Measured poses are recorded but have no effect.
@@ -123,7 +124,11 @@ def simulate_commands(
     robot, parameters, reference, settings, sensor, start, latencies, compiled
         As for `simulate_servo`. The reference determines the number of frames and the pose at rest.
     commands : ndarray, shape (frames, n)
-        Command of each frame: rad or m, or N m or N if the drives take torques.
+        Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
+        of NaN issues no command.
+    times : ndarray, shape (frames,), optional
+        Increasing times of the frames, s. The default is equal periods from zero on. The rate of a
+        command is its change in one period of the timing.
 
     Returns
     -------
@@ -143,7 +148,7 @@ def simulate_commands(
     ClosedLoopRun(3 frames to 0.03333 s, 0 lost, 0 events)
     """
     problem = commands_problem(
-        robot, parameters, reference, settings, commands, sensor, start, latencies
+        robot, parameters, reference, settings, commands, sensor, start, latencies, times
     )
     return _run(problem, compiled)
 
@@ -264,6 +269,7 @@ def differentiate_commands(
     *,
     start: StartState | None = None,
     latencies: np.ndarray | None = None,
+    times: np.ndarray | None = None,
     by_start: bool = False,
     groups: RigidGroups | None = None,
     compiled: bool = True,
@@ -272,7 +278,7 @@ def differentiate_commands(
 
     Parameters
     ----------
-    robot, parameters, reference, settings, commands, start, latencies, compiled
+    robot, parameters, reference, settings, commands, start, latencies, times, compiled
         As for `simulate_commands`.
     sensor, by_start, groups
         As for `differentiate_servo`.
@@ -298,7 +304,7 @@ def differentiate_commands(
     """
     check_type("sensor", sensor, IdealSensor, SimulationError)
     problem = commands_problem(
-        robot, parameters, reference, settings, commands, sensor, start, latencies
+        robot, parameters, reference, settings, commands, sensor, start, latencies, times
     )
     return _run(with_derivatives(problem, by_start, groups), compiled)
 

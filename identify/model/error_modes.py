@@ -1,6 +1,6 @@
 """Effect of errors that all poses of a run have in common, by runs of the model with each error."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,24 +21,24 @@ def error_modes(
     run: "LoopModel",
     parameters: Array,
     shown: Callable[[ClosedLoopRun], Array],
-    beside: Array | float | None = None,
+    known: Mapping[int, Array | float],
 ) -> Array:
     """Return the changes (N, 6, k) of a run's poses by one standard deviation of each error.
 
     They are central differences about the common errors that the model contains, at parameters
     (p,).
-    shown: function that returns the poses (N, 6) of a simulated run. beside (N, 6, k): given
-    columns for the errors of measured poses. If it is given, these errors are not simulated.
+    shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6) by
+    errors that are not simulated, by the place of the error.
 
     Raises LoopFailure if the model is unstable.
     """
     drawn = run.errors_had
     modes = np.zeros((*run.measured.shape, len(drawn)))
-    count = len(run.common.names)
-    if beside is not None:
-        modes[:, :, :count] = beside
-    moving = [] if beside is not None else list(range(count))[: run.common.noticed]
-    moving += range(count, len(drawn))
+    for place, change in known.items():
+        modes[:, :, place] = change
+    # Errors of poses beyond the noticed ones change nothing.
+    unnoticed = range(run.common.noticed, len(run.common.names))
+    moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
     if run.bodies is not None:
         # A crank about a vertical axis, for example, needs no torque for most of its errors.
         without = np.abs(run.bodies).max(axis=(1, 2)) < LEAST_COMMAND

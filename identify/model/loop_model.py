@@ -131,13 +131,15 @@ class LoopModel:
         appears in the measured poses.
         """
         if not self.driven:
-            return error_modes(self, parameters, lambda run: run.measured)
-        given = self.common.modes if self.common.names else 0.0
+            return error_modes(self, parameters, lambda run: run.measured, {})
+        modes = self.common.modes
+        given = {k: modes[:, :, k] for k in range(len(self.common.names))}
         return error_modes(self, parameters, lambda run: run.pose, given)
 
     def pose_modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the platform by one standard deviation of each error."""
-        return error_modes(self, parameters, lambda run: run.pose, 0.0 if self.driven else None)
+        given = dict.fromkeys(range(len(self.common.names)), 0.0) if self.driven else {}
+        return error_modes(self, parameters, lambda run: run.pose, given)
 
     @property
     def stated_latencies(self) -> Array:
