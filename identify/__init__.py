@@ -18,6 +18,7 @@ Studies
 
 A record of your own
     build_record(*, time, ...) -> Dataset       from arrays over the frames
+    build_timed_record(*, time, ...) -> Dataset from poses and commands at any times
     store_anchor(record, anchor)                scale anchor: ScaleAnchor(name, value, std)
     store_payload(record, payload, std)         a known load: payload_vector(mass_kg, inertia_kg_m2)
 
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from identify.record.load import payload_vector as payload_vector
     from identify.record.load import store_payload as store_payload
     from identify.record.recording import build_record as build_record
+    from identify.record.timed_record import build_timed_record as build_timed_record
     from identify.reporting.pictures import run_figures as run_figures
     from identify.scenario import Scenario as Scenario
     from identify.scenario import load_scenario as load_scenario
@@ -58,6 +60,7 @@ _HOME = {
     **dict.fromkeys(("run_experiment", "set_up", "unseen_errors"), "identify.setup"),
     "Study": "identify.studies.in_python",
     "build_record": "identify.record.recording",
+    "build_timed_record": "identify.record.timed_record",
     "ScaleAnchor": "identify.estimation.prior",
     "store_anchor": "identify.estimation.prior",
     "payload_vector": "identify.record.load",

@@ -38,7 +38,7 @@ from identify.experiment.true_robot import true_parameters, true_robot, with_tru
 from identify.files.atomic import write_bytes
 from identify.files.dataset import POSE, netcdf
 from identify.loop_parameters import carrying, in_form, loop_settings
-from identify.model.from_record import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import integer_seed
 from identify.record import recording

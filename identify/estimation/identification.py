@@ -26,12 +26,14 @@ from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.prior import model_guess, read_anchor
 from identify.estimation.result import IdentificationResult
 from identify.estimation.warm_start import linear_warm_start
-from identify.model.from_record import ModelSide, identified_model, model_side
+from identify.model.from_record import identified_model
+from identify.model.model_side import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.conditions import SERVO, command_time_warnings, drift_warnings, recorded_law
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import recorded_scenario, recorded_seed
+from identify.record.recording import is_timed
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 from identify.scenario.sections import Identification
@@ -92,7 +94,7 @@ def identify(
     robot = side.robot
     settings = asked.settings
     # The model can simulate only the servo. For other laws it gets the logged commands.
-    by_servo = all(recorded_law(record) == SERVO for record in records)
+    by_servo = all(recorded_law(record) == SERVO and not is_timed(record) for record in records)
     closed_loop = by_servo and settings.method == "closed_loop"
 
     def problem_under(law: DriveName) -> OutputErrorProblem:

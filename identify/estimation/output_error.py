@@ -69,7 +69,8 @@ class OutputErrorProblem:
         """
         pairs = zip(self.runs, errors, strict=True)
         return all(
-            np.abs(run.errors_had - run.having(own).errors_had).max(initial=0.0) <= within
+            np.abs(run.in_deciding_stds(run.errors_had - run.having(own).errors_had)).max(initial=0)
+            <= within
             for run, own in pairs
         )
 

@@ -30,6 +30,15 @@ FULL_STEPS = 2
 SETTLED = 0.02
 """Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
+STEPS = 2
+"""Number of steps between two linearisations in common errors with a wide prior."""
+
+MOST = 15
+"""Largest number of these linearisations."""
+
+NEAR = 1.0
+"""Change of such errors, in the standard deviations that decide, at which they count as near."""
+
 CLOSE_ENOUGH = 1e-2
 """Relative change of the cost at which multiple shooting ends. Other searches follow it."""
 
@@ -69,8 +78,8 @@ def output_error_searches(
     told = any(run.common.all_names for run in problem.runs)
     most = (1 + closed_loop + told) * problem.stop.max_iterations
     with progress.stage("identify", most) as advance:
-        starts = [start]
-        if told:
+        starts = [start, problem.guess.values] if told else [start]
+        if told and not all(run.begins_in_motion for run in problem.runs):
             found["noise_alone"] = Search(driven, search(driven, start, advance))
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
         found["command_driven"] = searched = search_with_common_errors(driven, starts, advance)
@@ -93,6 +102,8 @@ def search_with_common_errors(
     repeated until these values converge.
     """
     problem, start = _with_common_errors(problem, starts)
+    if any(run.begins_in_motion for run in problem.runs):
+        problem, start = _near_common_errors(problem, start)
     solution = search(problem, start, advance)
     for turn in range(LINEARISATIONS if problem.bends else 0):
         errors = most_likely_errors(problem, solution.parameters)
@@ -107,6 +118,25 @@ def search_with_common_errors(
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
     return Search(problem, solution)
+
+
+def _near_common_errors(
+    problem: OutputErrorProblem, start: Array
+) -> tuple[OutputErrorProblem, Array]:
+    """Return a problem about nearly its most likely common errors, and parameters (p,) near it.
+
+    Errors with a wide prior, such as a start in motion, move the optimum of the parameters far.
+    Only a few steps are therefore made between two linearisations.
+    """
+    few = replace(problem.stop, max_iterations=STEPS)
+    for _ in range(MOST):
+        found = search(replace(problem, stop=few), start, lambda n=1: None)
+        start = found.parameters
+        errors = most_likely_errors(problem, start)
+        if problem.has(errors, NEAR):
+            break
+        problem = problem.having(errors).with_common_errors(start)
+    return problem, start
 
 
 @dataclass(frozen=True)
@@ -161,7 +191,7 @@ def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solut
     segments cannot be simulated, or if the resulting model is unstable over the whole records.
     """
     loose = replace(problem, stop=replace(problem.stop, cost_tolerance=CLOSE_ENOUGH))
-    chains = [segments(run) for run in problem.runs]
+    chains = [segments(run.on_grid()) for run in problem.runs]
     for start in _candidates(problem, warm):
         states = [measured_states(chain, start, problem.low_pass) for chain in chains]
         shooting = MultipleShooting(problem, chains, states)

@@ -103,7 +103,7 @@ def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, 
     matrices = []
     right = []
     common = []
-    runs = problem.runs
+    runs = [run.on_grid() for run in problem.runs]
     layout = runs[0].robot.layout
     count = len(layout.names)
     joints = layout.joints

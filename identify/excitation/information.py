@@ -65,7 +65,7 @@ from identify.excitation.motion import (
     sample_times,
     tracked_motion,
 )
-from identify.model.from_record import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side
 from identify.scenario import Scenario
 from identify.scenario.sections import Identification
 from identify.trajectory import FourierTrajectory

@@ -32,7 +32,7 @@ from identify.errors import ScenarioError
 from identify.experiment.true_robot import true_zeros
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
-from identify.model.from_record import ModelSide
+from identify.model.model_side import ModelSide
 from identify.record.load import load_errors, load_parameters
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing

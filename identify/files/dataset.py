@@ -104,6 +104,7 @@ COORDINATES = {
     "axis": ("", "position component"),
     "angle": ("", "Euler angle"),
     "joint": ("", "joint number"),
+    "acting": ("s", "time at which a command begins to act, on the clock of time"),
     "pose_component": ("", "pose component"),
     "pose_component_2": ("", "pose component"),
 }
@@ -249,7 +250,7 @@ def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict
     units.
     """
     units = {name: layout.unit(name) for name in layout.names}
-    return units | {name: name.rpartition("_")[2] for name in others}
+    return units | {name: name.rpartition("_")[2] if "_" in name else "1" for name in others}
 
 
 def covariance_netcdf(units: Mapping[str, str], covariance: Array) -> bytes:

@@ -3,18 +3,17 @@
 A record that is not suitable for an identification is refused, see `identify.record.checks`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 
-from dynamics import Robot
-from dynamics.closed_loop import LoopSettings
 from identify.errors import EstimationError
-from identify.loop_parameters import carrying, drives_of, in_form, loop_settings
 from identify.model.body_errors import body_error_stds
+from identify.model.from_timed_record import timed_model
 from identify.model.loop_errors import loop_error_stds
 from identify.model.loop_model import LoopModel
+from identify.model.model_side import ModelSide
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
     check_channels,
@@ -24,74 +23,12 @@ from identify.record.checks import (
     check_plausible,
     check_reference,
     checked_covariance,
-    fewest_frames,
 )
 from identify.record.conditions import drift_warnings, logged_latencies, takes_torques
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.load import recorded_payload
-from identify.record.recording import poses, recorded_reference
+from identify.record.recording import is_timed, poses, recorded_reference
 from identify.record.stored_common_errors import LATENCY, CommonErrors, read_common_errors
-from identify.scenario import Filter, Model, Scenario, Timing
-from identify.scenario.plant_sections import DriveName
-
-
-@dataclass(frozen=True)
-class ModelSide:
-    """Robot and loop as the estimator knows them, and its settings for reading a record.
-
-    Attributes
-    ----------
-    robot : Robot
-        Robot with its known geometry.
-    settings : LoopSettings
-        Settings of the loop around the model. Its mean latency is used if a record does not state
-        when commands acted.
-    model : Model
-        Parameter set of the initial guess, and the law of the drives, which can be left open.
-    timing : Timing
-        Timing of the frames. In addition to the timing in `settings`, it has the standard deviation
-        of the latency.
-    low_pass : Filter
-        Filter of the measured poses in all linear fits.
-    nuisances : tuple of str
-        Kinds of errors that all poses have in common, and that are estimated beside the parameters.
-    fewest_frames : int
-        Smallest number of frames of a record for an identification.
-    """
-
-    robot: Robot
-    settings: LoopSettings
-    model: Model
-    timing: Timing
-    low_pass: Filter
-    nuisances: tuple[str, ...]
-    fewest_frames: int
-
-    def with_drive(self, law: DriveName) -> "ModelSide":
-        """Return a copy with an identified law of the drives, if the model leaves the law open."""
-        model = self.model.with_drive(law)
-        drives = drives_of(model, self.settings.drives.torque_limit)
-        return replace(self, model=model, settings=replace(self.settings, drives=drives))
-
-
-def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
-    """Return the model's side of a scenario.
-
-    Raises the ScenarioErrors of `in_form` and `loop_settings`.
-    """
-    model = scenario.model
-    anchor = scenario.identification.scale_anchor
-    robot = carrying(in_form(robot, model), scenario.payload, anchor)
-    timing = scenario.timing
-    return ModelSide(
-        robot=robot,
-        settings=loop_settings(robot, scenario.servo, timing, scenario.control, model),
-        model=model,
-        timing=timing,
-        low_pass=scenario.filter,
-        nuisances=tuple(scenario.identification.nuisances),
-        fewest_frames=fewest_frames(timing, scenario.filter, scenario.excitation),
-    )
 
 
 def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
@@ -112,6 +49,8 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
             "model.gains = 'each', but the commands of the record are torques, and no gain of a "
             "joint acts under them: set model.gains = 'shared'"
         )
+    if is_timed(record):
+        return timed_model(record, side)
     run = _model(record, side)
     check_reference(run.reference, side.timing.frame_rate_hz)
     check_channels(side.robot.geometry.chart, run.measured, run.logged, run.ok)
@@ -135,7 +74,7 @@ def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         symmetric and positive definite.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
-    return _model(record, side)
+    return timed_model(record, side) if is_timed(record) else _model(record, side)
 
 
 def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:

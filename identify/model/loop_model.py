@@ -184,6 +184,22 @@ class LoopModel:
         count = len(common.names) + len(common.loop_std) + len(common.body_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
+    def in_deciding_stds(self, change: Array) -> Array:
+        """Return a change (k,) of the common errors in the standard deviations that decide.
+
+        These are the prior ones, in which such errors are given.
+        """
+        return change
+
+    @property
+    def begins_in_motion(self) -> bool:
+        """True if the start of the run is estimated, False if the run begins at rest."""
+        return False
+
+    def on_grid(self) -> "LoopModel":
+        """Return the model of about this run with frames one period apart, for linear fits."""
+        return self
+
     def simulate(
         self,
         parameters: Array,

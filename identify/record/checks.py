@@ -22,7 +22,7 @@ from identify.errors import EstimationError
 from identify.files.dataset import POSE, as_number, shown
 from identify.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.provenance import check_robot, recorded_scenario
-from identify.record.recording import check_record, poses
+from identify.record.recording import check_record, is_timed, poses
 from identify.scenario import Excitation, Filter, Timing
 from identify.trajectory import FourierTrajectory
 
@@ -78,6 +78,8 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
             f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and "
             f"timing.frame_rate_hz of its attribute scenario is {rate_hz:g}"
         )
+    if is_timed(record):
+        return
     steps = np.diff(np.asarray(record["time"].values, dtype=float)) * rate_hz
     # `not ... <=` also refuses NaN times, which `>` would accept.
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
@@ -260,20 +262,30 @@ def check_plausible(
     commands, or None. Raises EstimationError with the frame, the finding, and the units in which
     the record would fit.
     """
-    _check_reach(robot, reference.poses)
+    _check_reach(robot, reference.poses, "the reference")
     _check_rest(reference)
     _check_measured(reference, measured, ok)
     if logged is not None:
-        _check_commands(robot, reference, logged)
+        _check_commands(robot, reference.poses, logged, "the reference")
 
 
-def _check_reach(robot: Robot, poses: Array) -> None:
+def check_timed_units(robot: Robot, measured: Array, followed: Array, logged: Array) -> None:
+    """Refuse a record without a reference that is in other units or frames than the robot.
+
+    measured (k, 6): measured poses without lost ones. followed (M, 6): measured poses at the times
+    of the commands logged (M, n). Raises EstimationError as `check_plausible` does.
+    """
+    _check_reach(robot, measured, "the measured motion")
+    _check_commands(robot, followed, logged, "the measured motion")
+
+
+def _check_reach(robot: Robot, poses: Array, what: str) -> None:
     def reached(one: Array) -> bool:
         return bool((robot.reach_margin(one) > 0).all())
 
     if not reached(poses):
         try:
-            robot.check_reach(poses, "the reference", "frame")
+            robot.check_reach(poses, what, "frame")
         except UnreachablePoseError as error:
             raise EstimationError(f"{error}{_unit_hint(poses, reached)}") from None
 
@@ -319,8 +331,8 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
         )
 
 
-def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
-    wanted = robot.inverse_kinematics(reference.poses)
+def _check_commands(robot: Robot, poses: Array, logged: Array, what: str) -> None:
+    wanted = robot.inverse_kinematics(poses)
     travel = float(np.ptp(wanted, axis=0).max())
     allowed = max(TRAVELS * travel, BUILT * robot.geometry.travel_limit)
 
@@ -338,7 +350,7 @@ def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
             hint = f"; in {other} it would fit, and records are in {unit}"
         raise EstimationError(
             f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and "
-            f"the reference needs {wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} "
+            f"{what} needs {wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} "
             f"{unit} away: zero, direction or unit of the joints differ from the robot file{hint}"
         )
 

@@ -69,6 +69,20 @@ VARIABLES: Variables = {
     "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
 }
 
+STRETCH = "stretch"
+"""Variable of a record with the number of the stretch that each pose belongs to."""
+
+TIMED: Variables = {
+    STRETCH: (
+        ("time",),
+        "1",
+        "number of the part of the record; between two parts, commands are missing",
+    ),
+    **{name: own for name, own in VARIABLES.items() if name.startswith("measured")},
+    "command": (("acting", "joint"), "rad", "joint command from this time on"),
+}
+"""Variables of a record whose commands have times of their own. It needs no reference."""
+
 MAY_BE_LOST = ("measured_position", "measured_orientation", "measured_covariance")
 """Variables that are NaN in frames in which the pose was lost."""
 
@@ -151,17 +165,23 @@ def build_record(
         with_joint_units(VARIABLES | (OPTIONAL if logged else {}), prismatic),
         joint=joint_numbers(command),
     )
-    record.attrs = {
+    record.attrs = described_attributes(robot, frame_rate_hz, scenario_toml)
+    if seed is not None:
+        record.attrs["seed"] = np.int64(seed)
+    return check_record(record, "new record")
+
+
+def described_attributes(robot: str, frame_rate_hz: float, scenario_toml: str) -> dict[str, object]:
+    """Return the attributes that every record has."""
+    return {
         "title": "Visual closed-loop experiment",
         "conventions_text": CONVENTIONS,
         "robot": robot,
-        **({} if seed is None else {"seed": np.int64(seed)}),
         "frame_rate_hz": float(frame_rate_hz),
         "scenario": scenario_toml,
         "software": "; ".join(f"{name} {version}" for name, version in versions().items()),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    return check_record(record, "new record")
 
 
 def write(path: Path | str, record: xr.Dataset, truth: xr.Dataset | None = None) -> None:
@@ -240,12 +260,18 @@ def poses(record: xr.Dataset, kind: str) -> Array:
     return np.hstack([record[f"{kind}_position"].values, record[f"{kind}_orientation"].values])
 
 
+def is_timed(record: xr.Dataset) -> bool:
+    """Return whether the commands of a record have times of their own."""
+    return "command" in record and "acting" in record["command"].dims
+
+
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     """Check that a record is complete, of the right shapes, and finite where measured. Return it.
 
     Raises RecordError with the first fault.
     """
-    check_variables(record, VARIABLES, source)
+    variables = TIMED if is_timed(record) else VARIABLES
+    check_variables(record, variables, source)
     stated = record["measured_ok"].values
     strange = np.flatnonzero((stated != 0) & (stated != 1))
     if len(strange):
@@ -254,8 +280,9 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
             f"{strange[0]}" + (f" and wrong in {len(strange) - 1} more" if len(strange) > 1 else "")
         )
     ok = stated.astype(bool)
-    for name in VARIABLES:
-        rows = record[name].values.reshape(len(ok), -1)
+    for name in variables:
+        values = record[name].values
+        rows = values.reshape(len(values), -1)
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) & (ok if name in MAY_BE_LOST else True))
         if len(bad):
             which = "frames that count as measured" if name in MAY_BE_LOST else "frames"
@@ -265,8 +292,28 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     steps = np.diff(record["time"].values)
     if not (steps > 0).all():
         raise RecordError(f"{source}: time does not increase after frame {np.argmin(steps > 0)}")
-    check_command_times(record, source)
+    if is_timed(record):
+        _check_acting(record, source)
+    else:
+        check_command_times(record, source)
     return record
+
+
+def _check_acting(record: xr.Dataset, source: str) -> None:
+    """Check that the times of commands do not decrease, and overlap those of the poses."""
+    acting = record["acting"].values
+    if not np.isfinite(acting).all() or not (np.diff(acting) >= 0).all():
+        row = int(np.argmin(np.append(np.diff(acting) >= 0, False)))
+        raise RecordError(
+            f"{source}: the times of commands must be finite and not decrease; command {row} is "
+            f"at {acting[row]:.9g} s"
+        )
+    time = record["time"].values
+    if acting[0] > time[-1] or acting[-1] < time[0]:
+        raise RecordError(
+            f"{source}: the commands are from {acting[0]:.6g} to {acting[-1]:.6g} s and the poses "
+            f"from {time[0]:.6g} to {time[-1]:.6g} s: their clocks do not overlap"
+        )
 
 
 EXCITATION = "excitation"

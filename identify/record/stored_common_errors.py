@@ -33,6 +33,9 @@ COVARIANCE = "common_error_covariance"
 LATENCY = "timing.latency_s"
 ZERO = "zeros.joint"
 SCALE = "scale.commands"
+CLOCK_OFFSET = "clock.offset_s"
+CLOCK_DRIFT = "clock.drift_s/s"
+START = "start"
 
 ASSUMPTIONS = ("centres", "products", "passive_friction")
 """Kinds of errors of bodies and passive joints that a model has in a simpler form."""
@@ -232,6 +235,7 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 def kind_of(name: str) -> str:
     """Return the kind of a common error, as `identification.nuisances` names it."""
-    same = ("exposure", "geometry", "zeros", "scale", *ASSUMPTIONS)
+    same = ("exposure", "geometry", "zeros", "scale", "clock", START, *ASSUMPTIONS)
     kinds = {"taught": "teaching", "timing": "latency", **dict(zip(same, same, strict=True))}
-    return kinds.get(name.split(".")[0], "rig")
+    # Each start of a record has its number.
+    return kinds.get(name.split(".")[0].rstrip("0123456789"), "rig")

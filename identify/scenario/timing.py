@@ -52,6 +52,20 @@ class Timing(Section):
     latency_std_s: float = quantity(
         0.0, "s", "standard deviation of the stated mean latency", ge=0, le=0.1
     )
+    clock_offset_std_s: float = quantity(
+        0.0,
+        "s",
+        "standard deviation of the offset of the commands' clock in a record; 0 is one clock",
+        ge=0,
+        le=10,
+    )
+    clock_drift_std: float = quantity(
+        0.0,
+        "1",
+        "standard deviation of the drift of the commands' clock in a record, s per s",
+        ge=0,
+        le=0.01,
+    )
     dropout: float = quantity(0.0, "1", "probability that a frame is lost", ge=0, le=1)
     hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
 

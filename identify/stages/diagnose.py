@@ -11,7 +11,7 @@ from identify.diagnosis.diagnosis import Diagnosis
 from identify.estimation.identification import output_error_problem
 from identify.files.run_folder import RunFolder, check_entries, load_result, save_result
 from identify.loop_parameters import settled_drive
-from identify.model.from_record import model_side
+from identify.model.model_side import model_side
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RECORDS, RunFiles
 from identify.reporting.run_result import parameter_vector

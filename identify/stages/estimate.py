@@ -18,7 +18,7 @@ from identify.files.run_folder import (
     rms_figures,
 )
 from identify.files.versions import versions
-from identify.model.from_record import model_side
+from identify.model.model_side import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.conditions import DRIFT, read_finding

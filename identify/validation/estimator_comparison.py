@@ -42,7 +42,7 @@ from identify.experiment.truth import (
 )
 from identify.files.run_folder import load_result, rms_figures, rms_row
 from identify.loop_parameters import settled_drive
-from identify.model.from_record import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, mixed_generator
 from identify.record.conditions import logged_latencies, takes_torques

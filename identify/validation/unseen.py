@@ -33,13 +33,14 @@ from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import SensorPlan
 from identify.model.body_errors import body_errors
-from identify.model.from_record import ModelSide, predicting_model
+from identify.model.from_record import predicting_model
 from identify.model.loop_model import LoopModel
+from identify.model.model_side import ModelSide
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 from identify.record.conditions import SERVO, logged_latencies, recorded_law
-from identify.record.recording import recorded_reference
+from identify.record.recording import is_timed, recorded_reference
 from identify.runtime import cores
 from identify.trajectory import FourierTrajectory
 from identify.validation.processes import mapped
@@ -116,7 +117,7 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
 
     Raises the errors of `model_run`.
     """
-    if recorded_law(record) == SERVO:
+    if recorded_law(record) == SERVO and not is_timed(record):
         latencies = logged_latencies(record, side.timing)
         reference = recorded_reference(record)
         return model_run(side.robot, side.settings, parameters, reference, latencies)

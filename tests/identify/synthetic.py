@@ -15,7 +15,7 @@ from identify.estimation.prior import ScaleAnchor, StartingGuess, store_anchor
 from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.files.run_folder import RunFolder
-from identify.model.from_record import model_side
+from identify.model.model_side import model_side
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write

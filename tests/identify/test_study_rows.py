@@ -18,7 +18,7 @@ from dynamics.closed_loop import (
     differentiate_servo,
 )
 from identify.errors import EstimationError, ScenarioError
-from identify.model.from_record import model_side
+from identify.model.model_side import model_side
 from identify.scenario import load_scenario
 from identify.setup import Setup
 from identify.studies.rows import KINDS, find_kind

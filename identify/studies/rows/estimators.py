@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from identify.estimators.estimator import find_estimators
 from identify.experiment.joint_instruments import instruments_of
-from identify.model.from_record import model_side
+from identify.model.model_side import model_side
 from identify.own_parts import ESTIMATORS
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed

@@ -22,7 +22,7 @@ from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, excitation_run, run_plant
 from identify.experiment.sensor_in_loop import PoseSensor, teach
 from identify.experiment.truth import true_poses
-from identify.model.from_record import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.conditions import logged_latencies

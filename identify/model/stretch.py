@@ -1,0 +1,172 @@
+"""Stretch of a record that begins in motion, and the state in which it begins.
+
+The first poses of a stretch determine its pose and pose rate at the start, by a polynomial in time.
+The integrals of the drives follow from the torque that holds the robot there, and from the error of
+the drives. Each of these numbers has an error with a wide prior, because the whole stretch
+determines it much better.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dynamics import Robot
+from dynamics.closed_loop import LoopSettings, StartState, equilibrium
+from dynamics.closed_loop.drives import JointLaw
+from identify.arrays import Array
+from identify.record.stored_common_errors import START
+
+FIRST_S = 0.2
+"""Time, s, from the start of a stretch whose poses determine the start."""
+
+FEWEST = 6
+"""Smallest number of poses that determine the start."""
+
+DEGREE = 3
+"""Degree of the polynomial through the first poses."""
+
+WIDE = 20.0
+"""Standard deviation of a start, in those of the polynomial through the first poses."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Part of a run, and the state in which it begins.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot as the estimator knows it.
+    number : int
+        Number of the stretch in its record, from 1.
+    rows : slice
+        Rows of the poses of the stretch.
+    coordinates, rates : ndarray, shape (m,)
+        Coordinates of the platform at the start, and their rates.
+    integral : ndarray, shape (n,)
+        Integrals of the drives beside those of the state of rest, rad s or m s.
+    std : ndarray, shape (2 m + n,)
+        Standard deviations of coordinates, rates and integrals.
+    """
+
+    robot: Robot
+    number: int
+    rows: slice
+    coordinates: Array
+    rates: Array
+    integral: Array
+    std: Array
+
+    @cached_property
+    def error_names(self) -> tuple[str, ...]:
+        """Names of the errors of the start, in the order of the standard deviations."""
+        chart = self.robot.geometry.chart
+        kind = START if self.number == 1 else f"{START}{self.number}"
+        axes = list(zip(chart.coordinate_names, chart.units, strict=True))
+        joints = range(1, self.robot.layout.joints + 1)
+        return (
+            *(f"{kind}.{name}_{unit}" for name, unit in axes),
+            *(f"{kind}.rate_{name}_{unit}/s" for name, unit in axes),
+            *(f"{kind}.integral_{joint}_{self.robot.layout.joint_unit} s" for joint in joints),
+        )
+
+    @property
+    def stds(self) -> dict[str, float]:
+        """Standard deviations of the errors of the start by name, without those that are zero."""
+        pairs = zip(self.error_names, self.std.tolist(), strict=True)
+        return {name: std for name, std in pairs if std}
+
+    def start_state(
+        self,
+        robot: Robot,
+        parameters: Array,
+        settings: LoopSettings,
+        errors: Mapping[str, float],
+        commands: Array,
+        since: Array,
+    ) -> StartState:
+        """Return the state in which a model begins the stretch.
+
+        Parameters
+        ----------
+        robot, parameters, settings
+            Robot that moves, its parameters (p,) with the load, and the settings of the loop.
+        errors : mapping of str to float
+            Errors of the start by name, in their units. Others are zero.
+        commands, since : ndarray, shapes (k, n) and (k,)
+            Commands that began to act before the start, and these times relative to the start, s.
+        """
+        chart = robot.geometry.chart
+        off = np.array([errors.get(name, 0.0) for name in self.error_names])
+        count = len(self.coordinates)
+        place, rate, integral = np.split(off, [count, 2 * count])
+        pose = chart.pose(self.coordinates + place)
+        rest = equilibrium(robot, parameters, pose, settings.servo, drives=settings.drives)
+        # A run takes commands from before its start as issued one period apart.
+        period = 1.0 / settings.timing.frame_rate_hz
+        issued = np.arange(-len(commands), 0) * period
+        return StartState(
+            pose=pose,
+            pose_rate=chart.lifted(self.rates + rate),
+            joint_integral=rest.joint_integral + self.integral + integral,
+            servo_integral=np.zeros(count),
+            commands=commands,
+            last_measured=pose,
+            joint_integral_sensitivity=rest.joint_integral_sensitivity,
+            latencies=np.maximum(since - issued, 0.0),
+        )
+
+
+def begun_stretch(
+    robot: Robot,
+    number: int,
+    rows: slice,
+    times: Array,
+    measured: Array,
+    covariance: Array,
+    commands: Array,
+    law: JointLaw,
+) -> Stretch:
+    """Return a stretch with the start that its poses and commands suggest.
+
+    Parameters
+    ----------
+    robot, number, rows
+        As for `Stretch`.
+    times, measured : ndarray, shapes (k,) and (k, 6)
+        Times and poses of the stretch, without lost ones.
+    covariance : ndarray, shape (6, 6)
+        Covariance of a pose.
+    commands : ndarray, shape (k, n)
+        Commands that act at these times.
+    law : JointLaw
+        Law of the drives with the gains of the initial guess.
+    """
+    chart = robot.geometry.chart
+    since = times - times[0]
+    near = max(int(np.searchsorted(since, FIRST_S)), min(FEWEST, len(since)))
+    powers = np.vander(since[:near], min(DEGREE, near - 1) + 1, increasing=True)
+    solver = np.linalg.pinv(powers)
+    fit = solver @ chart.coordinates(measured[:near])
+    free = chart.basis.T @ covariance @ chart.basis
+    noise = np.sqrt(np.diag(free))
+    spread = np.linalg.norm(solver, axis=1)
+    joints = robot.inverse_kinematics(chart.pose(chart.coordinates(measured)))
+    error = commands - joints
+    # Without an integral in the law, none can be wrong.
+    with np.errstate(divide="ignore"):
+        per_torque = np.where(law.li > 0, 1.0 / law.li, 0.0)
+    lag = law.lp * np.sqrt(np.mean(error**2, axis=0))
+    return Stretch(
+        robot=robot,
+        number=number,
+        rows=rows,
+        coordinates=fit[0],
+        rates=fit[1] if len(fit) > 1 else np.zeros(fit.shape[1]),
+        integral=-law.lp * per_torque * error[0],
+        std=np.concatenate(
+            [WIDE * spread[0] * noise, WIDE * spread[1] * noise, WIDE * per_torque * lag]
+        ),
+    )

@@ -1,0 +1,260 @@
+"""Model of a record whose poses and commands have times of their own, driven by its commands.
+
+Between two events the model is an ordinary differential equation. Events are the times at which
+poses were seen and those at which commands began to act. A model of this kind needs neither a frame
+grid nor a reference.
+
+It does not need a start at rest, either. Pose and pose rate at the start, and the integrals of the
+drives, are common errors of the record with wide priors, about values from the first poses. After a
+gap in which commands are missing, the model starts anew in the same way. Each part of a record
+between such gaps is a stretch.
+
+The clock of the commands can differ from that of the poses by an offset and a drift. A command with
+the stated time t acts at t + offset + drift (t - t0), where t0 is the time of the first pose.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynamics import Robot
+from dynamics.closed_loop import (
+    ClosedLoopRun,
+    LoopFailure,
+    Reference,
+    differentiate_commands,
+    simulate_commands,
+)
+from identify.arrays import Array
+from identify.model.error_modes import error_modes
+from identify.model.loop_errors import lowest_errors
+from identify.model.loop_model import LoopModel
+from identify.model.stretch import Stretch
+from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE
+
+ROUNDING = 9
+"""Decimals of the times of events, s, so that a command and a pose of one time are one event."""
+
+
+@dataclass(frozen=True)
+class TimedModel(LoopModel):
+    """Model of a run at any times, driven by commands.
+
+    Attributes
+    ----------
+    times : ndarray, shape (N,)
+        Times of the poses, s.
+    acting : ndarray, shape (M,)
+        Stated times, s, at which the commands `logged` (M, n) begin to act. They do not decrease.
+    stretches : tuple of Stretch
+        Parts of the run, each with its own start.
+    """
+
+    times: Array = field(kw_only=True)
+    acting: Array = field(kw_only=True)
+    stretches: tuple[Stretch, ...] = field(kw_only=True)
+
+    def driven_by_commands(self) -> "TimedModel":
+        """Return a copy of the model, which the logged commands always drive."""
+        return replace(self, driven=True, marginal=None)
+
+    @cached_property
+    def acting_now(self) -> Array:
+        """Times (M,), s, at which the commands act with the errors that the model contains."""
+        errors = self._loop_errors
+        offset = errors.get(CLOCK_OFFSET, 0.0) + errors.get(LATENCY, 0.0)
+        drift = errors.get(CLOCK_DRIFT, 0.0)
+        return self.acting + offset + drift * (self.acting - self.times[0])
+
+    @property
+    def latencies(self) -> None:
+        """None, because the times of the commands contain their latency."""
+        return None
+
+    @property
+    def lowest_drawn(self) -> Array:
+        """Smallest allowed values (k,) of the common errors. The clock may have any offset."""
+        free = np.full(len(self.common.names), -np.inf)
+        return np.concatenate([free, lowest_errors(self.common.loop_std, np.inf)])
+
+    def simulate(
+        self,
+        parameters: Array,
+        sensitivities: bool = False,
+        robot: Robot | None = None,
+        noise: Array | None = None,
+    ) -> ClosedLoopRun:
+        """Simulate the model stretch by stretch. The rows of the run are those of the poses.
+
+        Arguments and errors are as for `LoopModel.simulate`.
+        """
+        run = _joined(self._simulated(parameters, sensitivities, robot))
+        # Without a servo, noise does not move the model.
+        return run if noise is None else replace(run, measured=run.pose + noise)
+
+    def simulate_repeats(
+        self, parameters: Array, noises: Array
+    ) -> list[ClosedLoopRun | LoopFailure]:
+        """Return the model's run once for each noise (N, 6) of noises (runs, N, 6)."""
+        run = self.simulate(parameters)
+        return [replace(run, measured=run.pose + noise) for noise in noises]
+
+    def modes(self, parameters: Array) -> Array:
+        """Return the shift (N, 6, k) of the measured poses by one standard deviation of each error.
+
+        The shifts by the start are derivatives, and those by all other errors of the loop are
+        differences of runs.
+        """
+        given = self.common.modes
+        known = {k: given[:, :, k] for k in range(len(self.common.names))}
+        known |= self._shown_starts(parameters)
+        return error_modes(self, parameters, lambda run: run.pose, known)
+
+    def pose_modes(self, parameters: Array) -> Array:
+        """Return the shift (N, 6, k) of the platform by one standard deviation of each error."""
+        known = dict.fromkeys(range(len(self.common.names)), np.zeros_like(self.measured))
+        known |= self._shown_starts(parameters)
+        return error_modes(self, parameters, lambda run: run.pose, known)
+
+    def in_deciding_stds(self, change: Array) -> Array:
+        """Return a change (k,) of the common errors in their posterior standard deviations.
+
+        The priors are wide, and tell nothing of how well the record determines these errors.
+        """
+        if self.marginal is None:
+            return change
+        modes = self.marginal.modes[:, : len(change)]
+        return np.asarray(np.linalg.qr(np.vstack([np.eye(len(change)), modes]), mode="r") @ change)
+
+    @property
+    def begins_in_motion(self) -> bool:
+        """True, because the start of every stretch is estimated."""
+        return True
+
+    def on_grid(self) -> LoopModel:
+        """Return about the same run with poses and commands a period apart, for linear fits."""
+        grid = grid_times(self.times[self.ok], self.settings.timing.frame_rate_hz)
+        measured = interpolated(grid, self.times[self.ok], self.measured[self.ok])
+        taken = {one.name: getattr(self, one.name) for one in fields(LoopModel)}
+        return LoopModel(
+            **taken
+            | {
+                "measured": measured,
+                "ok": np.ones(len(grid), dtype=bool),
+                "logged": interpolated(grid, self.acting_now, self.logged),
+                "common": NONE,
+                "drawn": None,
+                "marginal": None,
+                "torques": None,
+            }
+        )
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what is unusual about the record."""
+        return tuple(
+            f"commands are missing from t = {before:.2f} s to {after:.2f} s: the model starts anew "
+            "after this gap"
+            for before, after in self._gaps
+        )
+
+    @property
+    def _gaps(self) -> list[tuple[float, float]]:
+        ends = [self.times[one.rows][-1] for one in self.stretches[:-1]]
+        begins = [self.times[one.rows][0] for one in self.stretches[1:]]
+        return list(zip(ends, begins, strict=True))
+
+    def _simulated(
+        self,
+        parameters: Array,
+        sensitivities: bool,
+        robot: Robot | None = None,
+        by_start: bool = False,
+    ) -> list[ClosedLoopRun]:
+        """Return the runs of the stretches, with the errors that the model contains."""
+        errors = self._loop_errors
+        moved, values = self._moving(parameters, robot or self.robot)
+        commands = self._commands(parameters)
+        settings = self._loop
+        acting = np.round(np.maximum.accumulate(self.acting_now), ROUNDING)
+        runs = []
+        for stretch in self.stretches:
+            seen = np.round(self.times[stretch.rows], ROUNDING)
+            # Of commands that act before the start, the last two determine the rate of the last.
+            newest = max(int(np.searchsorted(acting, seen[0], side="right")), 1)
+            earlier = slice(max(newest - 2, 0), newest)
+            inside = np.arange(newest, int(np.searchsorted(acting, seen[-1])))
+            events = np.union1d(seen, acting[inside])
+            written = np.full((len(events), commands.shape[1]), np.nan)
+            written[np.searchsorted(events, acting[inside])] = commands[inside]
+            start = stretch.start_state(
+                moved, values, settings, errors, commands[earlier], acting[earlier] - seen[0]
+            )
+            still = Reference(np.tile(start.pose, (len(events), 1)), np.zeros((len(events), 6)))
+            given = moved, values, still, settings, written
+            run = (
+                differentiate_commands(
+                    *given, start=start, times=events, by_start=by_start, groups=self.groups
+                )
+                if sensitivities
+                else simulate_commands(*given, start=start, times=events)
+            )
+            runs.append(_at_rows(run, np.searchsorted(events, seen)))
+        return runs
+
+    def _shown_starts(self, parameters: Array) -> dict[int, Array]:
+        """Return the changes (N, 6) of the poses by each error of a start, by the error's place."""
+        runs = self._simulated(parameters, sensitivities=True, by_start=True)
+        stds = self.common.loop_std
+        places = {name: len(self.common.names) + k for k, name in enumerate(stds)}
+        found = {}
+        for stretch, run in zip(self.stretches, runs, strict=True):
+            assert run.start_sensitivity is not None
+            for column, name in enumerate(stretch.error_names):
+                if name in stds:
+                    found[places[name]] = np.zeros(self.measured.shape)
+                    found[places[name]][stretch.rows] = (
+                        stds[name] * run.start_sensitivity[:, :, column]
+                    )
+        return found
+
+
+PER_FRAME = (
+    *("time", "pose", "pose_rate", "torque", "command", "measured", "measured_ok"),
+    *("joint_integral", "servo_integral", "pose_sensitivity", "start_sensitivity"),
+    *("motor_angle", "motor_rate", "filtered_rate"),
+)
+"""Fields of a run with one row per frame."""
+
+
+def _at_rows(run: ClosedLoopRun, rows: NDArray[np.intp]) -> ClosedLoopRun:
+    """Return a run with some of its frames."""
+    given: dict[str, Any] = {
+        name: getattr(run, name)[rows] for name in PER_FRAME if getattr(run, name) is not None
+    }
+    return replace(run, **given)
+
+
+def _joined(runs: Sequence[ClosedLoopRun]) -> ClosedLoopRun:
+    """Return the frames of several runs as one run."""
+    given: dict[str, Any] = {
+        name: np.concatenate([getattr(run, name) for run in runs])
+        for name in PER_FRAME
+        if getattr(runs[0], name) is not None
+    }
+    return replace(runs[0], **given)
+
+
+def grid_times(times: Array, rate_hz: float) -> Array:
+    """Return times one period apart over the range of given times (N,)."""
+    frames = int((times[-1] - times[0]) * rate_hz) + 1
+    return np.asarray(times[0] + np.arange(frames) / rate_hz)
+
+
+def interpolated(times: Array, known: Array, values: Array) -> Array:
+    """Return values (k, m), which are known at times (k,), at other times (N,)."""
+    columns = [np.interp(times, known, column) for column in values.T]
+    return np.column_stack(columns)
