@@ -177,9 +177,7 @@ def commands_problem(
         return dataclasses.replace(problem, commands=_rows("commands", commands, shape))
     held, written = _held(commands, shape, problem.start.commands[-1])
     if start is None and not written[0]:
-        raise SimulationError(
-            "a run whose first frame issues no command needs a start"
-        )
+        raise SimulationError("a run whose first frame issues no command needs a start")
     times = _checked_times(times, problem.frames)
     return dataclasses.replace(problem, commands=held, times=times, written=written)
 

@@ -31,6 +31,7 @@ from identify.model.model_side import ModelSide, model_side
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.conditions import SERVO, command_time_warnings, drift_warnings, recorded_law
+from identify.record.from_telemetry import reading_notes
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import recorded_scenario, recorded_seed
 from identify.record.recording import is_timed
@@ -123,7 +124,11 @@ def identify(
     driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
-    told = (*command_time_warnings(records, side.timing), *drift_warnings(records))
+    told = (
+        *reading_notes(records),
+        *command_time_warnings(records, side.timing),
+        *drift_warnings(records),
+    )
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,

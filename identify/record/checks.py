@@ -290,6 +290,11 @@ def _check_reach(robot: Robot, poses: Array, what: str) -> None:
             raise EstimationError(f"{error}{_unit_hint(poses, reached)}") from None
 
 
+def begins_at_rest(rates: Array) -> bool:
+    """Return whether the rates (N, 6) of a reference begin near zero."""
+    return bool((np.abs(rates[0]) <= REST_RATE * np.abs(rates).max(axis=0)).all())
+
+
 def _check_rest(reference: Reference) -> None:
     first = np.abs(reference.rates[0])
     largest = np.abs(reference.rates).max(axis=0)
@@ -299,7 +304,8 @@ def _check_rest(reference: Reference) -> None:
         raise EstimationError(
             f"the record does not begin at rest: the rate of {POSE[worst]} in its first frame is "
             f"{first[worst]:.3g} {unit}, {100 * first[worst] / largest[worst]:.0f} % of its "
-            "largest; begin the record where the robot stood still"
+            "largest; begin the record where the robot stood still, or build it with "
+            "identify.build_timed_record, whose start is estimated"
         )
 
 

@@ -20,16 +20,23 @@ from identify.files.dataset import POSE
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
 RULES = """\
-A record begins at rest: before its first row the robot has stood still at the first reference pose,
-and the reference starts there with a rate of zero. A record has one row per frame at the frame rate
-of [timing], without gaps. A frame without a measured pose has a row with empty measured columns.
 Units are m, rad and s. A pose is the pose of the platform frame in the base frame of the robot
 file, R = Rx(alpha) Ry(beta) Rz(gamma). The time of a row is the instant at which the sensor saw the
-pose. A command is the joint coordinate that the servo requests from its row on, with the zero and
-the direction of the robot file. It acts from its command_time_s on, or without that column after
-the latency of [timing]. An empty command_time_s is allowed only in a row without a measured pose.
-Rates are the time derivatives of the six numbers of the reference pose, not the angular velocity.
-Without rate columns, rates are computed from a spline through the reference.
+pose. A command is the joint coordinate that is requested from its row on, with the zero and the
+direction of the robot file. It acts from its command_time_s on, or without that column after the
+latency of [timing]. Between two commands, the drives take the rate of a command as its change in
+one period of timing.frame_rate_hz. In a row without a measured pose the measured columns are empty,
+and in a row in which no command was written, so that the last one was held, the command columns.
+
+If rows are one frame of timing.frame_rate_hz apart, if the record begins at rest at its first
+reference pose, and if the servo saw exactly the measured poses, a model can close its own loop.
+Every row then has a reference and a command. Rates of the reference are the time derivatives of its
+six numbers, not the angular velocity, and without rate columns come from a spline through it.
+
+In every other record the logged commands drive the model: rows at any times, begun in motion,
+without a reference, with commands in rows without poses, or with rows missing. The start is then
+estimated, and after missing rows the model starts anew. A clock of the commands that differs from
+that of the poses is estimated with timing.clock_offset_std_s and timing.clock_drift_std.
 """
 """Rules for records of users."""
 
@@ -58,7 +65,11 @@ def columns_of(robot: Robot) -> dict[str, Group]:
     pairs = [(a, b) for k, a in enumerate(POSE) for b in POSE[k:]]
     return {
         "time": Group(("time_s",), "time since the first row"),
-        "reference": Group(tuple(f"reference_{a}_{UNITS[a]}" for a in POSE), "desired pose"),
+        "reference": Group(
+            tuple(f"reference_{a}_{UNITS[a]}" for a in POSE),
+            "desired pose, which a model needs that closes its own loop",
+            True,
+        ),
         "measured": Group(
             tuple(f"measured_{a}_{UNITS[a]}" for a in POSE),
             "pose that the sensor measured, or empty",
@@ -114,7 +125,9 @@ class Table:
                 rows,
                 None if written is None else written[:, 0] - start,
             ),
-            ReferenceLog(time, self.groups["reference"], rows, self.groups.get("rate")),
+            ReferenceLog(time, self.groups["reference"], rows, self.groups.get("rate"))
+            if "reference" in self.groups
+            else None,
         )
 
     def _measured_ok(self) -> NDArray[np.bool_]:

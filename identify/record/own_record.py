@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 import numpy as np
 import xarray as xr
 from pydantic import Field, ValidationError
-from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
@@ -24,13 +23,14 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.columns import Columns
 from identify.record.csv_record import read_table
+from identify.record.from_telemetry import record_of
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
 from identify.record.readers.mapped import read_mapped
-from identify.record.recording import build_record, read
+from identify.record.recording import read
 from identify.record.suspicions import fits, suspicions
-from identify.record.telemetry import ReferenceLog, Telemetry
+from identify.record.telemetry import Telemetry
 from identify.scenario import Scenario
 from identify.scenario.payload import Payload
 from identify.scenario.scenario import SCENARIOS, scenario_schema
@@ -171,43 +171,14 @@ def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:
     telemetry = read_telemetry(path, about, robot)
     if about.columns is not None and (found := log_suspicions(path, about, telemetry, robot)):
         raise RecordError("; ".join(found))
-    record = _record(telemetry, robot, scenario, measured, path)
+    # Covariances of the log itself go first.
+    stated = np.eye(6) if telemetry.poses.covariance is not None else _stated(measured, path)
+    record = record_of(telemetry, robot, scenario, stated)
+    record.attrs["title"] = f"Record of {path.name}"
     _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:
         _state_payload(record, scenario.payload)
     return record, scenario
-
-
-def _record(
-    telemetry: Telemetry, robot: Robot, scenario: Scenario, measured: Measured, path: Path
-) -> xr.Dataset:
-    """Return the record of a log. Raises RecordError if its times are not those of frames."""
-    poses = telemetry.poses
-    poses.check_grid(scenario.timing.frame_rate_hz)
-    reference = telemetry.reference
-    if reference is None or not telemetry.is_one_table:
-        raise RecordError(
-            f"{path}: each row must hold a pose, a command and a reference of the same time"
-        )
-    covariance = poses.covariance
-    record = build_record(
-        time=poses.time,
-        reference_pose=reference.pose,
-        reference_rate=_rates(reference, scenario.timing.frame_period_s),
-        measured_pose=poses.pose,
-        measured_covariance=_stated(measured, path, len(poses.ok))
-        if covariance is None
-        else covariance,
-        measured_ok=poses.ok,
-        command=telemetry.commands.command,
-        command_time=telemetry.commands.written,
-        robot=robot.name,
-        scenario_toml=scenario.to_toml(),
-        frame_rate_hz=scenario.timing.frame_rate_hz,
-        prismatic=robot.layout.prismatic,
-    )
-    record.attrs["title"] = f"Record of {path.name}"
-    return record
 
 
 def read_description(path: Path, log: Path) -> Description:
@@ -272,28 +243,15 @@ def record_schema() -> dict[str, Any]:
     return schema
 
 
-def _rates(reference: ReferenceLog, frame_period_s: float) -> Array:
-    """Return the rates (N, 6) of the reference, from the log or from a spline through it."""
-    if reference.rate is not None:
-        return reference.rate
-    # A record that is too short for a spline is refused later, by the check of its length.
-    if len(reference.pose) < 6:
-        return np.zeros_like(reference.pose)
-    times = np.arange(len(reference.pose)) * frame_period_s
-    spline = make_interp_spline(times, reference.pose, k=5)
-    return np.asarray(spline.derivative()(times), dtype=float)
-
-
-def _stated(measured: Measured, path: Path, count: int) -> Array:
-    """Return the covariances (N, 6, 6) of measured poses that the description states."""
+def _stated(measured: Measured, path: Path) -> Array:
+    """Return the covariance (6, 6) of a measured pose that the description states."""
     if measured.position_std_m is None or measured.orientation_std_rad is None:
         raise RecordError(
             f"{path} has no covariance columns, so {description_file(path)} must state "
             f"position_std_m and orientation_std_rad in [{DESCRIPTION}], the standard deviations "
             "of a measured pose"
         )
-    std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
-    return np.tile(np.diag(std**2), (count, 1, 1))
+    return np.diag(np.repeat([measured.position_std_m, measured.orientation_std_rad], 3) ** 2)
 
 
 def _state_anchor(

@@ -21,7 +21,8 @@ from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
 from identify.record.conditions import OPTIONAL
 from identify.record.load import ADDED
-from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
+from identify.record.model_runs import read_model_runs
+from identify.record.recording import VARIABLES, read, read_runs
 from identify.scenario import Scenario, scenario_from_toml
 
 ROBOT = "robot_geometry"

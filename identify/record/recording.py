@@ -1,14 +1,13 @@
-"""Records of runs as xarray datasets in netCDF, and runs of models on the same motion.
+"""Records of runs as xarray datasets in netCDF.
 
 A record holds the data of a run that an experimenter has. It is the main group of its file. The
 truth is a separate group (`identify.experiment.truth`), so that an estimator that reads a record
 cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...
-Model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -314,109 +313,6 @@ def _check_acting(record: xr.Dataset, source: str) -> None:
             f"{source}: the commands are from {acting[0]:.6g} to {acting[-1]:.6g} s and the poses "
             f"from {time[0]:.6g} to {time[-1]:.6g} s: their clocks do not overlap"
         )
-
-
-EXCITATION = "excitation"
-
-MODEL_VARIABLES: Variables = {
-    "initial_position": (
-        ("time", "axis"),
-        "m",
-        "position of the model with the initial guess of the parameters",
-    ),
-    "initial_orientation": (
-        ("time", "angle"),
-        "rad",
-        "orientation of the model with the initial guess of the parameters",
-    ),
-    "identified_position": (
-        ("time", "axis"),
-        "m",
-        "position of the model with the identified parameters",
-    ),
-    "identified_orientation": (
-        ("time", "angle"),
-        "rad",
-        "orientation of the model with the identified parameters",
-    ),
-}
-
-PREDICTED: Variables = {
-    "std_position": (
-        ("time", "axis"),
-        "m",
-        "predicted standard deviation of the plant's position from the identified model",
-    ),
-    "std_orientation": (
-        ("time", "angle"),
-        "rad",
-        "predicted standard deviation of the plant's orientation from the identified model",
-    ),
-}
-"""Additional variables of runs of validation trajectories."""
-
-
-def build_model_run(
-    time: ArrayLike,
-    initial_pose: ArrayLike,
-    identified_pose: ArrayLike,
-    std: ArrayLike | None = None,
-) -> xr.Dataset:
-    """Build the dataset of the poses of the initial and the identified model in a run.
-
-    Parameters
-    ----------
-    time : array_like, shape (N,)
-        Times of the frames, s.
-    initial_pose, identified_pose : array_like, shape (N, 6)
-        Poses of the models, m and rad. Poses of a diverged model that are not finite become NaN.
-    std : array_like, shape (N, 6), optional
-        Predicted standard deviations of the plant's poses from the identified model.
-
-    Raises
-    ------
-    RecordError
-        A shape is wrong.
-    """
-    values = pose_parts(initial_pose, "initial_pose", "initial_position", "initial_orientation")
-    values |= pose_parts(
-        identified_pose, "identified_pose", "identified_position", "identified_orientation"
-    )
-    variables = MODEL_VARIABLES
-    if std is not None:
-        values |= pose_parts(std, "std", "std_position", "std_orientation")
-        variables = MODEL_VARIABLES | PREDICTED
-    # Poses of a diverged model can be infinite.
-    finite = {name: np.where(np.isfinite(v), v, np.nan) for name, v in values.items()}
-    return described_dataset(finite, time, variables)
-
-
-def write_model_runs(
-    path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
-) -> None:
-    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..."""
-    write_groups(path, model_groups(excitation, validation))
-
-
-def model_groups(
-    excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
-) -> dict[str, xr.Dataset]:
-    """Return the groups of a file of model runs, which `write_model_runs` writes."""
-    named = {run_name(number): run for number, run in enumerate(validation, start=1)}
-    return {EXCITATION: excitation} | named
-
-
-def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
-    """Read all model runs by group name, including ``excitation``.
-
-    Raises RecordError if the file is truncated, a variable is missing, or a shape is wrong.
-    """
-    runs = {}
-    for name in group_names(path):
-        run = read_group(path, name)
-        check_variables(run, MODEL_VARIABLES, f"{path}:{name}")
-        runs[name] = run
-    return runs
 
 
 def recorded_reference(record: xr.Dataset) -> Reference:

@@ -74,9 +74,9 @@ class PoseLog:
 
 @dataclass(frozen=True)
 class CommandLog:
-    """Joint commands (M, n) and the times (M,) of their rows.
+    """Joint commands (M, n) and the times (M,) of their rows. Rows of NaN issue no command.
 
-    Raises RecordError with the row if the times do not increase.
+    Raises RecordError with the row if the times do not increase, or only a part of a row is NaN.
     """
 
     time: Array
@@ -91,6 +91,14 @@ class CommandLog:
 
     def __post_init__(self) -> None:
         check_increasing(self.time, self.rows)
+        missing = np.isnan(self.command)
+        partly = np.flatnonzero(missing.any(axis=1) & ~missing.all(axis=1))
+        if len(partly):
+            row = int(partly[0])
+            raise RecordError(
+                f"{self.rows.place(row)}: the command of joint {int(np.argmax(missing[row])) + 1} "
+                "is empty, and others are not: a row holds the commands of all joints, or of none"
+            )
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from identify.estimation.covariance import correlation_matrix
 from identify.experiment.truth import read_truth, true_poses
 from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, check_entries, load_result
+from identify.record.model_runs import EXCITATION
 from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
-from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
+from identify.record.recording import TRUTH_GROUP, poses, run_name
 from identify.reporting.figures.fit import Fit
 from identify.reporting.paper import repeats_the_paper
 from identify.reporting.run_result import check_intervals

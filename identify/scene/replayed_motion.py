@@ -14,8 +14,9 @@ from identify.experiment.truth import read_truth, true_poses
 from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, load_result
 from identify.record.known_geometry import known_geometry
+from identify.record.model_runs import EXCITATION
 from identify.record.provenance import RunFiles, check_robot, recorded_seed
-from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
+from identify.record.recording import TRUTH_GROUP, poses, run_name
 from identify.scenario import load_scenario
 from identify.scene.workcell import Workcell, workcell
 

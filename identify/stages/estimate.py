@@ -25,9 +25,9 @@ from identify.record.conditions import DRIFT, read_finding
 from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import known_geometry
+from identify.record.model_runs import build_model_run, model_groups
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, digest
-from identify.record.recording import build_model_run, model_groups
 from identify.scenario import Scenario, load_scenario
 from identify.stages.diagnose import ENTRY as DIAGNOSIS
 from identify.stages.diagnose import with_diagnosis

@@ -21,8 +21,8 @@ from identify.files.run_folder import (
 from identify.loop_parameters import settled_drive
 from identify.progress import Progress
 from identify.record import recording
+from identify.record.model_runs import build_model_run, model_groups
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
-from identify.record.recording import build_model_run, model_groups
 from identify.reporting.run_result import (
     add_truth,
     parameter_vector,

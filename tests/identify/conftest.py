@@ -7,7 +7,8 @@ import pytest
 
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, rms_figures, save_result
-from identify.record.recording import build_model_run, write_model_runs, write_runs
+from identify.record.model_runs import build_model_run, write_model_runs
+from identify.record.recording import write_runs
 from tests.identify.synthetic import LAYOUT, NAMES, recorded_run_folder, rss6, short_run, truth_of
 
 

@@ -11,16 +11,9 @@ from identify.experiment.truth import read_truth
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import load_result, save_result
 from identify.progress import SilentProgress
+from identify.record.model_runs import EXCITATION, read_model_runs, write_model_runs
 from identify.record.provenance import ENTRY, RunFiles, array_digest, digest
-from identify.record.recording import (
-    EXCITATION,
-    read,
-    read_model_runs,
-    read_runs,
-    write,
-    write_model_runs,
-    write_runs,
-)
+from identify.record.recording import read, read_runs, write, write_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector

@@ -22,18 +22,16 @@ from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
 from identify.record.load import recorded_payload
+from identify.record.model_runs import build_model_run, read_model_runs, write_model_runs
 from identify.record.provenance import check_robot
 from identify.record.recording import (
-    build_model_run,
     check_record,
     poses,
     read,
-    read_model_runs,
     read_runs,
     run_name,
     run_names,
     write,
-    write_model_runs,
     write_runs,
 )
 from identify.setup import Setup, with_renderer

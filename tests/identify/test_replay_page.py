@@ -13,8 +13,9 @@ from cmmsim.geometry.pose import invert
 from dynamics import load_robot
 from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import RunFolder, save_result
+from identify.record.model_runs import build_model_run, write_model_runs
 from identify.record.provenance import store_robot
-from identify.record.recording import build_model_run, write, write_model_runs
+from identify.record.recording import write
 from identify.scene import replay, workcell
 from tests.identify.commands import command
 from tests.identify.conftest import make_result

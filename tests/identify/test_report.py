@@ -16,7 +16,8 @@ import identify
 from dynamics.kinematics.platform import Chart
 from identify.errors import OutputFolderError, RecordError
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
-from identify.record.recording import build_model_run, read, write, write_model_runs
+from identify.record.model_runs import build_model_run, write_model_runs
+from identify.record.recording import read, write
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.figures import estimates, fit, paths, style
 from identify.reporting.figures.fit import Fit

@@ -1,0 +1,66 @@
+"""Times of poses: those that a log states, or frames one period apart.
+
+Cameras are triggered by a clock, but logs round times or write them late. Poses of a moving robot
+show which times are right: as a function of these, they lie on smoother curves.
+"""
+
+import numpy as np
+
+from identify.arrays import Array
+from identify.record.smoothness import local_misfit
+
+FARTHEST = 0.4
+"""Largest distance of a stated time from a frame, in periods, at which it can be of that frame."""
+
+BETTER = 0.97
+"""Largest ratio of two misfits at which the smaller one decides."""
+
+
+def frame_grid(times: Array, rate_hz: float) -> Array | None:
+    """Return times (N,) of frames one period apart that are nearest to stated times (N,), s.
+
+    Frames can be missing. The period is fitted, and starts near that of rate_hz. Returns None if
+    some time is too far from every frame.
+    """
+    steps = np.rint(np.diff(times) * rate_hz)
+    frames = np.concatenate([[0.0], np.cumsum(steps)])
+    if (steps < 1).any():
+        return None
+    slope, start = np.polyfit(frames, times, 1)
+    grid = start + slope * frames
+    return grid if np.abs(times - grid).max() <= FARTHEST / rate_hz else None
+
+
+def likelier_times(times: Array, poses: Array, covariance: Array, rate_hz: float) -> Array:
+    """Return the times (N,) at which poses were more likely seen, s.
+
+    These are the stated times (N,), or the nearest frames.
+
+    Parameters
+    ----------
+    times : ndarray, shape (N,)
+        Stated times of measured poses, s.
+    poses : ndarray, shape (N, 6)
+        Measured poses, without lost ones.
+    covariance : ndarray, shape (6, 6)
+        Covariance of a pose.
+    rate_hz : float
+        Frame rate.
+
+    Examples
+    --------
+    A platform moves at 60 frames a second, and times are rounded to milliseconds:
+
+    >>> import numpy as np
+    >>> frames = np.arange(300) / 60
+    >>> poses = np.outer(0.01 * np.sin(5 * frames), [1, 0, 0, 0, 0, 0])
+    >>> poses += 1e-6 * np.random.default_rng(0).standard_normal(poses.shape)
+    >>> found = likelier_times(np.round(frames, 3), poses, 1e-12 * np.eye(6), 60.0)
+    >>> bool(np.abs(np.diff(found) - 1 / 60).max() < 1e-6)
+    True
+    """
+    grid = frame_grid(times, rate_hz)
+    if grid is None:
+        return times
+    stated, framed = (local_misfit(one, poses, covariance) for one in (times, grid))
+    return grid if framed < BETTER * stated else times

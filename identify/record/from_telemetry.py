@@ -1,0 +1,279 @@
+"""Record of a run from its logs of poses, commands and the reference.
+
+A log on the grid of frames, with a reference, that begins at rest, and that shows every pose that
+the servo used, becomes a record on the grid. Its model can close its own loop. Every other log
+becomes a record with times of its own, whose model the commands drive.
+
+Gross errors are left out, and what was decided is noted in the record.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.record.checks import begins_at_rest
+from identify.record.frame_times import frame_grid, likelier_times
+from identify.record.recording import build_record
+from identify.record.smoothness import gross_errors
+from identify.record.telemetry import TIME_ROUNDING, CommandLog, ReferenceLog, Telemetry
+from identify.record.timed_record import build_timed_record
+from identify.scenario import Scenario
+
+MOST_GROSS = 0.1
+"""Largest share of poses that can be gross errors."""
+
+GAP = 1.5
+"""Time between two rows, in usual times between rows, above which rows are missing."""
+
+OTHER_RATE = 0.05
+"""Smallest relative difference of the rate of rows from the frame rate that is an error."""
+
+NAMED = 10
+"""Largest number of gross errors whose times a note names."""
+
+NOTES = "notes"
+"""Attribute of a record with what was decided when its file was read, as a JSON list."""
+
+
+def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Array) -> xr.Dataset:
+    """Return the record of a run from its logs.
+
+    stated (6, 6): covariance of the poses if the log holds none. Raises RecordError if more than a
+    tenth of the poses are gross errors, if no command is logged, or as `build_record` and
+    `build_timed_record` do.
+    """
+    ok = telemetry.poses.ok
+    covariances = telemetry.poses.covariance
+    if covariances is None:
+        covariances = np.tile(stated, (len(ok), 1, 1))
+    wrong, notes = _gross(telemetry, covariances)
+    poses = replace(telemetry.poses, ok=ok & ~wrong, covariance=covariances)
+    telemetry = replace(telemetry, poses=poses)
+    given: dict[str, Any] = {
+        "robot": robot.name,
+        "scenario_toml": scenario.to_toml(),
+        "frame_rate_hz": scenario.timing.frame_rate_hz,
+        "prismatic": robot.layout.prismatic,
+    }
+    why = _not_on_grid(telemetry, scenario, bool(wrong.any()))
+    if why is None:
+        assert telemetry.reference is not None
+        record = build_record(
+            time=poses.time,
+            reference_pose=telemetry.reference.pose,
+            reference_rate=rates(telemetry.reference, scenario.timing.frame_period_s),
+            measured_pose=poses.pose,
+            measured_covariance=covariances,
+            measured_ok=poses.ok,
+            command=telemetry.commands.command,
+            command_time=telemetry.commands.written,
+            **given,
+        )
+    else:
+        times, acting, more = _event_times(telemetry, scenario)
+        kept = _new_commands(telemetry.commands)
+        record = build_timed_record(
+            time=times,
+            measured_pose=poses.pose,
+            measured_covariance=covariances,
+            measured_ok=poses.ok,
+            acting=acting[kept],
+            command=telemetry.commands.command[kept],
+            gaps=_gaps(telemetry, acting, kept),
+            **given,
+        )
+        notes += [f"the commands drive the model: {why}", *more]
+    if notes:
+        record.attrs[NOTES] = json.dumps(notes)
+    return record
+
+
+def reading_notes(records: Sequence[xr.Dataset]) -> tuple[str, ...]:
+    """Return what was decided when the files of records were read.
+
+    Raises RecordError if a note is not text.
+    """
+    found: list[str] = []
+    for record in records:
+        text = record.attrs.get(NOTES, "[]")
+        try:
+            notes = json.loads(text)
+        except (TypeError, ValueError):
+            notes = None
+        if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+            raise RecordError(f"the record's attribute {NOTES} is {text!r}, must be a list of text")
+        found += notes
+    return tuple(found)
+
+
+def rates(reference: ReferenceLog, frame_period_s: float) -> Array:
+    """Return the rates (N, 6) of a reference, from its log or from a spline through it."""
+    if reference.rate is not None:
+        return reference.rate
+    # A record that is too short for a spline is refused later, by the check of its length.
+    if len(reference.pose) < 6:
+        return np.zeros_like(reference.pose)
+    times = np.arange(len(reference.pose)) * frame_period_s
+    spline = make_interp_spline(times, reference.pose, k=5)
+    return np.asarray(spline.derivative()(times), dtype=float)
+
+
+def _gross(telemetry: Telemetry, covariances: Array) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which poses (N,) are gross errors, and a note that names them.
+
+    Raises RecordError if there are too many.
+    """
+    log = telemetry.poses
+    wrong = np.zeros(len(log.ok), dtype=bool)
+    good = np.flatnonzero(log.ok)
+    # Fewer poses make no record, which is said later.
+    if len(good) < 30:
+        return wrong, []
+    mean = covariances[good].mean(axis=0)
+    # An invalid covariance is refused later, with all that is known there.
+    if not np.isfinite(mean).all() or np.linalg.eigvalsh((mean + mean.T) / 2)[0] <= 0:
+        return wrong, []
+    wrong[good[gross_errors(log.time[good], log.pose[good], mean)]] = True
+    count = int(wrong.sum())
+    if not count:
+        return wrong, []
+    shown = ", ".join(f"{time:.3f}" for time in log.time[wrong][:NAMED])
+    named = f"t = {shown} s" + (f" and {count - NAMED} more" if count > NAMED else "")
+    if count > MOST_GROSS * len(good):
+        raise RecordError(
+            f"{log.rows.source}: {count} of {len(good)} poses are far from the motion of their "
+            f"neighbours, at {named}; at most {MOST_GROSS:.0%} are left out as gross errors "
+            "(cmmsim check draws the poses)"
+        )
+    return wrong, [f"{count} single poses were left out as gross errors: {named}"]
+
+
+def _not_on_grid(telemetry: Telemetry, scenario: Scenario, gross: bool) -> str | None:
+    """Return why a log makes no record on the grid, or None."""
+    reference = telemetry.reference
+    poses = telemetry.poses
+    timing = scenario.timing
+    if reference is None:
+        return "the record holds no reference"
+    if not telemetry.is_one_table:
+        return "poses and commands were logged at different times"
+    frames = np.diff(poses.time) * timing.frame_rate_hz
+    _check_rate(telemetry, timing.frame_rate_hz)
+    if not (np.abs(frames - 1) <= TIME_ROUNDING).all():
+        return "the rows are not one frame period apart"
+    if timing.clock_offset_std_s or timing.clock_drift_std:
+        return "poses and commands have different clocks"
+    if gross:
+        return "the servo used wrong poses"
+    if not np.isfinite(telemetry.commands.command).all():
+        return "some rows hold no command"
+    if _seen_but_lost(telemetry):
+        return (
+            "commands change in rows without a measured pose, where the servo saw poses that were "
+            "not logged"
+        )
+    if not begins_at_rest(rates(reference, timing.frame_period_s)):
+        return "the record begins in motion"
+    return None
+
+
+def _check_rate(telemetry: Telemetry, rate_hz: float) -> None:
+    """Check that the usual time between the rows of one table is one frame of the stated rate.
+
+    Raises RecordError with the first row that is not.
+    """
+    times = telemetry.poses.time
+    if len(times) < 2:
+        return
+    frames = np.diff(times) * rate_hz
+    usual = float(np.median(frames))
+    mean = float(frames[np.abs(frames - usual) <= usual / 2].mean())
+    if abs(mean - 1) > OTHER_RATE:
+        row = int(np.argmax(np.abs(frames - 1) > OTHER_RATE))
+        raise RecordError(
+            f"{telemetry.poses.rows.place(row + 1)}: time_s is {times[row + 1]:g} after "
+            f"{times[row]:g} in the row before, which is {frames[row]:.4g} frames of {rate_hz:g} "
+            f"Hz (timing.frame_rate_hz) and not one; on average rows are {mean:.4g} frames apart"
+        )
+
+
+def _seen_but_lost(telemetry: Telemetry) -> bool:
+    """Return whether a command changes in a row without a measured pose."""
+    command = telemetry.commands.command
+    changes = (np.diff(command, axis=0) != 0).any(axis=1)
+    return bool((changes & ~telemetry.poses.ok[1:]).any())
+
+
+def _event_times(telemetry: Telemetry, scenario: Scenario) -> tuple[Array, Array, list[str]]:
+    """Return the times of poses (N,) and of the action of commands (M,), s, and notes on them."""
+    poses = telemetry.poses
+    commands = telemetry.commands
+    rate_hz = scenario.timing.frame_rate_hz
+    times = poses.time
+    assert poses.covariance is not None
+    good = poses.ok
+    notes = []
+    grid = frame_grid(times, rate_hz)
+    if grid is not None and good.sum() > 30:
+        covariance = poses.covariance[good].mean(axis=0)
+        found = likelier_times(times[good], poses.pose[good], covariance, rate_hz)
+        if found is not times[good] and not np.array_equal(found, times[good]):
+            off = float(np.std(times - grid))
+            notes = [
+                f"poses are smoother at frames of {1 / np.diff(grid).min():.4f} Hz than at the "
+                f"logged times, which differ by {1e3 * off:.2g} ms (rms): the frames were taken"
+            ]
+            times = grid
+    if commands.written is not None:
+        acting = commands.written
+    elif np.array_equal(commands.time, poses.time):
+        acting = times + scenario.timing.latency_s
+    else:
+        acting = commands.time + scenario.timing.latency_s
+    return times, acting, notes
+
+
+def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
+    """Return the rows (M,) that issue a command.
+
+    An empty row issues none. If a logger is faster than the controller, most rows repeat the
+    command before, and only those that change it issue one.
+    """
+    given = np.array(np.isfinite(commands.command).all(axis=1))
+    if commands.written is not None:
+        given &= np.isfinite(commands.written)
+    if not given.any():
+        raise RecordError(f"{commands.rows.source}: no row holds a command")
+    rows = np.flatnonzero(given)
+    changes = np.append(True, (np.diff(commands.command[rows], axis=0) != 0).any(axis=1))
+    if changes.mean() < 0.5:
+        given[rows[~changes]] = False
+    return given
+
+
+def _gaps(telemetry: Telemetry, acting: Array, kept: NDArray[np.bool_]) -> Array:
+    """Return the times (k, 2) of the last and the first command around gaps, s.
+
+    In a gap, rows of commands and of poses are missing. Where only commands are missing, the last
+    one was held.
+    """
+    rows = telemetry.commands.time
+    poses = telemetry.poses.time
+    usual = GAP * max(float(np.median(np.diff(rows))), float(np.median(np.diff(poses))))
+    found = []
+    for row in np.flatnonzero(np.diff(rows) > usual):
+        inside = (poses > rows[row] + 1e-9) & (poses < rows[row + 1] - 1e-9)
+        before = np.flatnonzero(kept[: row + 1])
+        after = np.flatnonzero(kept[row + 1 :])
+        if not inside.any() and len(before) and len(after):
+            found.append((acting[before[-1]], acting[row + 1 + after[0]]))
+    return np.array(found).reshape(-1, 2)
