@@ -22,6 +22,7 @@ from identify.estimation.identification import asked_of, identify, output_error_
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
+from identify.record.recording import is_timed
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
@@ -74,6 +75,11 @@ def diagnose(
     began = time.perf_counter()
     asked = asked_of(record, robot, scenario)
     side = asked.side.with_drive(result.drive.law)
+    if any(map(is_timed, asked.records)):
+        raise EstimationError(
+            "the diagnosis asks for causes frame by frame, and the commands of a record have times "
+            "of their own"
+        )
     problem = output_error_problem(asked.records, side, asked.settings)
     found = diagnosis_from(problem, result.driven_estimate, causes)
     return replace(found, seconds=time.perf_counter() - began)

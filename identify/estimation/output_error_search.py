@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynamics import DynamicsError
+from dynamics.closed_loop import LoopFailure
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, minimise
@@ -30,11 +31,14 @@ FULL_STEPS = 2
 SETTLED = 0.02
 """Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
-STEPS = 2
+STEPS = 1
 """Number of steps between two linearisations in common errors with a wide prior."""
 
 MOST = 15
 """Largest number of these linearisations."""
+
+HALVINGS = 10
+"""Largest number of halvings of a step of the common errors."""
 
 NEAR = 1.0
 """Change of such errors, in the standard deviations that decide, at which they count as near."""
@@ -135,8 +139,28 @@ def _near_common_errors(
         errors = most_likely_errors(problem, start)
         if problem.has(errors, NEAR):
             break
-        problem = problem.having(errors).with_common_errors(start)
+        problem = _moved_towards(problem, errors, start)
     return problem, start
+
+
+def _moved_towards(
+    problem: OutputErrorProblem, errors: list[Array], parameters: Array
+) -> OutputErrorProblem:
+    """Return the problem about these common errors, or part of the way to them.
+
+    The model can be unstable with errors that follow from a linearisation far from them. Raises
+    LoopFailure if it is unstable half a thousandth of the way.
+    """
+    had = [run.errors_had for run in problem.runs]
+    for halving in range(HALVINGS):
+        share = 0.5**halving
+        part = [before + share * (own - before) for before, own in zip(had, errors, strict=True)]
+        try:
+            return problem.having(part).with_common_errors(parameters)
+        except LoopFailure:
+            if halving == HALVINGS - 1:
+                raise
+    raise AssertionError
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,10 @@ class LoopModel:
         # Errors of measured poses have no effect on a model without a servo.
         inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
         had = modes[:, inside] @ self.errors_had[inside]
-        return replace(run, marginal=Marginal.of(modes, had))
+        whitened = replace(run, marginal=Marginal.of(modes, had))
+        # Whitening changes no run.
+        whitened._runs.update(run._runs)
+        return whitened
 
     def modes(self, parameters: Array) -> Array:
         """Return the shift (N, 6, k) of the measured poses against the model by the common errors.

@@ -208,6 +208,8 @@ class TimedModel(LoopModel):
     def _shown_starts(self, parameters: Array) -> dict[int, Array]:
         """Return the changes (N, 6) of the poses by each error of a start, by the error's place."""
         runs = self._simulated(parameters, sensitivities=True, by_start=True)
+        # The search linearises at the same parameters next.
+        self._runs[True] = parameters.tobytes(), _joined(runs)
         stds = self.common.loop_std
         places = {name: len(self.common.names) + k for k, name in enumerate(stds)}
         found = {}

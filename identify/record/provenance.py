@@ -22,7 +22,7 @@ from identify.files.run_folder import RunFolder, load_result
 from identify.record.conditions import OPTIONAL
 from identify.record.load import ADDED
 from identify.record.model_runs import read_model_runs
-from identify.record.recording import VARIABLES, read, read_runs
+from identify.record.recording import read, read_runs, variables_of
 from identify.scenario import Scenario, scenario_from_toml
 
 ROBOT = "robot_geometry"
@@ -290,7 +290,8 @@ def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
         # A new title or date does not make another record.
-        held = ("time", *VARIABLES, *(name for name in OPTIONAL if name in record))
+        optional = (*OPTIONAL, "acting")
+        held = ("time", *variables_of(record), *(name for name in optional if name in record))
         arrays = {name: record[name].values for name in held}
         stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}
         scenario = recorded_scenario(record)

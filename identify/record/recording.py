@@ -30,6 +30,7 @@ from identify.files.dataset import (
     write_groups,
 )
 from identify.files.versions import versions
+from identify.filtering import without_gaps
 from identify.record.conditions import COMMAND_TIME, OPTIONAL, check_command_times
 
 TRUTH_GROUP = "truth"
@@ -264,12 +265,17 @@ def is_timed(record: xr.Dataset) -> bool:
     return "command" in record and "acting" in record["command"].dims
 
 
+def variables_of(record: xr.Dataset) -> Variables:
+    """Return the variables that a record of this kind has."""
+    return TIMED if is_timed(record) else VARIABLES
+
+
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     """Check that a record is complete, of the right shapes, and finite where measured. Return it.
 
     Raises RecordError with the first fault.
     """
-    variables = TIMED if is_timed(record) else VARIABLES
+    variables = variables_of(record)
     check_variables(record, variables, source)
     stated = record["measured_ok"].values
     strange = np.flatnonzero((stated != 0) & (stated != 1))
@@ -313,6 +319,16 @@ def _check_acting(record: xr.Dataset, source: str) -> None:
             f"{source}: the commands are from {acting[0]:.6g} to {acting[-1]:.6g} s and the poses "
             f"from {time[0]:.6g} to {time[-1]:.6g} s: their clocks do not overlap"
         )
+
+
+def intended_motion(record: xr.Dataset) -> Array:
+    """Return the desired poses (N, 6) of a record, m and rad.
+
+    If it holds no reference, the measured poses are returned, with lost ones interpolated.
+    """
+    if "reference_position" in record:
+        return poses(record, "reference")
+    return without_gaps(poses(record, "measured"), record["measured_ok"].values.astype(bool))
 
 
 def recorded_reference(record: xr.Dataset) -> Reference:

@@ -6,23 +6,33 @@ needed.
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from identify.arrays import Array
 
-NEIGHBOURS = 10
-"""Number of poses through which a polynomial goes."""
+NEIGHBOURS = 12
+"""Number of poses near a pose, through which polynomials go."""
+
+TRUSTED = 9
+"""Number of these that must be right."""
+
+SUBSETS = 30
+"""Number of polynomials that are tried for each pose."""
 
 DEGREE = 6
 """Degree of the polynomial. It follows motions up to a tenth of the frame rate."""
 
-LONGEST = 3.5
+LONGEST = 2.5
 """Longest time between two poses of a polynomial, in usual times between poses."""
 
-GROSS = 60.0
+GROSS = 100.0
 """Squared distance from the prediction above which a pose is a gross error.
 
 It is in units of its variance. For noise alone, its mean is six.
 """
+
+MEDIAN = float(chdtri(6, 0.5))
+"""Median of this squared distance for noise alone."""
 
 
 def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
@@ -31,8 +41,9 @@ def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
     It is in variances of the noise, and about one if the motion is smooth in times (N,), s. The
     largest tenth of all distances is left out, where the motion has kinks.
     """
-    rows = np.arange(len(times))
-    _, leftover, _ = _predicted(times, _whitened(poses, covariance), rows)
+    white = _whitened(poses, covariance)
+    neighbours, powers, _ = _windows(times, np.arange(len(times)))
+    _, leftover = _predicted(white, powers, white[neighbours])
     ordered = np.sort(leftover)[: max(1, int(0.9 * len(leftover)))]
     return float(ordered.mean())
 
@@ -41,8 +52,9 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
     """Return the rows of single poses that are wrong.
 
     A wrong pose is far from the polynomial through its neighbours, from which the neighbours
-    themselves are not. At a kink of the motion, all poses are far from it. The worst pose is left
-    out first, because it also moves the predictions of its neighbours.
+    themselves are not. At a kink of the motion, all poses are far from it. Neighbours can be wrong
+    as well: of several polynomials through most of them, the one to which most are near counts
+    (least trimmed squares).
 
     Parameters
     ----------
@@ -60,53 +72,56 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
     >>> poses[40, 1] += 1e-3
     >>> gross_errors(times, poses, 1e-12 * np.eye(6))
     array([40])
+
+    References
+    ----------
+    Rousseeuw, Least median of squares regression, Journal of the American Statistical Association
+    79(388), 1984.
     """
-    kept = np.arange(len(times))
+    rows = np.arange(len(times))
     white = _whitened(poses, covariance)
-    found: list[int] = []
-    passed: set[int] = set()
-    while len(kept) > NEIGHBOURS + 1:
-        squared, leftover, _ = _predicted(times[kept], white[kept], np.arange(len(kept)))
-        squared = np.where([int(row) in passed for row in kept], 0.0, squared)
-        worst = int(np.argmax(squared))
-        if squared[worst] <= GROSS:
-            break
-        if squared[worst] > GROSS * max(1.0, leftover[worst]):
-            found.append(int(kept[worst]))
-            kept = np.delete(kept, worst)
-            continue
-        # A second wrong pose near it can hide it.
-        near = np.delete(np.arange(len(kept)), _strongest_beside(squared, worst))
-        place = int(np.flatnonzero(near == worst)[0])
-        own, rest, _ = _predicted(times[kept[near]], white[kept[near]], np.array([place]))
-        if own[0] > GROSS * max(1.0, rest[0]):
-            found.append(int(kept[worst]))
-            kept = np.delete(kept, worst)
-        else:
-            passed.add(int(kept[worst]))
-    return np.array(_still_wrong(times, white, found), dtype=np.intp)
+    neighbours, powers, reached = _windows(times, rows)
+    values = white[neighbours]
+    best = np.full(len(rows), np.inf)
+    kept = np.zeros((len(rows), TRUSTED), dtype=np.intp)
+    rng = np.random.default_rng(0)
+    for _ in range(SUBSETS):
+        chosen = np.sort(rng.choice(NEIGHBOURS, TRUSTED, replace=False))
+        base, triangle = np.linalg.qr(powers[:, chosen])
+        slopes = np.linalg.solve(triangle, base.transpose(0, 2, 1) @ values[:, chosen])
+        apart = np.sum((values - powers @ slopes) ** 2, axis=2)
+        order = np.argsort(apart, axis=1)[:, :TRUSTED]
+        trimmed = np.take_along_axis(apart, order, axis=1).sum(axis=1)
+        better = trimmed < best
+        best[better] = trimmed[better]
+        kept[better] = order[better]
+    squared, leftover = _predicted(
+        white[rows],
+        np.take_along_axis(powers, kept[:, :, None], axis=1),
+        np.take_along_axis(values, kept[:, :, None], axis=1),
+    )
+    # A motion too fast for the frame rate is nowhere near its polynomials.
+    least = max(1.0, float(np.median(squared)) / MEDIAN)
+    wrong = np.flatnonzero(reached & (squared > GROSS * np.maximum(least, leftover)))
+    return _still_wrong(times, white, wrong[np.argsort(squared[wrong])], least)
 
 
-def _still_wrong(times: Array, white: Array, found: list[int]) -> list[int]:
-    """Return the rows that are wrong beside the right ones alone, in their order.
+def _still_wrong(
+    times: Array, white: Array, wrong: NDArray[np.intp], least: float
+) -> NDArray[np.intp]:
+    """Return those of some wrong poses that are also far from right ones alone, in their order.
 
-    A right pose beside two wrong ones can have been taken for wrong before both were left out.
+    A right pose beside wrong ones can be far from a polynomial through these. wrong: rows, the
+    least wrong first. least: smallest mean squared distance of neighbours.
     """
-    wrong = sorted(found)
-    for row in reversed(found):
-        others = np.delete(np.arange(len(times)), [one for one in wrong if one != row])
-        place = np.searchsorted(others, row)
-        squared, _, _ = _predicted(times[others], white[others], np.array([place]))
-        if squared[0] <= GROSS:
-            wrong.remove(row)
-    return wrong
-
-
-def _strongest_beside(squared: Array, row: int) -> int:
-    """Return the row with the largest entry of squared (N,) near another row."""
-    near = np.arange(max(0, row - NEIGHBOURS), min(len(squared), row + NEIGHBOURS + 1))
-    near = near[near != row]
-    return int(near[np.argmax(squared[near])])
+    for row in wrong:
+        others = np.delete(np.arange(len(times)), wrong[wrong != row])
+        place = np.searchsorted(others, [row])
+        neighbours, powers, reached = _windows(times[others], place)
+        squared, leftover = _predicted(white[[row]], powers, white[others[neighbours]])
+        if reached[0] and squared[0] <= GROSS * max(least, leftover[0]):
+            wrong = wrong[wrong != row]
+    return np.sort(wrong)
 
 
 def _whitened(poses: Array, covariance: Array) -> Array:
@@ -115,34 +130,39 @@ def _whitened(poses: Array, covariance: Array) -> Array:
     return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), continuous.T).T)
 
 
-def _predicted(
-    times: Array, white: Array, rows: NDArray[np.intp]
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Predict whitened poses (N, 6) at some rows (k,) by polynomials through their neighbours.
+def _windows(
+    times: Array, rows: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
+    """Return the neighbours (k, NEIGHBOURS) of rows (k,), and the powers of their times.
 
-    Returns the squared distances (k,) from the predictions in units of their variance, the mean
-    squared distances (k,) of the neighbours from the polynomial per component and degree of
-    freedom, and the neighbours (k, NEIGHBOURS).
+    The powers (k, NEIGHBOURS, DEGREE + 1) are of times relative to the row. The last array (k,)
+    is false where the window spans a gap, across which a polynomial does not reach.
     """
-    half = NEIGHBOURS // 2
-    first = np.clip(rows - half, 0, len(times) - NEIGHBOURS - 1)
+    first = np.clip(rows - NEIGHBOURS // 2, 0, len(times) - NEIGHBOURS - 1)
     window = first[:, None] + np.arange(NEIGHBOURS + 1)
     neighbours = window[window != rows[:, None]].reshape(len(rows), NEIGHBOURS)
     since = times[neighbours] - times[rows][:, None]
     scale = np.abs(since).max(axis=1, keepdims=True)
     powers = (since / scale)[:, :, None] ** np.arange(DEGREE + 1)
+    longest = np.diff(times[window], axis=1).max(axis=1)
+    return neighbours, powers, longest <= LONGEST * np.median(np.diff(times))
+
+
+def _predicted(white: Array, powers: Array, values: Array) -> tuple[Array, Array]:
+    """Predict whitened poses (k, 6) by polynomials through other poses (k, q, 6).
+
+    powers (k, q, DEGREE + 1): powers of the times of these. Returns the squared distances (k,) from
+    the predictions in units of their variance, and the mean squared distances (k,) of the other
+    poses from the polynomials, per component and degree of freedom.
+    """
     base, triangle = np.linalg.qr(powers)
-    values = white[neighbours]
     along = base.transpose(0, 2, 1) @ values
     left = values - base @ along
-    freedom = white.shape[1] * (NEIGHBOURS - DEGREE - 1)
+    freedom = white.shape[1] * (powers.shape[1] - powers.shape[2])
     leftover = np.sum(left**2, axis=(1, 2)) / freedom
     # At the row itself all powers but the first are zero.
-    weights = np.linalg.solve(triangle.transpose(0, 2, 1), np.eye(DEGREE + 1)[:, :1])[:, :, 0]
+    at_row = np.eye(powers.shape[2])[:, :1]
+    weights = np.linalg.solve(triangle.transpose(0, 2, 1), at_row)[:, :, 0]
     predicted = np.einsum("kp,kpc->kc", weights, along)
     variance = 1.0 + np.sum(weights**2, axis=1)
-    squared = np.sum((white[rows] - predicted) ** 2, axis=1) / variance
-    # A polynomial does not reach across a gap.
-    longest = np.diff(times[window], axis=1).max(axis=1)
-    squared[longest > LONGEST * np.median(np.diff(times))] = 0.0
-    return squared, leftover, neighbours
+    return np.sum((white - predicted) ** 2, axis=1) / variance, leftover

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import RunFolder
-from identify.record.recording import poses
+from identify.record.recording import intended_motion, poses
 from identify.reporting.figures import diagnosis, estimates, fit, overview, paths
 from identify.reporting.figures.style import drawn, moving
 from identify.reporting.run_data import RunData, read_run
@@ -156,7 +156,7 @@ def _of_the_sensor(data: RunData) -> dict[str, Picture]:
     covariances = data.experiment["measured_covariance"].values
     errors = None if data.truth is None else true_poses(data.truth) - measured
     # The reference has no noise, and shows which components move.
-    shown = moving(poses(data.experiment, "reference"))
+    shown = moving(intended_motion(data.experiment))
     text = (
         "Uncertainty of single measured poses: ellipses that contain 95 % of true poses according "
         "to the cameras, along the path, enlarged as stated above each row."
@@ -172,7 +172,7 @@ def _of_the_sensor(data: RunData) -> dict[str, Picture]:
 
 def _of_the_motion(data: RunData) -> dict[str, Picture]:
     time = data.experiment["time"].values
-    reference = poses(data.experiment, "reference")
+    reference = intended_motion(data.experiment)
     path = (
         "The exciting trajectory as a path in space, and the orientation along it; the same times "
         "are marked in both."

@@ -21,7 +21,7 @@ from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.record.model_runs import EXCITATION
 from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
-from identify.record.recording import TRUTH_GROUP, poses, run_name
+from identify.record.recording import TRUTH_GROUP, intended_motion, poses, run_name
 from identify.reporting.figures.fit import Fit
 from identify.reporting.paper import repeats_the_paper
 from identify.reporting.run_result import check_intervals
@@ -132,7 +132,7 @@ class RunData:
         It is the true pose if that is known, and the reference otherwise.
         """
         measured = (
-            poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
+            intended_motion(self.experiment) if self.truth is None else true_poses(self.truth)
         )
         return measured[len(measured) // 2]
 

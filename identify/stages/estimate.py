@@ -108,8 +108,9 @@ def _identified_files(
     robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     diagnosis = None
-    # drives that took torques have no commands whose causes could be asked
-    if result.drive.in_loop and not result.explained:
+    # Causes are asked of joint commands, one per frame.
+    in_frames = result.drive.in_loop and not any(map(recording.is_timed, records.values()))
+    if in_frames and not result.explained:
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnose(list(records.values()), result, robot, scenario)
             advance()

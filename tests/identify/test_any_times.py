@@ -1,0 +1,147 @@
+"""Records as laboratories log them: nine forms of one experiment, identified alike.
+
+The experiment is simulated with known parameters. Poses at times that are not frames come from the
+plant itself, moved by the logged commands.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.errors import RecordError
+from identify.estimation.identification import identify
+from identify.record.frame_times import likelier_times
+from identify.record.from_telemetry import reading_notes, record_of
+from identify.record.recording import is_timed
+from identify.record.smoothness import gross_errors
+from tests.identify.record_forms import (
+    COVARIANCE,
+    DRIFT,
+    FORMS,
+    OFFSET_S,
+    exact,
+    record_in,
+    scenario_of,
+    true_parameters,
+)
+from tests.identify.synthetic import rss6
+
+CHANCE = 4.0
+"""Standard deviations that a figure may be off by chance."""
+
+
+@pytest.mark.parametrize(
+    ("form", "says"),
+    [
+        ("exact", None),
+        ("rounded to ms", "poses are smoother at frames of 60.0000 Hz"),
+        ("jitter of 0.2 ms", "the record holds no reference"),
+        ("commands at 250 Hz", "the record holds no reference"),
+        ("begun in motion", "the record begins in motion"),
+        ("two clocks", "poses and commands have different clocks"),
+        ("gaps of the servo", None),
+        ("gaps of the log", "the rows are not one frame period apart"),
+        ("gross errors", "5 single poses were left out as gross errors: t = 1.667, 5.833, 5.850, "),
+    ],
+)
+def test_a_form_is_recognised_and_said(form, says):
+    record = record_in(form, seed=0)
+    notes = reading_notes([record])
+    assert is_timed(record) is (says is not None)
+    assert (says is None and not notes) or any(says in note for note in notes)
+
+
+def test_commands_that_change_while_no_pose_is_logged_drive_the_model():
+    """Rows without a pose are there, so that nothing else tells of them."""
+    telemetry, _ = exact(0)
+    telemetry.poses.ok[300:330] = False
+    telemetry.poses.pose[300:330] = np.nan
+    record = record_of(telemetry, rss6(), scenario_of(), COVARIANCE)
+    assert is_timed(record)
+    assert "the servo saw poses that were not logged" in reading_notes([record])[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["begun in motion", "two clocks", "gaps of the log"])
+def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
+    known = identify(record_in("rounded to ms", 3))
+    record = record_in(form, 3)
+    found = identify(record)
+    chosen = found.identifiable & known.identifiable
+    assert np.count_nonzero(chosen) >= 24
+    shift = (found.estimate - known.estimate)[chosen] / known.std[chosen]
+    assert np.sqrt(np.mean(shift**2)) < 0.7
+    assert found.explained
+    off = np.abs(found.estimate - true_parameters())[chosen] / found.std[chosen]
+    assert np.count_nonzero(off > 2) <= 4
+    if form == "two clocks":
+        clock = found.common_errors
+        offset, drift = (
+            (clock.learned[name], clock.std[clock.names.index(name)])
+            for name in ("clock.offset_s", "clock.drift_s/s")
+        )
+        assert abs(offset[0] - OFFSET_S) < min(2e-4, CHANCE * offset[1])
+        assert abs(drift[0] - DRIFT) < CHANCE * drift[1]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("form", FORMS)
+def test_intervals_hold_in_every_form(form, keep_figures):
+    seeds = 50
+    inside = total = 0
+    shifts = []
+    for seed in range(seeds):
+        known = identify(record_in("exact", seed))
+        found = identify(record_in(form, seed))
+        chosen = found.identifiable & known.identifiable
+        off = np.abs(found.estimate - true_parameters())[chosen] / found.std[chosen]
+        inside += np.count_nonzero(off < 1.96)
+        total += np.count_nonzero(chosen)
+        shifts.append(np.mean((found.estimate - known.estimate)[chosen] / known.std[chosen]))
+    keep_figures(coverage=inside / total, mean_shift=float(np.mean(shifts)), records=seeds)
+    assert 0.93 <= inside / total <= 0.99
+    assert abs(np.mean(shifts)) < 0.3
+
+
+def smooth(count=200):
+    times = np.arange(count) / 60
+    poses = np.column_stack([0.01 * np.sin(4 * times + k) for k in range(6)])
+    noise = np.random.default_rng(5).standard_normal(poses.shape)
+    return times, poses + noise @ np.sqrt(COVARIANCE)
+
+
+def test_wrong_poses_are_found_beside_each_other_and_not_at_a_kink():
+    times, poses = smooth()
+    poses[:, 2] += 0.5 * np.maximum(times - 1.5, 0.0) ** 2
+    assert not len(gross_errors(times, poses, COVARIANCE))
+    wrong = [3, 60, 62, 140, 198]
+    poses[wrong] += np.random.default_rng(6).choice([-1, 1], (5, 6)) * ([2e-4] * 3 + [1e-3] * 3)
+    np.testing.assert_array_equal(gross_errors(times, poses, COVARIANCE), wrong)
+
+
+def test_times_are_those_at_which_poses_are_smooth():
+    """Stamps of a camera that jitters are right, and late stamps of a steady one are not."""
+    times, poses = smooth()
+    late = times + 5e-4 * np.random.default_rng(7).random(len(times))
+    found = likelier_times(late, poses, COVARIANCE, 60.0)
+    assert np.ptp(np.diff(found)) < 1e-9
+    jitter = times + 5e-4 * np.random.default_rng(8).standard_normal(len(times))
+    moved = np.column_stack([0.01 * np.sin(4 * jitter + k) for k in range(6)])
+    moved += poses - np.column_stack([0.01 * np.sin(4 * times + k) for k in range(6)])
+    np.testing.assert_array_equal(likelier_times(jitter, moved, COVARIANCE, 60.0), jitter)
+
+
+def test_more_than_a_tenth_of_wrong_poses_are_refused():
+    telemetry, _ = exact(0)
+    rows = np.random.default_rng(9).choice(len(telemetry.poses.ok), 160, replace=False)
+    telemetry.poses.pose[rows] += 5e-3
+    with pytest.raises(RecordError, match=r"mine.csv: \d+ of 1200 poses are far from the motion"):
+        record_of(telemetry, rss6(), scenario_of(), COVARIANCE)
+
+
+def test_clocks_that_do_not_overlap_are_refused():
+    telemetry, _ = exact(0)
+    other = replace(telemetry.commands, time=telemetry.commands.time + 1e6)
+    with pytest.raises(RecordError, match=r"no stretch .* commands from 1e\+06"):
+        record_of(replace(telemetry, commands=other), rss6(), scenario_of(), COVARIANCE)
