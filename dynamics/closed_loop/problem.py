@@ -23,6 +23,7 @@ from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
     equilibrium,
 )
+from dynamics.closed_loop.timed_commands import checked_times, held_commands
 from dynamics.errors import SimulationError
 from dynamics.legs.geometric_numbers import MOST_NUMBERS
 from dynamics.parameters import JOINT_PID, RigidGroups
@@ -175,10 +176,10 @@ def commands_problem(
     shape = problem.frames, robot.layout.joints
     if times is None:
         return dataclasses.replace(problem, commands=_rows("commands", commands, shape))
-    held, written = _held(commands, shape, problem.start.commands[-1])
+    held, written = held_commands(commands, shape, problem.start.commands[-1])
     if start is None and not written[0]:
         raise SimulationError("a run whose first frame issues no command needs a start")
-    times = _checked_times(times, problem.frames)
+    times = checked_times(times, problem.frames)
     return dataclasses.replace(problem, commands=held, times=times, written=written)
 
 
@@ -346,39 +347,6 @@ def _check_latencies(timing: FrameTiming, name: str, latencies: np.ndarray | Non
     """Raise SimulationError for a latency that is out of range."""
     for number, latency in enumerate([] if latencies is None else latencies.tolist()):
         timing.check_latency(f"{name} {number}", latency)
-
-
-def _checked_times(times: object, frames: int) -> np.ndarray:
-    """Times (frames,) of frames, s, which increase. Raises SimulationError."""
-    checked = floats("times", times, (frames,), error=SimulationError)
-    back = np.flatnonzero(np.diff(checked) <= 0)
-    if len(back):
-        first = int(back[0])
-        raise SimulationError(
-            f"times must increase, but frame {first + 1} is at {checked[first + 1]:.9g} s and "
-            f"frame {first} at {checked[first]:.9g} s"
-        )
-    return checked
-
-
-def _held(
-    commands: object, shape: tuple[int, int], before: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Commands (frames, n) with rows of NaN replaced by the command before, and which are given.
-
-    Raises SimulationError for a row of which only a part is NaN.
-    """
-    given = floats("commands", commands, shape, error=SimulationError, finite=False)
-    missing = np.isnan(given)
-    written = ~missing.all(axis=1)
-    if not np.isfinite(given[written]).all():
-        frame = int(np.flatnonzero(written & ~np.isfinite(given).all(axis=1))[0])
-        raise SimulationError(
-            f"commands of frame {frame} are {given[frame]}: a row is finite, or NaN as a whole"
-        )
-    newest = np.maximum.accumulate(np.where(written, np.arange(len(given)), -1))
-    held = np.where((newest >= 0)[:, None], given[newest], before)
-    return np.ascontiguousarray(held), written
 
 
 def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:

@@ -117,7 +117,8 @@ def _still_wrong(
     for row in wrong:
         others = np.delete(np.arange(len(times)), wrong[wrong != row])
         place = np.searchsorted(others, [row])
-        neighbours, powers, reached = _windows(times[others], place)
+        # Wrong poses in a row leave a gap, which is no reason to call their neighbours wrong.
+        neighbours, powers, reached = _windows(times[others], place, 2 * LONGEST)
         squared, leftover = _predicted(white[[row]], powers, white[others[neighbours]])
         if reached[0] and squared[0] <= GROSS * max(least, leftover[0]):
             wrong = wrong[wrong != row]
@@ -131,7 +132,7 @@ def _whitened(poses: Array, covariance: Array) -> Array:
 
 
 def _windows(
-    times: Array, rows: NDArray[np.intp]
+    times: Array, rows: NDArray[np.intp], longest: float = LONGEST
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
     """Return the neighbours (k, NEIGHBOURS) of rows (k,), and the powers of their times.
 
@@ -144,8 +145,8 @@ def _windows(
     since = times[neighbours] - times[rows][:, None]
     scale = np.abs(since).max(axis=1, keepdims=True)
     powers = (since / scale)[:, :, None] ** np.arange(DEGREE + 1)
-    longest = np.diff(times[window], axis=1).max(axis=1)
-    return neighbours, powers, longest <= LONGEST * np.median(np.diff(times))
+    widest = np.diff(times[window], axis=1).max(axis=1)
+    return neighbours, powers, widest <= longest * np.median(np.diff(times))
 
 
 def _predicted(white: Array, powers: Array, values: Array) -> tuple[Array, Array]:

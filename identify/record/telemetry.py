@@ -55,22 +55,6 @@ class PoseLog:
     def __post_init__(self) -> None:
         check_increasing(self.time, self.rows)
 
-    def check_grid(self, rate_hz: float) -> None:
-        """Check that the rows are one frame of this rate apart.
-
-        Raises RecordError with the row and the times.
-        """
-        frames = np.diff(self.time) * rate_hz
-        wrong = np.flatnonzero(~(np.abs(frames - 1) <= TIME_ROUNDING))
-        if len(wrong):
-            row = int(wrong[0])
-            raise RecordError(
-                f"{self.rows.place(row + 1)}: time_s is {self.time[row + 1]:g} after "
-                f"{self.time[row]:g} in the row before, which is {frames[row]:.4g} frames of "
-                f"{rate_hz:g} Hz (timing.frame_rate_hz) and not one; a lost frame must have a row "
-                "with empty measured columns"
-            )
-
 
 @dataclass(frozen=True)
 class CommandLog:

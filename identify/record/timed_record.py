@@ -4,6 +4,8 @@ A pose has the time at which it was seen, and a command the time at which it beg
 be at any times, and begin in motion. Neither a frame grid nor a reference is needed.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray

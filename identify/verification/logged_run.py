@@ -26,7 +26,7 @@ from identify.estimation.prior import (
     measured_parameter,
     model_guess,
 )
-from identify.model.from_record import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side
 from identify.record.conditions import COMMAND_TIME
 from identify.record.motion_lag import MotionLag
 from identify.record.own_record import (

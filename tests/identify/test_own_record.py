@@ -222,10 +222,6 @@ def moved(column, factor=1.0, shift=0.0):
         ),
         (lambda t: t.drop(columns="rate_z_m_s"), "line 1: there is no column rate_z_m_s"),
         (
-            lambda t: t.drop(index=50),
-            "line 52: time_s is 0.85 after 0.816667 in the row before, which is 2 frames",
-        ),
-        (
             lambda t: t.assign(time_s=2 * t["time_s"]),
             "line 3: time_s is 0.0333333 after 0 .* 2 frames of 60 Hz",
         ),
