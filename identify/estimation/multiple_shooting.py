@@ -33,6 +33,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.filtering import filtered_derivatives
 from identify.model.loop_model import LoopModel
+from identify.model.torque_model import commands_before
 from identify.scenario import Filter
 
 SEGMENT_S = 0.5
@@ -92,7 +93,7 @@ class Segment:
         start = None
         # Only the first segment begins in equilibrium.
         if self.first:
-            before, latencies = run.commands_before(self.first)
+            before, latencies = commands_before(run, self.first)
             start = StartState(
                 pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies
             )

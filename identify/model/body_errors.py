@@ -25,7 +25,6 @@ from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.loop_parameters import check_parameter_set
 from identify.model.body_torques import full_regressor, passive_columns, run_motion
-from identify.model.joint_torques import equivalent_commands
 from identify.scenario import Model
 
 if TYPE_CHECKING:
@@ -93,15 +92,14 @@ def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
     torques = _torques(run, parameters, run.simulate(parameters))
     if run.settings.drives.torques:
         return -torques
-    late = run.stated_latencies if run.latencies is None else run.latencies
     law = run.drive_law(parameters)
     count, frames, joints = torques.shape
     # all errors at once, as if each had joints of its own
     gains = [np.tile(one, count) for one in (law.lp, law.li, law.ld)]
     tiled = law._replace(lp=gains[0], li=gains[1], ld=gains[2])
     side_by_side = torques.transpose(1, 0, 2).reshape(frames, -1)
-    needed = equivalent_commands(side_by_side, late, tiled, run.settings.timing)
-    return -needed.reshape(frames, count, joints).transpose(1, 0, 2)
+    needed = run.commands_for(side_by_side, tiled)
+    return -needed.reshape(len(needed), count, joints).transpose(1, 0, 2)
 
 
 def fed_forward(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from dynamics.closed_loop import ClosedLoopRun
 from dynamics.expressions import function
@@ -19,7 +20,7 @@ from dynamics.parameters import passive_parameters
 from dynamics.rigid_body.passive_friction import passive_friction_columns
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
-from identify.filtering import spline_derivatives
+from identify.filtering import SPLINE_DEGREE
 
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
@@ -46,7 +47,7 @@ def run_motion(run: "LoopModel", found: ClosedLoopRun) -> RunMotion:
     chart = robot.geometry.chart
     poses = chart.pose(chart.coordinates(found.pose))
     rates = chart.lifted(chart.coordinates(found.pose_rate))
-    gains, _ = spline_derivatives(rates, run.settings.timing.frame_rate_hz)
+    gains = make_interp_spline(found.time, rates, k=SPLINE_DEGREE).derivative()(found.time)
     free = chart.basis
     jacobians = robot.joint_jacobian(poses) @ free
     maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T

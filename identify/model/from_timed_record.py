@@ -12,6 +12,7 @@ from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import filtered_derivatives
+from identify.model.body_errors import body_error_stds
 from identify.model.loop_errors import loop_error_stds
 from identify.model.model_side import ModelSide
 from identify.model.stretch import Stretch, begun_stretch
@@ -168,7 +169,10 @@ def _with_errors(run: TimedModel, record: xr.Dataset, side: ModelSide) -> TimedM
         for stretch in run.stretches:
             stds |= stretch.stds
     of_poses = read_common_errors(record, kinds)
-    common = replace(of_poses, loop_std=stds, geometry=geometry, whitener=run.whitener)
+    bodies = body_error_stds(run.robot, side.model, kinds)
+    common = replace(
+        of_poses, loop_std=stds, body_std=bodies, geometry=geometry, whitener=run.whitener
+    )
     return replace(run, common=common)
 
 

@@ -25,7 +25,6 @@ from dynamics.closed_loop import (
     simulate_servo,
 )
 from dynamics.closed_loop.drives import JointLaw
-from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
@@ -188,10 +187,7 @@ class LoopModel:
         return np.zeros(count) if self.drawn is None else self.drawn
 
     def in_deciding_stds(self, change: Array) -> Array:
-        """Return a change (k,) of the common errors in the standard deviations that decide.
-
-        These are the prior ones, in which such errors are given.
-        """
+        """Return a change (k,) of the common errors in the standard deviations that decide."""
         return change
 
     @property
@@ -200,7 +196,7 @@ class LoopModel:
         return False
 
     def on_grid(self) -> "LoopModel":
-        """Return the model of about this run with frames one period apart, for linear fits."""
+        """Return about this run with frames one period apart, for linear fits."""
         return self
 
     def simulate(
@@ -267,12 +263,14 @@ class LoopModel:
         """Return the logged commands (N, n), changed for `torques` and for errors of bodies."""
         commands = self.logged
         if self.torques is not None:
-            late = self.stated_latencies if self.latencies is None else self.latencies
-            law = self.drive_law(parameters)
-            timing = self.settings.timing
-            commands = commands - equivalent_commands(self.torques, late, law, timing)
+            commands = commands - self.commands_for(self.torques, self.drive_law(parameters))
         change = self.body_commands
         return commands if change is None else commands + change
+
+    def commands_for(self, torques: Array, law: JointLaw) -> Array:
+        """Return the changes of the commands for which drives add torques (N, j) at the frames."""
+        late = self.stated_latencies if self.latencies is None else self.latencies
+        return equivalent_commands(torques, late, law, self.settings.timing)
 
     @property
     def body_commands(self) -> Array | None:
@@ -294,16 +292,6 @@ class LoopModel:
     def _lost(self) -> NDArray[np.bool_] | None:
         """Marks (N,) of frames without a measurement by the model's servo. None without a servo."""
         return None if self.driven else ~self.ok
-
-    def commands_before(self, frame: int) -> tuple[Array, Array | None]:
-        """Return the commands (k, n) before a frame that can still act at it, and their latencies.
-
-        For the first frame it is the first command of the run. The latencies (k,) are in s. They
-        are None if all commands have the latency of the timing.
-        """
-        rows = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1))
-        latencies = self.latencies
-        return self.logged[rows], None if latencies is None else latencies[rows]
 
     def _sensed(self, noise: Array | None) -> Array | None:
         """Return the sum of the common errors in the model and of noise (..., N, 6).
@@ -343,10 +331,9 @@ class LoopModel:
         return {}
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `misses` (n, 6) of a model driven by the logged commands.
+        """Return `misses` (n, 6) of a model driven by commands, which are white if it is right.
 
-        They are white if the model is right. rng: generator that a subclass uses if it fits states
-        to the poses. Raises LoopFailure if the model is unstable.
+        rng: generator for a subclass that fits states to the poses. Raises LoopFailure.
         """
         return self.misses(parameters)
 
@@ -356,11 +343,7 @@ class LoopModel:
         return self.without_common(missed), self.without_common(shown)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) with respect to all parameters.
-
-        shown (..., k): derivatives with respect to the pivots of `groups` and to all other
-        parameters.
-        """
+        """Return derivatives (..., p) by all parameters from those (..., k) by pivots and others."""
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)

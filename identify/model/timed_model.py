@@ -29,8 +29,10 @@ from dynamics.closed_loop import (
     differentiate_commands,
     simulate_commands,
 )
+from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.model.error_modes import error_modes
+from identify.model.joint_torques import equivalent_commands
 from identify.model.loop_errors import lowest_errors
 from identify.model.loop_model import LoopModel
 from identify.model.stretch import Stretch
@@ -79,7 +81,9 @@ class TimedModel(LoopModel):
     def lowest_drawn(self) -> Array:
         """Smallest allowed values (k,) of the common errors. The clock may have any offset."""
         free = np.full(len(self.common.names), -np.inf)
-        return np.concatenate([free, lowest_errors(self.common.loop_std, np.inf)])
+        return np.concatenate(
+            [free, lowest_errors(self.common.loop_std | self.common.body_std, np.inf)]
+        )
 
     def simulate(
         self,
@@ -134,6 +138,17 @@ class TimedModel(LoopModel):
     def begins_in_motion(self) -> bool:
         """True, because the start of every stretch is estimated."""
         return True
+
+    def commands_for(self, torques: Array, law: JointLaw) -> Array:
+        """Return the changes (M, j) of the commands for which drives add torques (N, j) at poses.
+
+        They follow from commands one period apart, and change little in a period.
+        """
+        timing = self.settings.timing
+        grid = grid_times(self.times, timing.frame_rate_hz)
+        along = interpolated(grid, self.times, torques)
+        needed = equivalent_commands(along, np.zeros(len(grid)), law, timing)
+        return interpolated(self.acting_now, grid, needed)
 
     def on_grid(self) -> LoopModel:
         """Return about the same run with poses and commands a period apart, for linear fits."""

@@ -23,6 +23,7 @@ from dynamics.closed_loop import (
     StartState,
     differentiate_commands,
 )
+from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives
 from identify.model.loop_model import LoopModel
@@ -223,7 +224,7 @@ class TorqueModel(LoopModel):
         # Drives with torque commands have no integrals, and neither has a run without a servo.
         no_joint_integral = np.zeros(robot.layout.joints)
         no_pose_integral = np.zeros(len(coordinates))
-        before, earlier = self.commands_before(first)
+        before, earlier = commands_before(self, first)
         begin = StartState(
             pose,
             chart.lifted(rates),
@@ -266,6 +267,17 @@ class TorqueModel(LoopModel):
         return np.asarray(
             by_parameters - np.asarray(fit.run.start_sensitivity)[:, :, :states] @ moving
         )
+
+
+def commands_before(run: LoopModel, frame: int) -> tuple[Array, Array | None]:
+    """Return the commands (k, n) before a frame that can still act at it, and their latencies.
+
+    For the first frame it is the first command of the run. The latencies (k,) are in s. They are
+    None if all commands have the latency of the timing.
+    """
+    rows = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1))
+    latencies = run.latencies
+    return run.logged[rows], None if latencies is None else latencies[rows]
 
 
 def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
