@@ -317,8 +317,7 @@ class LoopModel:
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
-        # A copy, because the caller can change the array.
-        given = parameters.tobytes()
+        given = parameters.tobytes()  # a copy, because the caller can change the array
         known, run = self._runs.get(sensitivities, (b"", None))
         if run is None or known != given:
             run = self.simulate(parameters, sensitivities=sensitivities)
@@ -343,7 +342,7 @@ class LoopModel:
         return self.without_common(missed), self.without_common(shown)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters from those (..., k) by pivots and others."""
+        """Return derivatives (..., p) by all parameters, from those by pivots and others."""
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)
