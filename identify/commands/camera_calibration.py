@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.commands.options import JsonFile, Plugins, Quiet, completion, tell
+from identify.commands.photographs import require_none, save_pairs
 from identify.errors import ScenarioError
-from identify.files.atomic import atomic_contents, write_bytes, write_text
+from identify.files.atomic import atomic_contents, write_text
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
@@ -144,8 +145,8 @@ def calibrate(
     folder = context.with_resource(new_run_folder(out)).path
     progress = terminal_progress(quiet)
     if render is not None:
-        _require_none("--render makes pictures and reads none", LEFT=left, RIGHT=right)
-        _require_none(
+        require_none("--render makes pictures and reads none", LEFT=left, RIGHT=right)
+        require_none(
             "--render makes pictures and calibrates nothing",
             **{
                 "--distortion": distortion,
@@ -158,7 +159,7 @@ def calibrate(
         _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
         return
     if halves is None:
-        _require_none(
+        require_none(
             "a calibration draws no random numbers without --render or --halves", **{"--seed": seed}
         )
     if left is None or right is None or board is None:
@@ -187,12 +188,6 @@ def calibrate(
         [*found.warnings, *(template.disagreements(found) if template else []), *refused]
     )
     tell(content, json, quiet, lambda: _print_summary(found, apart, folder))
-
-
-def _require_none(reason: str, **given: object) -> None:
-    """Raise ScenarioError that names the arguments given although they would change nothing."""
-    if names := [name for name, value in given.items() if value is not None]:
-        raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
 
 def _view(
@@ -259,7 +254,6 @@ def _render(
     quiet: bool,
 ) -> None:
     """Write pictures into left/ and right/, and board.toml beside them: all files, or none."""
-    import cv2
     import numpy as np
 
     from cmmsim import load_sensor
@@ -273,13 +267,7 @@ def _render(
     renderer = choose_renderer(source.renderer)
     frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
     with progress.stage("render", count) as advance, atomic_contents(folder) as made:
-        for side in ("left", "right"):
-            (made / side).mkdir()
-        for k, frame in enumerate(frames):
-            for side, image in (("left", frame.left), ("right", frame.right)):
-                path = made / side / f"{k:03d}.png"
-                write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
-            advance()
+        save_pairs(made, frames, advance)
         write_text(made / "board.toml", board.as_toml())
     if not quiet:
         typer.echo(

@@ -8,16 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.commands.options import JsonFile, Quiet, completion, tell
+from identify.errors import ScenarioError
 from identify.files.atomic import atomic_contents, write_bytes, write_text
 from identify.files.run_folder import new_run_folder, save_files
-from identify.progress import print_table, print_warnings, terminal_progress
+from identify.progress import Advance, Progress, print_table, print_warnings, terminal_progress
 
 if TYPE_CHECKING:
-    from cmmsim import PhotographedTeaching
+    from collections.abc import Iterable
+
+    from cmmsim import PhotographedTeaching, StereoFrame
     from identify.arrays import Array
 
-Left = Annotated[Path, typer.Argument(help="Folder of the left images, or a video.")]
-Right = Annotated[Path, typer.Argument(help="Folder of the right images, or a video.")]
+LEFT = typer.Argument(help="Folder of the left images, or a video.", show_default=False)
+RIGHT = typer.Argument(help="Folder of the right images, or a video.", show_default=False)
 SensorFile = Annotated[
     str,
     typer.Option(
@@ -39,13 +42,28 @@ Colour = Annotated[
 
 def teach(
     context: typer.Context,
-    left: Left,
-    right: Right,
     sensor: SensorFile,
+    left: Annotated[Path | None, LEFT] = None,
+    right: Annotated[Path | None, RIGHT] = None,
     out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path(
         "runs/teaching"
     ),
     colour: Colour = None,
+    render: Annotated[
+        int | None,
+        typer.Option(
+            "--render", min=1, help="Only render this many pairs of images; teach nothing."
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed",
+            min=0,
+            help="Seed of the noise of rendered images; 0 by default.",
+            show_default=False,
+        ),
+    ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
@@ -68,11 +86,23 @@ def teach(
     Examples:
       cmmsim teach photos/left photos/right --sensor mine.toml --out teaching
       cmmsim teach left.avi right.avi --sensor mine.toml --colour green
+    Render images to try it with, and the true poses into poses.csv:
+      cmmsim teach --render 24 --sensor mine.toml --out photos
     """
     from cmmsim.from_photographs import photographs_for, sensor_for
     from identify.verification.photograph_figures import teaching_residuals
 
     folder = context.with_resource(new_run_folder(out)).path
+    if render is not None:
+        require_none("--render makes images and reads none", LEFT=left, RIGHT=right)
+        require_none("--render makes grey images", **{"--colour": colour, "--json": json})
+        _render(folder, sensor, render, seed or 0, terminal_progress(quiet))
+        if not quiet:
+            typer.echo(f"images: {folder}/left {folder}/right")
+        return
+    require_none("teaching draws no random numbers without --render", **{"--seed": seed})
+    if left is None or right is None:
+        raise ScenarioError("missing LEFT or RIGHT; cmmsim teach --help shows examples")
     known = sensor_for(sensor)
     pairs = photographs_for(known, left, right, colour)
     with terminal_progress(quiet, "pairs/s").stage("find stickers", len(pairs)) as advance:
@@ -81,6 +111,44 @@ def teach(
     save_files(folder, {"taught.json": content, "residuals.png": teaching_residuals(found)})
     print_warnings(found.warnings)
     tell(content, json, quiet, lambda: _print_summary(found, folder))
+
+
+def _render(folder: Path, sensor: str, count: int, seed: int, progress: Progress) -> None:
+    """Write images of the poses of a smooth path, and these poses: all files, or none."""
+    import numpy as np
+
+    from cmmsim.loading import load_sensor
+    from cmmsim.photographs.measuring import POSE, UNITS
+    from cmmsim.teaching import teaching_path
+
+    source = load_sensor(sensor, seed)
+    poses = teaching_path(source.home, count)
+    frames = (source.capture(pose) for pose in poses)
+    header = ",".join(f"{name}_{unit}" for name, unit in zip(POSE, UNITS, strict=True))
+    text = io.StringIO()
+    np.savetxt(text, poses, delimiter=",", header=header, comments="")
+    with progress.stage("render", count) as advance, atomic_contents(folder) as made:
+        save_pairs(made, frames, advance)
+        write_text(made / "poses.csv", text.getvalue())
+
+
+def save_pairs(folder: Path, frames: "Iterable[StereoFrame]", advance: Advance) -> None:
+    """Write frames as numbered images into the folders left and right of a folder."""
+    import cv2
+
+    for side in ("left", "right"):
+        (folder / side).mkdir()
+    for k, frame in enumerate(frames):
+        for side, image in (("left", frame.left), ("right", frame.right)):
+            path = folder / side / f"{k:03d}.png"
+            write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+        advance()
+
+
+def require_none(reason: str, **given: object) -> None:
+    """Raise ScenarioError that names the arguments given although they would change nothing."""
+    if names := [name for name, value in given.items() if value is not None]:
+        raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
 
 def _print_summary(found: "PhotographedTeaching", folder: Path) -> None:
@@ -111,8 +179,8 @@ def _stds(covariance: "Array") -> tuple[str, str]:
 
 def measure(
     context: typer.Context,
-    left: Left,
-    right: Right,
+    left: Annotated[Path, LEFT],
+    right: Annotated[Path, RIGHT],
     sensor: SensorFile,
     taught: Annotated[
         Path, typer.Option("--taught", metavar="FILE", help="taught.json of cmmsim teach.")

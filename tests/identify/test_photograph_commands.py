@@ -2,6 +2,8 @@
 
 import csv
 import json
+import shlex
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -126,3 +128,27 @@ def test_an_image_that_does_not_fit_the_sensor_is_named_with_the_cause(
     assert teach(tmp_path, tmp_path / "out") == 1
     assert message in one_line(capfd.readouterr().err)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_tutorial_measure_the_poses_that_they_rendered(tmp_path, monkeypatch):
+    """With fewer images, and the nominal cameras."""
+    page = Path(__file__).parents[2] / "docs" / "tutorials" / "real_photographs.md"
+    lines = [
+        line.replace("--render 24", "--render 4").replace("calibration/sensor.toml", "ctrack780")
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if line.startswith(("cmmsim teach", "cmmsim measure"))
+    ]
+    assert len(lines) == 3
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        assert command(*shlex.split(line)[1:], "--quiet") == 0
+    true = np.loadtxt("photos/poses.csv", delimiter=",", skiprows=1)
+    with Path("poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    names = columns_of(load_robot("rss6"))["measured"].names
+    measured = np.array([[float(row[name]) for name in names] for row in rows])
+    assert np.abs(measured - true).max() < 1e-4
+    assert command("teach", "--render", 4, "photos", "--sensor", "ctrack780", "--out", "new") == 1
+    assert command("teach", "photos/left", "--sensor", "ctrack780", "--out", "new") == 1
+    assert not Path("new").exists()
