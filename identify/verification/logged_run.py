@@ -38,7 +38,7 @@ from identify.record.own_record import (
 )
 from identify.record.pose_noise import GAP, PoseNoise, Spectrum, pose_noise, spectrum
 from identify.record.provenance import recorded_scenario
-from identify.record.recording import poses, read, recorded_reference
+from identify.record.recording import is_timed, poses, read, recorded_reference
 from identify.record.servo_delay import ServoDelay, servo_delay
 from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
@@ -211,11 +211,18 @@ def recorded_telemetry(record: xr.Dataset, source: str) -> Telemetry:
     """Return the logs of a record. `source` names it in messages."""
     time = np.asarray(record["time"].values, dtype=float)
     rows = Rows(source, range(len(time)), "frame")
-    reference = recorded_reference(record)
     ok = record["measured_ok"].values.astype(bool)
+    covariance = record["measured_covariance"].values
+    log = PoseLog(time, poses(record, "measured"), ok, rows, covariance)
+    commands = np.asarray(record["command"].values, dtype=float)
+    if is_timed(record):
+        acting = np.asarray(record["acting"].values, dtype=float)
+        of_commands = Rows(source, range(len(acting)), "command")
+        return Telemetry(log, CommandLog(acting, commands, of_commands, acting))
+    reference = recorded_reference(record)
     written = record[COMMAND_TIME].values if COMMAND_TIME in record else None
     return Telemetry(
-        PoseLog(time, poses(record, "measured"), ok, rows, record["measured_covariance"].values),
-        CommandLog(time, np.asarray(record["command"].values, dtype=float), rows, written),
+        log,
+        CommandLog(time, commands, rows, written),
         ReferenceLog(time, reference.poses, rows, reference.rates),
     )

@@ -202,6 +202,29 @@ def test_every_kind_of_log_holds_the_poses_and_commands_of_the_record_to_1e_9(
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
 
 
+def test_records_of_all_logs_and_of_netcdf_are_the_same_to_1e_9(record, tmp_path):
+    """Logs without a reference become records with times of their own."""
+    write(tmp_path / "mine.nc", record)
+    (kept,), _ = read_own_records([tmp_path / "mine.nc"])
+    ok = kept["measured_ok"].values == 1
+    for place, write_log in enumerate((as_motive, as_vicon, as_mcap)):
+        folder = tmp_path / str(place)
+        folder.mkdir()
+        (found,), _ = read_own_records([write_log(folder, record)])
+        seen = found["measured_ok"].values == 1
+        # Before its second command the model does not run, and a command that stays is no event.
+        begun = ok & (kept["time"].values >= found["time"].values[0] - TOLERANCE)
+        for ours, theirs in (
+            (poses(found, "measured")[seen], poses(kept, "measured")[begun]),
+            (found["time"].values[seen], kept["time"].values[begun]),
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
+        rows = np.searchsorted(kept["time"].values - TOLERANCE, found["acting"].values) - 1
+        np.testing.assert_allclose(
+            found["command"].values, kept["command"].values[rows], rtol=0, atol=TOLERANCE
+        )
+
+
 def test_netcdf_holds_the_same(record, tmp_path):
     write(tmp_path / "mine.nc", record)
     (found,), _ = read_own_records([tmp_path / "mine.nc"])

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from identify.commands.help import BEYOND_LIMIT, DONE, MISUSED, NOT_DONE
-from identify.record.recording import write
+from identify.record.recording import poses, write
 from identify.record.suspicions import suspicions
 from identify.record.telemetry import Telemetry
+from identify.record.timed_record import build_timed_record
 from identify.verification.logged_run import LoggedRun, recorded_telemetry
 from identify.verification.telemetry_check import check_telemetry
 from tests.identify.commands import command, one_line
@@ -57,13 +58,13 @@ def test_a_sound_record_passes_and_its_page_and_json_hold_the_findings(
 
 def test_what_is_wrong_with_the_poses_is_found_with_its_size(record):
     sound = recorded_telemetry(record, "mine.nc")
-    poses = sound.poses.pose.copy()
+    moved = sound.poses.pose.copy()
     ok = sound.poses.ok.copy()
     ok[100:140] = False  # while commands go on
-    poses[300, 0] += 1e-3
-    poses[400:420] = poses[400]  # a tracker that repeats its last pose
+    moved[300, 0] += 1e-3
+    moved[400:420] = moved[400]  # a tracker that repeats its last pose
     spoilt = replace(
-        sound, poses=replace(sound.poses, pose=np.where(ok[:, None], poses, np.nan), ok=ok)
+        sound, poses=replace(sound.poses, pose=np.where(ok[:, None], moved, np.nan), ok=ok)
     )
     found = findings(spoilt, stated=3 * SIGMA)
     failed = {name for name, one in found.items() if not one.ok}
@@ -95,6 +96,24 @@ def test_what_is_wrong_with_the_commands_is_found_with_its_size(record):
     assert found["clock offset"].value == pytest.approx(0.012, abs=1e-6)
     assert "commands of joint 4 lie 6.2" in found["units and frames"].text
     assert "off by a turn" in found["units and frames"].text
+
+
+def test_a_record_with_times_of_its_own_is_checked_as_one_on_the_grid(record):
+    """Its commands act 4 ms after their poses, as its timing states."""
+    ok = record["measured_ok"].values == 1
+    timed = build_timed_record(
+        time=record["time"].values[ok],
+        measured_pose=poses(record, "measured")[ok],
+        measured_covariance=np.diag(SIGMA**2),
+        acting=record["command_time"].values,
+        command=record["command"].values,
+        scenario_toml=SCENARIO.to_toml(),
+        robot="rss6",
+        frame_rate_hz=60.0,
+    )
+    found = findings(recorded_telemetry(timed, "timed.nc"))
+    assert all(one.ok for one in found.values())
+    assert found["clock offset"].value == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_motion_that_is_too_small_cannot_show_the_parameters():
