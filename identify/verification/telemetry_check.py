@@ -49,7 +49,10 @@ BEFORE_S = 0.1
 """Largest time, s, by which a motion can seem to be before its commands."""
 
 CLOCK = 0.05
-"""Largest offset of the clocks, in frames."""
+"""Largest offset of the clocks, in frames, beside what is stated of them."""
+
+STDS = 3.0
+"""Largest offset or drift in stated standard deviations."""
 
 SHOWN_GROUPS = 0.5
 """Smallest share of the groups of parameters that the motion can show."""
@@ -294,7 +297,11 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
     # The row of a command without its own time is that of its pose.
     expected = 0.0 if logged.telemetry.commands.written is None else timing.latency_s
     offset = delay.seconds - expected
-    allowed = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
+    step = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
+    allowed = step + STDS * (timing.clock_offset_std_s + timing.latency_std_s)
+    beyond = (
+        "" if abs(offset) <= allowed else "; timing.clock_offset_std_s has the offset estimated"
+    )
     yield Finding(
         "clock offset",
         abs(offset) <= allowed,
@@ -305,15 +312,15 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         f"the noise of a pose is in the command {1e3 * delay.seconds:.3f} ms later (correlation "
         f"{delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
         f"{1e3 * expected:.3f} ms: the clock of the commands is ahead by {1e3 * offset:.3f} ms, or "
-        "the latency is another",
+        f"the latency is another{beyond}",
     )
     duration = float(np.ptp(logged.time))
     grown = delay.drift * duration
     yield Finding(
         "clock drift",
-        abs(grown) <= allowed,
+        abs(grown) <= step + STDS * timing.clock_drift_std * duration,
         delay.drift,
-        allowed / duration,
+        step / duration + STDS * timing.clock_drift_std,
         "1",
         None,
         f"this delay grows by {1e6 * delay.drift:.1f} us in a second, {1e3 * grown:.3f} ms over "
