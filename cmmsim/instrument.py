@@ -123,7 +123,11 @@ class Instrument:
     @cached_property
     def settings(self) -> DetectionSettings:
         """Settings of the search for stickers in windows."""
-        return self._view.settings(self.noise, self.camera.centre_error_px(Quality()))
+        settings = self._view.settings(self.noise, self.camera.centre_error_px(Quality()))
+        taught = self._taught
+        if taught is None or taught.radius is None:
+            return settings
+        return replace(settings, radius=taught.radius)
 
     @property
     def timing(self) -> Timing:

@@ -55,6 +55,8 @@ class Taught:
         exact rig. Otherwise the derivative follows from the geometry of the simulated teaching.
     platform_ids : tuple of str
         Names of the platform's stickers, if they are not all stickers of the sensor file.
+    radius : float or None
+        Radius of the stickers in the images, m, if teaching has measured it.
 
     Raises
     ------
@@ -78,6 +80,7 @@ class Taught:
     known: KnownRig | None = None
     by_rig: Array | None = None
     platform_ids: tuple[str, ...] = ()
+    radius: float | None = None
 
     def __post_init__(self) -> None:
         stickers = len(self.platform_places)

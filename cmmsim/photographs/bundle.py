@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.disc_image import centre_offset
+from cmmsim.geometry.disc_image import centre_offset, sticker_outlines
 from cmmsim.geometry.pose import Array, rotation_exp, skew
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 
@@ -38,6 +38,7 @@ class Observations:
     sticker      (m,), number of the sticker: first those of the base, then those of the platform
     pixels       (2, m, 2), centres of ellipses
     covariances  (2, m, 2, 2), px²
+    shapes       (2, m, 2, 2), symmetric matrices of the ellipses, px
     base         number of stickers of the base
     normals      (n, 3), of all stickers, in the axes of their places
     radius       of a sticker, m
@@ -47,6 +48,7 @@ class Observations:
     sticker: NDArray[np.int_]
     pixels: Array
     covariances: Array
+    shapes: Array
     base: int
     normals: Array
     radius: float
@@ -64,6 +66,7 @@ class Observations:
             sticker=self.sticker[keep],
             pixels=self.pixels[:, keep],
             covariances=self.covariances[:, keep],
+            shapes=self.shapes[:, keep],
         )
 
 
@@ -103,6 +106,14 @@ class BundleState:
             there = points @ move[:3, :3].T + move[:3, 3]
             computed[side] += centre_offset(camera, there, normals @ move[:3, :3].T, seen.radius)
         return np.asarray(seen.pixels - computed)
+
+    def radius(self, seen: Observations) -> float:
+        """Return the radius of a sticker in the images, m: the median over all ellipses."""
+        own = np.where(seen.moves[:, None, None], self.poses[seen.pair], np.eye(4))
+        places, normals = self.places[seen.sticker], seen.normals[seen.sticker]
+        shapes = sticker_outlines(self.rig, own, places, normals, seen.radius)[1]
+        areas = np.linalg.det(seen.shapes) / np.linalg.det(shapes)
+        return seen.radius * float(np.sqrt(np.median(areas)))
 
     def moved(self, known: StereoRig, places: Array, poses: Array, rig: Array) -> BundleState:
         """Return the state after changes of places (n, 3), poses (K, 6) and rig (24,)."""

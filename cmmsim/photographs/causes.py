@@ -1,22 +1,29 @@
-"""Causes for which photographs teach nothing: folders exchanged, shifted, or of one camera."""
+"""Causes for which photographs teach nothing or little.
+
+Folders are exchanged, shifted, or of one camera, or the images are blurred or noisier than stated.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
-from cmmsim.measuring.observation import Observer
-from cmmsim.photographs.matching import Spots, candidates, match
+from cmmsim.measuring.observation import Observer, StickerExposure
+from cmmsim.photographs.matching import Spots, candidates, match, spots_in
+from cmmsim.photographs.pairs import Photograph
 
 # Both images of a pair are of one camera if this share of the spots is at the same place, px.
 SAME_SHARE = 0.7
 SAME_PX = 1.5
 # Numbers of pairs by which the images of one folder may be late.
 SHIFTS = (1, -1, 2, -2)
+# Point spreads that are tried for images that do not fit, px.
+SPREADS = (0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
 
 
 def cause_of(
@@ -69,3 +76,37 @@ def _same(pair: Spots) -> bool:
         return False
     gaps = cKDTree(right).query(left)[0]
     return bool(np.mean(gaps < SAME_PX) > SAME_SHARE)
+
+
+def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str:
+    """Return what is wrong with the stated noise or point spread, or an empty text.
+
+    Measuring refuses stickers whose grey values differ too much from a blurred disc. The text names
+    the point spread that fits best.
+    """
+    usual = _misfit(spots)
+    limit = observer.settings.limits.largest_misfit
+    if usual <= limit or isinstance(photograph.images, StickerExposure):
+        return ""
+    tried = {}
+    for psf_px in SPREADS:
+        optics = replace(observer.settings.optics, psf_px=psf_px)
+        blurred = replace(observer, settings=replace(observer.settings, optics=optics))
+        tried[psf_px] = _misfit(spots_in(photograph.images, blurred))
+    best = min(tried, key=lambda psf_px: tried[psf_px])
+    said = (
+        f"{photograph.name}: squared residuals of grey values are {usual:.2g} times the noise that "
+        f"the sensor file states, and cmmsim measure refuses stickers above {limit:g}: "
+    )
+    if tried[best] < limit:
+        return f"{said}with lens.psf_px = {best:g} they are {tried[best]:.2g} times"
+    return (
+        f"{said}enlarge camera.dark_noise (with lens.psf_px = {best:g} they are still "
+        f"{tried[best]:.2g} times)"
+    )
+
+
+def _misfit(spots: Spots) -> float:
+    """Return the median of the reduced chi-squares of all spots."""
+    found = np.concatenate([one.misfits[one.good] for one in spots])
+    return float(np.median(found)) if len(found) else 0.0

@@ -55,14 +55,14 @@ class Candidates:
 
     pixels       (2, m, 2), centres of the ellipses in both images
     covariances  (2, m, 2, 2), of the centres, px²
-    misfits      (2, m), reduced chi-square of the grey values
+    shapes       (2, m, 2, 2), symmetric matrices of the ellipses, px
     points       (m, 3), in the camera frame, m
     alone        (m,), True if both spots belong to no other candidate
     """
 
     pixels: Array
     covariances: Array
-    misfits: Array
+    shapes: Array
     points: Array
     alone: NDArray[np.bool_]
 
@@ -92,7 +92,7 @@ def candidates(spots: Spots, observer: Observer) -> Candidates:
     return Candidates(
         np.stack([fits.centres[own] for fits, own in chosen]),
         np.stack([fits.covariances[own] for fits, own in chosen]),
-        np.stack([fits.misfits[own] for fits, own in chosen]),
+        np.stack([fits.shapes[own] for fits, own in chosen]),
         points,
         np.all([np.bincount(side, minlength=1)[side] == 1 for side in pairs.T], axis=0),
     )

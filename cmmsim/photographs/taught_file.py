@@ -29,6 +29,7 @@ def taught_as_dict(taught: Taught) -> dict[str, Any]:
         "platform_places": taught.platform_places.tolist(),
         "place_covariances": taught.place_covariances.tolist(),
         "base_places": taught.base_places.tolist(),
+        "sticker_radius": taught.radius,
         "rig": None if known is None else _rig_as_dict(known),
         "by_rig": None if taught.by_rig is None else taught.by_rig.tolist(),
     }
@@ -105,6 +106,7 @@ def _taught(content: dict[str, Any]) -> Taught:
         None if rig is None else _known(rig),
         None if by_rig is None else np.array(by_rig, dtype=float),
         tuple(str(name) for name in content["platform_stickers"]),
+        None if content["sticker_radius"] is None else float(content["sticker_radius"]),
     )
 
 

@@ -21,7 +21,7 @@ from cmmsim.geometry.registration import register
 from cmmsim.measuring.observation import Observer
 from cmmsim.measuring.taught import Taught
 from cmmsim.photographs.bundle import RIG, Bundle, BundleState, Observations
-from cmmsim.photographs.causes import cause_of
+from cmmsim.photographs.causes import cause_of, light_doubt
 from cmmsim.photographs.matching import (
     NONE,
     Candidates,
@@ -42,6 +42,8 @@ FEWEST_PAIRS = 3
 MOST_PAIRS = 500
 # A warning is given if the squared residuals exceed the stated noise by this factor.
 LARGEST_FACTOR = 1.5
+# A warning is given if the radius of stickers differs by more than this share.
+LARGEST_GROWTH = 0.02
 # A warning is given if the platform moves by less in all images.
 SHORTEST_WAY_PX = 3.0
 UNFOUND = "hidden, or its images do not belong together"
@@ -135,8 +137,10 @@ def teach_from(
     """
     names = []
     spots = []
+    doubt = ""
     for one in photographs:
         spots.append(spots_in(one.images, observer))
+        doubt = doubt or light_doubt(one, spots[-1], observer)
         names.append(one.name)
         advance()
     if len(spots) < FEWEST_PAIRS:
@@ -151,10 +155,12 @@ def teach_from(
     except LostError as error:
         cause = cause_of(spots, names, observer, base, platform)
         raise TeachingError(f"teaching failed: {cause or error}") from error
-    if not left_out:
-        return found
-    said = f"{left_out} pairs are not used: {MOST_PAIRS} pairs, spread over all, are enough"
-    return replace(found, warnings=(said, *found.warnings))
+    said = [doubt] if doubt else []
+    if left_out:
+        said.append(
+            f"{left_out} pairs are not used: {MOST_PAIRS} pairs, spread over all, are enough"
+        )
+    return replace(found, warnings=(*said, *found.warnings))
 
 
 def _taught(
@@ -185,6 +191,9 @@ def _taught(
             raise LostError(f"{error}: {said}") from error
         seen, start = observations(pairs, bodies, marked, observer)
         judged = adjust_robustly(seen, start, observer.rig, prior, names)
+        # The radius is known better from the images, and moves the centres of ellipses a little.
+        seen = replace(seen, radius=judged.bundle.state.radius(judged.seen))
+        judged = adjust_robustly(seen, judged.bundle.state, observer.rig, prior, names)
         if not judged.stickers:
             break
         # A sticker that is left out leaves the unknowns, too.
@@ -201,14 +210,14 @@ def _taught(
     missing = {names[k]: "the platform was not found: " + UNFOUND for k in unseen}
     missing |= {names[k]: reason for k, reason in judged.pairs.items()}
     return PhotographedTeaching(
-        frames.taught(name, rig),
+        replace(frames.taught(name, rig), radius=judged.seen.radius),
         frames,
         judged.seen,
         judged.bundle,
         tuple(names),
         missing,
         lost,
-        tuple(doubts(judged, missing, lost, pairs, observer)),
+        tuple(doubts(judged, missing, lost, observer)),
     )
 
 
@@ -216,7 +225,6 @@ def doubts(
     judged: Judged,
     missing: dict[str, str],
     lost: dict[str, str],
-    pairs: list[Candidates],
     observer: Observer,
 ) -> list[str]:
     """Return lines about what a user should look at."""
@@ -226,18 +234,16 @@ def doubts(
             f"squared residuals are {judged.bundle.factor:.1f} times the stated noise, and the "
             "covariances are enlarged as much: are the cameras calibrated, and the images sharp?"
         )
+    radius = observer.settings.radius
+    if abs(judged.seen.radius / radius - 1.0) > LARGEST_GROWTH:
+        lines.append(
+            f"stickers have a radius of {judged.seen.radius:.4g} m in the images, which is used, "
+            f"but the sensor file states {radius:g} m"
+        )
     if (longest := longest_way(judged.seen)) < SHORTEST_WAY_PX:
         lines.append(
             f"the platform moves by at most {longest:.1f} px in the images: with larger movements, "
             "errors of single pixels average out"
-        )
-    usual = float(np.median(np.concatenate([one.misfits.ravel() for one in pairs])))
-    limit = observer.settings.limits.largest_misfit
-    if usual > limit:
-        lines.append(
-            f"grey values of stickers scatter {usual:.1f} times as much as [camera] of the sensor "
-            f"file states, and cmmsim measure refuses stickers above {limit:g}: enlarge "
-            "camera.dark_noise, or state the point spread lens.psf_px"
         )
     return lines
 
@@ -273,11 +279,13 @@ def observations(
     spread: Array = np.stack(
         [pairs[k].covariances[:, j] for k, j in zip(pair, spot, strict=True)], axis=1
     )
+    shapes = np.stack([pairs[k].shapes[:, j] for k, j in zip(pair, spot, strict=True)], axis=1)
     seen = Observations(
         pair,
         sticker,
         pixels,
         spread + observer.settings.centre_error_px**2 * np.eye(2),
+        shapes,
         len(bodies[0].sticker),
         np.concatenate(normals),
         observer.settings.radius,

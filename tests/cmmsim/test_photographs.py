@@ -2,6 +2,8 @@
 measured with them.
 """
 
+import re
+
 import numpy as np
 import pytest
 
@@ -277,6 +279,7 @@ def test_other_kinds_of_images_are_taught_and_measured_with_a_true_covariance(ch
     frames = [photographed(sensor, pose) for pose in spread_poses(6, 5)]
     found = sensor.teach_from(numbered(frames, 60.0))
     assert (found.rejected_pairs, found.rejected_stickers, found.warnings) == ({}, {}, ())
+    assert found.taught.radius == pytest.approx(0.003, rel=2e-3)
     assert found.bundle.factor == pytest.approx(1.0, abs=0.15)
     sensor.teach(frames=frames)
     near = spread_poses(40, 6, 0.009, 0.035)
@@ -312,3 +315,34 @@ def test_rough_places_may_be_off_by_millimetres():
     )
     square, freedom = normalised(errors, found.frames.covariance[:60, :60])
     assert square / freedom == pytest.approx(1.0, abs=0.6)
+
+
+def test_the_radius_of_stickers_is_taken_from_the_images():
+    """With that of the file, whose stickers are 6 % smaller, no sticker would be measured."""
+    larger = {"stickers.radius": 0.0032}
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=8, changes=larger)
+    frames = [photographed(sensor, pose) for pose in spread_poses(5, 8)]
+    usual = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=8)
+    found = usual.teach_from(numbered(frames, 60.0))
+    assert found.taught.radius == pytest.approx(0.0032, rel=2e-3)
+    assert "a radius of 0.0032 m in the images" in found.warnings[0]
+    taught = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=found.taught)
+    measured = [cmmsim.measure_frame(frame, taught.estimator) for frame in frames]
+    assert [len(one.target_ids) for one in measured] == [18] * 5
+    stated = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=usual.truth)
+    assert not cmmsim.measure_frame(frames[0], stated.estimator).ok
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"lens.psf_px": 0.6}, "with lens.psf_px = 0.6 they are (1|1.1|0.9\\d?) times"),
+        ({"camera.dark_noise": 60.0}, "enlarge camera.dark_noise"),
+    ],
+)
+def test_images_that_are_blurred_or_noisier_than_stated_are_said_to_be(changes, said):
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=8, changes=changes)
+    frames = [photographed(sensor, pose) for pose in spread_poses(4, 8)]
+    usual = cmmsim.load_sensor("ctrack780", renderer="analytic")
+    warnings = usual.teach_from(numbered(frames, 60.0)).warnings
+    assert re.search(f"^0: squared residuals of grey values are .*{said}", warnings[0]), warnings
