@@ -202,6 +202,7 @@ def test_every_kind_of_log_holds_the_poses_and_commands_of_the_record_to_1e_9(
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_records_of_all_logs_and_of_netcdf_are_the_same_to_1e_9(record, tmp_path):
     """Logs without a reference become records with times of their own."""
     write(tmp_path / "mine.nc", record)
