@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
+from dynamics.legs.crank_and_link import centred, full_force, full_mass
 from dynamics.legs.leg import (
     EXACT,
     ROUNDED,
@@ -36,7 +37,6 @@ from dynamics.legs.leg import (
     link_axes,
     universal_spin,
 )
-from dynamics.spatial_inertia import INERTIAL
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -245,12 +245,14 @@ class RssLeg(Leg):
         bodies: Sequence[ca.SX],
         gravity: ca.DM,
     ) -> ca.SX:
-        if not self._in_closed_form(bodies):
+        if self._link_spins:
             return super().force(position, velocity, acceleration, bodies, gravity)
         leg = self.vectors(position)
         crank, link = bodies
         motion = leg_motion(leg, velocity, acceleration)
         gradient = angle_gradient(leg)
+        if not centred(bodies):
+            return full_force(leg, motion, gradient, bodies, gravity)
         tangent = ca.cross(leg.axis, leg.crank)
         # The crank rotates only about its own z. Izz of a link without spin about l does no work.
         lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
@@ -267,11 +269,13 @@ class RssLeg(Leg):
         return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
     def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        if not self._in_closed_form(bodies):
+        if self._link_spins:
             return super().mass(position, bodies)
         leg = self.vectors(position)
         crank, link = bodies
         gradient = angle_gradient(leg)
+        if not centred(bodies):
+            return full_mass(leg, gradient, bodies)
         tangent = ca.cross(leg.axis, leg.crank)
         reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
         half = gradient @ (link[0] / 4 * tangent).T
@@ -284,11 +288,10 @@ class RssLeg(Leg):
             total += (inertia * weight * (1 / leg.link_length**2)) * (row @ row.T)
         return symmetric_from_lower(total)
 
-    def _in_closed_form(self, bodies: Sequence[ca.SX]) -> bool:
-        """Return True if all bodies are centred and the link does not spin."""
-        return "Izz" not in self.bodies[1].moments and all(
-            own.numel() == len(INERTIAL) for own in bodies
-        )
+    @property
+    def _link_spins(self) -> bool:
+        """True if the link turns about its own length."""
+        return "Izz" in self.bodies[1].moments
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Components of the vector from B to A along and across the zero direction, and the chord.

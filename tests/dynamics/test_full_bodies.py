@@ -284,3 +284,13 @@ def test_full_bodies_of_a_robot_file(load_changed):
         ParameterError, match=r"platform\.mcz = nan kg m is not allowed, must be finite$"
     ):
         robot.layout.check(np.where(np.arange(70) == 3, np.nan, robot.nominal_parameters))
+
+
+@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.slow)])
+def test_full_bodies_cost_few_more_operations_than_centred_ones(name):
+    """At most 1.6 times as many, in the equation of motion and in its derivatives."""
+    robot = dynamics.load_robot(name)
+    full = robot.with_full_bodies(["all"])
+    for function in (equation_of_motion, motion_derivatives):
+        ours, theirs = (function(one.geometry).whole.n_instructions() for one in (full, robot))
+        assert ours <= 1.6 * theirs, function.__name__

@@ -1,0 +1,102 @@
+"""Force and mass of a crank and a link that does not spin, if they are full bodies (CasADi).
+
+Of the crank only the rotation about its axis z does work. With its length r, its angle theta, and
+the axes x along it and y = z x x, its first moments m_x and m_y add to the torque about its axis
+
+    m_x (r theta_ddot - y . g) + m_y x . g
+
+The rates of rotation of the link have no component along its length. In its own axes they are (p,
+q, 0), and only the components x and y of its moment do work.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import casadi as ca
+
+from dynamics.expressions import symmetric_from_lower
+from dynamics.legs.leg import link_axes
+from dynamics.spatial_inertia import INERTIAL
+
+if TYPE_CHECKING:
+    from dynamics.legs.rss import LegMotion, LegVectors
+
+
+def centred(bodies: Sequence[ca.SX]) -> bool:
+    """Return True if all bodies are centred, with four parameters."""
+    return all(own.numel() == len(INERTIAL) for own in bodies)
+
+
+def full_force(
+    leg: "LegVectors",
+    motion: "LegMotion",
+    gradient: ca.SX,
+    bodies: Sequence[ca.SX],
+    gravity: ca.DM,
+) -> ca.SX:
+    """Force at A (3,), N, for the motion of crank and link.
+
+    `gradient` (3,) is that of the crank angle. `bodies` has the parameters of both, 4 or 10.
+    """
+    mass, mx, my, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
+    tangent = ca.cross(leg.axis, leg.crank)
+    along = ca.dot(leg.crank, gravity) * (1 / leg.crank_length)
+    across = ca.dot(tangent, gravity) * (1 / leg.crank_length)
+    lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
+    torque = mass * lever + izz * motion.crank_acceleration
+    torque += mx * (leg.crank_length * motion.crank_acceleration - across) + my * along
+    push, moment_x, moment_y, axes = _link_load(leg, motion, _ten(bodies[1]), gravity)
+    pull = axes @ push / 2
+    turn = (moment_y * axes[:, 0] - moment_x * axes[:, 1]) * (1 / leg.link_length)
+    return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
+
+
+def _link_load(
+    leg: "LegVectors", motion: "LegMotion", ten: ca.SX, gravity: ca.DM
+) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Force (3,) on the link and moments about x and y of its middle, in its axes (3, 3)."""
+    mass, sx, sy, sz, xx, yy, _, xy, xz, yz = ca.vertsplit(ten)
+    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
+    p, q = (ca.dot(axes[:, k], motion.angular_velocity) for k in range(2))
+    u, v = (ca.dot(axes[:, k], motion.angular_acceleration) for k in range(2))
+    falling = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
+    x, y, z = ca.vertsplit(axes.T @ falling)
+    turned = p * sx + q * sy
+    square = p * p + q * q
+    push = ca.vertcat(
+        mass * x + v * sz + p * turned - sx * square,
+        mass * y - u * sz + q * turned - sy * square,
+        mass * z + u * sy - v * sx - sz * square,
+    )
+    spun = xz * p + yz * q
+    moment_x = sy * z - sz * y + xx * u + xy * v + q * spun
+    moment_y = sz * x - sx * z + xy * u + yy * v - p * spun
+    return push, moment_x, moment_y, axes
+
+
+def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+    """Mass matrix (3, 3) of crank and link at A. For the arguments see `full_force`."""
+    mass, mx, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
+    own, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(_ten(bodies[1]))
+    tangent = ca.cross(leg.axis, leg.crank)
+    radius = leg.crank_length
+    reflected = izz + mx * radius + (mass + own) * (radius**2 / 4)
+    half = gradient @ (own / 4 * tangent).T
+    total = reflected * (gradient @ gradient.T) + own / 4 * ca.SX.eye(3) + half + half.T
+    # rows of the rates of rotation p and q, and of the velocity of the middle, in the link's axes
+    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
+    by_crank = [ca.dot(tangent, axes[:, k]) for k in range(3)]
+    moving = [(axes[:, k] + by_crank[k] * gradient) / 2 for k in range(3)]
+    x, y = ((axes[:, k] - by_crank[k] * gradient) * (1 / leg.link_length) for k in range(2))
+    p, q = -y, x
+    total += xx * (p @ p.T) + yy * (q @ q.T)
+    mixed = xy * (p @ q.T) + moving[2] @ (sy * p - sx * q).T
+    mixed += sz * (moving[0] @ q.T - moving[1] @ p.T)
+    return symmetric_from_lower(total + mixed + mixed.T)
+
+
+def _ten(body: ca.SX) -> ca.SX:
+    """Parameters (10,) of a full body for those of a full or centred body."""
+    if not centred([body]):
+        return body
+    return ca.vertcat(body[0], ca.SX(3, 1), body[1:], ca.SX(3, 1))
