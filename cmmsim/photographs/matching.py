@@ -33,7 +33,9 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.measuring.pose_estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, TAUGHT_TOLERANCE
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# Share of all pairs in which a standing sticker has the same pixels.
+# A sticker of the base has the same pixels in this share of all pairs, because it can be hidden.
+SHOWN_SHARE = 0.25
+# What has the same pixels in this share of all pairs does not belong to the platform.
 STANDING_SHARE = 0.6
 # Largest distance between the pixels of a standing sticker in two pairs, over both images.
 STANDING_PX = 0.7
@@ -82,9 +84,14 @@ def candidates(spots: Spots, observer: Observer) -> Candidates:
     """Return the possible stickers of a pair of images; some of them are false."""
     good = []
     ideal = []
+    limits = observer.settings.limits
     for camera, fits in zip(observer.rig.cameras, spots, strict=True):
         pixels, found = camera.undistort(fits.centres)
-        good.append(np.flatnonzero(found & fits.good))
+        # In images that are noisier than stated, a sticker must not fit worse than most others.
+        usual = max(1.0, float(np.median(fits.misfits[fits.good]))) if fits.good.any() else 1.0
+        allowed = replace(limits, largest_misfit=usual * limits.largest_misfit)
+        found &= fits.within(allowed, observer.upright).good
+        good.append(np.flatnonzero(found))
         ideal.append(pixels[good[-1]])
     off_line = LINE_TOLERANCE_PX + LINE_STDS * observer.settings.line_error_px
     pairs, points = candidate_pairs(observer.rig.ideal, ideal[0], ideal[1], off_line)
@@ -316,19 +323,20 @@ def match(
     """Return the stickers of base and platform in K pairs with these names. Raises LostError."""
     # Points that stand for a while tell when a sticker has moved.
     briefly = standing(pairs)
-    often = np.sum(briefly != NONE, axis=1) >= STANDING_SHARE * len(pairs)
+    share = np.mean(briefly != NONE, axis=1)
     places = places_of(pairs, briefly)
-    still, stood = briefly[often], places[often]
+    still = briefly[share >= STANDING_SHARE]
+    shown, stood = briefly[share >= SHOWN_SHARE], places[share >= SHOWN_SHARE]
     place, stickers, own = named(base, stood)
     lost = _missing(base, place, stickers, places, briefly, names)
     stays = np.tile(np.eye(4), (len(pairs), 1, 1)), np.ones(len(pairs), dtype=bool)
-    found = [FoundBody(stickers, still[own], stood[own], *stays, {}).with_missing(lost)]
+    found = [FoundBody(stickers, shown[own], stood[own], *stays, {}).with_missing(lost)]
     try:
         # Stickers that stand and belong to no body are left out as well.
-        moved = moving(pairs, _free(pairs, still), platform.name)
+        moved = moving(pairs, _free(pairs, np.concatenate([still, shown[own]])), platform.name)
     except LostError:
         # A platform that seldom moves stands in most pairs, too.
-        moved = moving(pairs, _free(pairs, still[own]), platform.name)
+        moved = moving(pairs, _free(pairs, shown[own]), platform.name)
     place, stickers, own = named(platform, moved.places)
     lost = _missing(platform, place, stickers, moved.places, moved.members, names)
     body = FoundBody(stickers, moved.members[own], moved.places[own], moved.moves, moved.seen, {})

@@ -1,8 +1,8 @@
 """Adjustment that leaves out what contradicts the rest: single centres, pairs, and stickers.
 
-The worst centre of each body in each pair is left out if its squared residual is larger than chance
-allows, and the adjustment is repeated. If most centres of a pair or a quarter of those of a sticker
-are left out, the whole pair or sticker is left out, and the result says so.
+The worst centres are left out if their squared residuals are larger than chance allows, and the
+adjustment is repeated. If most centres of a pair or of a sticker are left out, or if those of a
+sticker show that it moved, the whole pair or sticker is left out, and the result says so.
 
 All residuals can be larger than the noise that the fits of ellipses state. The noise is then
 enlarged to the size of the residuals.
@@ -26,14 +26,15 @@ from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
 CHANCE = 1e-5
 LARGEST_SQUARE = float(chdtri(4, CHANCE))
 MEDIAN_SQUARE = float(chdtri(4, 0.5))
+# Share of a sticker's largest squared residual above which a centre is nearly its worst.
+NEARLY = 0.5
 # Probability that residuals count as larger than noise although they are not.
 EXCESS_CHANCE = 1e-4
 ROUNDS = 40
 # Fewest stickers of the platform that determine its pose in a pair.
 FEWEST = 4
-# Largest shares of left-out centres of a pair and of a sticker that remain in use.
-PAIR_SHARE = 0.5
-STICKER_SHARE = 0.25
+# Largest share of left-out centres of a pair or of a sticker that remains in use.
+LARGEST_SHARE = 0.5
 # A jump of a sticker's place is reported if it is this many times the scatter of the places.
 CLEAR_JUMP = 4.0
 
@@ -95,12 +96,18 @@ def adjust_robustly(
 
 
 def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
-    """Return the worst observation of each body in each pair, if it is larger than by chance."""
-    group = 2 * seen.pair + seen.moves
-    order = np.lexsort((squares, group))
-    last = np.flatnonzero(np.diff(group[order], append=-1) != 0)
-    worst = order[last]
-    return np.asarray(worst[squares[worst] > LARGEST_SQUARE])
+    """Return the observations that are left out next.
+
+    A wrong centre pulls the place of its sticker and the pose of its pair, so that right centres
+    seem wrong as well. Only centres are left out that are nearly the worst of their sticker and, on
+    the platform, the worst of their pair.
+    """
+    of_sticker = np.zeros(seen.sticker.max() + 1)
+    np.maximum.at(of_sticker, seen.sticker, squares)
+    of_pair = np.zeros(seen.pair.max() + 1)
+    np.maximum.at(of_pair, seen.pair[seen.moves], squares[seen.moves])
+    worst = (squares > LARGEST_SQUARE) & (squares > NEARLY * of_sticker[seen.sticker])
+    return np.flatnonzero(worst & (~seen.moves | (squares == of_pair[seen.pair])))
 
 
 def _left_out(
@@ -114,15 +121,18 @@ def _left_out(
     stickers: dict[int, str] = {}
     for sticker in np.unique(seen.sticker).tolist():
         own = seen.sticker == sticker
-        share = 1.0 - kept[own].mean()
-        if share > STICKER_SHARE and np.sum(~kept[own]) > 1:
-            stickers[sticker] = _why(seen, state, own, names)
+        if np.sum(~kept[own]) < 2:
+            continue
+        if moved := _movement(seen.selected(own), state, names):
+            stickers[sticker] = moved
+        elif kept[own].mean() < LARGEST_SHARE:
+            stickers[sticker] = "does not fit to the other stickers: hidden, damaged, or not round?"
     kept[np.isin(seen.sticker, list(stickers))] = False
     judged = seen.moves & ~np.isin(seen.sticker, list(stickers))
     for pair in np.unique(seen.pair[judged]).tolist():
         own = judged & (seen.pair == pair)
         count = int(kept[own].sum())
-        if count < max(FEWEST, PAIR_SHARE * own.sum()):
+        if count < max(FEWEST, LARGEST_SHARE * own.sum()):
             kept[own] = False
             pairs[pair] = (
                 f"{count} of {own.sum()} stickers of the platform agree with the other pairs: do "
@@ -131,11 +141,8 @@ def _left_out(
     return pairs, stickers
 
 
-def _why(
-    seen: Observations, state: BundleState, own: NDArray[np.bool_], names: Sequence[str]
-) -> str:
-    """Return why a sticker is left out: where its place jumps, or that it does not fit."""
-    mine = seen.selected(own)
+def _movement(mine: Observations, state: BundleState, names: Sequence[str]) -> str:
+    """Return when one sticker has moved by how much, or an empty text."""
     found = triangulate(state.rig, *mine.pixels, *mine.covariances).points
     poses = state.poses[mine.pair]
     places = np.array(
@@ -155,4 +162,4 @@ def _why(
         if jump > CLEAR_JUMP * np.sqrt(scatter[k] / len(places)):
             before, after = (names[mine.pair[order][j]] for j in (k, k + 1))
             return f"moved by {1e3 * jump:.2f} mm between {before} and {after}"
-    return "does not fit to the other stickers: hidden, damaged, or not round?"
+    return ""

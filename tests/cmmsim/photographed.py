@@ -31,10 +31,10 @@ def corners_of_stickers(sensor, pose):
     return np.rint(pixels - 0.5 * (SIZE - 1)).astype(int)
 
 
-def photographed(sensor, pose):
+def photographed(sensor, pose, obstacles=None):
     """A frame with the noise of the sensor about its stickers, and even ground elsewhere."""
     corners = corners_of_stickers(sensor, pose)
-    windows = sensor.look(pose).windows(corners, SIZE)
+    windows = sensor.look(pose, obstacles).windows(corners, SIZE)
     camera = sensor.true_cameras.rig.left
     ground = round(sensor.noise.black_level)
     sides = np.full((2, camera.height, camera.width), ground, dtype=windows.dtype)
