@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import PhotographError
 from cmmsim.geometry.pose import Array
-from cmmsim.measuring.measurement import Measurement
+from cmmsim.measuring.layout_search import bright_ellipses
+from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, measure_frame
 from cmmsim.photographs.pairs import Photograph
-from cmmsim.radiometry.stereo_images import StereoFrame
+from cmmsim.radiometry.stereo_images import StereoFrame, readable
 from cmmsim.tracker import Tracker
 
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
@@ -35,6 +36,8 @@ COLUMNS = (
     "why",
 )
 """Columns of the table: ``covariance`` is new noise in each pair, ``common`` the same in all."""
+# Share of the platform's stickers that both images of a lost pair show if they are worth a hint.
+SHOWN_SHARE = 0.5
 # Radius of a circle around a found sticker in a picture, px.
 CIRCLE_PX = 14
 
@@ -56,7 +59,6 @@ class MeasuredPair:
 
     Examples
     --------
-    >>> from cmmsim.measuring.measurement import lost_measurement
     >>> images = StereoFrame(*np.zeros((2, 30, 40), dtype=np.uint8))
     >>> MeasuredPair("dark.png", 0.0, lost_measurement("no stickers"), images).row[-2:]
     ['0', 'no stickers']
@@ -117,9 +119,23 @@ def measure_pairs(
     tracker = Tracker(estimator)
     for number, one in enumerate(photographs):
         found = tracker.measure(one.images)
-        if number == 0 and not found.ok:
-            _require_order(one, estimator)
+        if not found.ok:
+            if number == 0:
+                _require_order(one, estimator)
+            found = lost_measurement(found.reason + _hint(one, estimator))
         yield MeasuredPair(one.name, one.time, found, one.images)
+
+
+def _hint(lost: Photograph, estimator: PoseEstimator) -> str:
+    """Return a hint if the images of a lost pair show the stickers, but each for itself."""
+    sides = bright_ellipses(readable(lost.images), estimator)
+    counts = [int(fits.good.sum()) for fits in sides]
+    if min(counts) < SHOWN_SHARE * len(estimator.platform.sticker_ids):
+        return ""
+    return (
+        f" ({counts[0]} bright spots in the left image and {counts[1]} in the right: do the images "
+        "belong together, and have the cameras stood still since teaching?)"
+    )
 
 
 def _require_order(first: Photograph, estimator: PoseEstimator) -> None:

@@ -300,6 +300,16 @@ def test_rough_places_may_be_off_by_millimetres():
     assert square / freedom == pytest.approx(1.0, abs=0.6)
 
 
+def test_pairs_that_do_not_belong_together_are_lost_with_a_hint():
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=8)
+    frames = [photographed(sensor, pose) for pose in spread_poses(3, 8)]
+    mixed = [frames[0], cmmsim.StereoFrame(frames[1].left, frames[2].right), frames[2]]
+    images = [[getattr(frame, side) for frame in mixed] for side in ("left", "right")]
+    found = [one.measurement for one in cmmsim.measure(*images, "ctrack780", sensor.truth)]
+    assert [one.ok for one in found] == [True, False, True]
+    assert "36 bright spots in the left image and 36 in the right: do" in found[1].reason
+
+
 def test_the_radius_of_stickers_is_taken_from_the_images():
     """With that of the file, whose stickers are 6 % smaller, no sticker would be measured."""
     larger = {"stickers.radius": 0.0032}
