@@ -93,6 +93,8 @@ class Instrument:
         bodies = self.platform, self.base
         self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
+        # What teaching from photographs begins with, also when it is repeated.
+        self._stated = self.platform, self.rig, self._known
         self._taught: Taught | None = None
         if taught is not None:
             self._take(taught)
@@ -252,10 +254,11 @@ class Instrument:
         TeachingError
             If the stickers are not found, or do not determine the frames.
         """
-        bodies = self.platform, self.base
-        for body in bodies:
+        platform, rig, known = self._stated
+        for body in (platform, self.base):
             require_corner(body)
-        found = teach_from(photographs, self.observer, *bodies, self.name, self._known, advance)
+        observer = replace(self.observer, rig=rig)
+        found = teach_from(photographs, observer, platform, self.base, self.name, known, advance)
         return replace(found, taught=replace(found.taught, setup=setup_of(self._file)))
 
     def _take(self, taught: Taught) -> None:
@@ -265,8 +268,9 @@ class Instrument:
             self._known = taught.known
             self.rig = taught.known.rig
         if taught.platform_ids:
-            kept = np.isin(self.platform.sticker_ids, taught.platform_ids)
-            self.platform = self.platform.selected(np.flatnonzero(kept))
+            whole = self._stated[0]
+            kept = np.isin(whole.sticker_ids, taught.platform_ids)
+            self.platform = whole.selected(np.flatnonzero(kept))
         for name in ("_view", "settings", "_geometry"):
             self.__dict__.pop(name, None)
 

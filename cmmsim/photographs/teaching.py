@@ -116,9 +116,12 @@ class PhotographedTeaching:
         Parameters
         ----------
         path : str or Path
-            File that is written.
+            File that is written, completely or not at all.
         """
-        Path(path).write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
+        whole = Path(path)
+        part = whole.with_name(f"{whole.name}.part")
+        part.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
+        part.replace(whole)
 
 
 def teach_from(

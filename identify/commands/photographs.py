@@ -165,9 +165,6 @@ def _print_summary(found: "PhotographedTeaching", folder: Path) -> None:
         ("body",),
         f"{len(found.pairs)} pairs; residuals {found.rms_px:.3g} px; standard deviation of frames:",
     )
-    for names in (found.rejected_pairs, found.rejected_stickers):
-        for name, reason in names.items():
-            typer.echo(f"not used: {name}: {reason}")
     typer.echo(f"teaching: {folder}")
 
 

@@ -133,6 +133,16 @@ def test_a_sticker_that_moved_between_pairs_is_left_out_and_measured_without(
     assert (f"{plane}{sticker + 1}" in one.target_ids) == (body == "base")
 
 
+def test_a_sensor_can_be_taught_again_after_it_lacked_a_sticker(good):
+    sensor, other = load(), load(moved("platform", "A", 0, 6e-3))
+    poses = spread_poses(COUNT, 4)
+    pairs = [*good[:4], *spots(other, poses[4:], sensor.observer)]
+    assert len(sensor.teach(frames=map(Spots, pairs)).platform_places) == 17
+    assert len(sensor.platform.sticker_ids) == 17
+    assert len(sensor.teach(frames=map(Spots, good)).platform_places) == 18
+    assert len(sensor.platform.sticker_ids) == 18
+
+
 def test_of_very_many_pairs_some_are_used(sensor, good, monkeypatch):
     monkeypatch.setattr(teaching, "MOST_PAIRS", 5)
     found = teach(sensor, good)
