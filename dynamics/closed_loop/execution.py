@@ -168,7 +168,7 @@ def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) ->
             poses["measured"] += chart.forbidden(
                 chart.pose(np.zeros(problem.sizes.coordinates)) + noise
             )
-    for name in ("pose_sensitivity", "start_sensitivity"):
+    for name in ("pose_sensitivity", "start_sensitivity", "command_sensitivity"):
         if found[name] is not None:
             poses[name] = chart.lifted(found[name], axis=1)
     return poses
@@ -243,6 +243,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "reference": chart.coordinates(problem.reference.poses),
         "reference_rate": chart.coordinates(problem.reference.rates),
         "commands": commands,
+        "directions": problem.directions,
         "feedforward": np.zeros((0, 0)) if problem.feedforward is None else problem.feedforward,
         "lost": np.zeros(0, bool) if ideal.lost is None else np.ascontiguousarray(ideal.lost),
         "noise": np.zeros((0, 0)) if ideal.noise is None else chart.coordinates(ideal.noise),
@@ -310,8 +311,7 @@ def _fill(
         task.stiffness = settings.elasticity.stiffness
         task.damping = settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
-    # with elastic joints, these exclude the inertia of the motors
-    task.rigid = rigid
+    task.rigid = rigid  # with elastic joints, without the inertia of the motors
     # indices of the parameters of rigid bodies that have a column of derivatives
     columns = problem.columns
     shown = len(problem.columns) - 2 * sizes.joints - sizes.gains
@@ -356,7 +356,7 @@ def _fill(
     now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)
     now.parameters = len(columns)
     now.start_moves = problem.start_sensitivities
-    now.step_column = len(columns) + (sizes.start if problem.start_sensitivities else 0)
+    now.step_column = len(columns) + problem.further_columns
     # kernels work on whole vectors of columns; the last columns can be unused
     now.width = plain(whole_vectors)(int(now.step_column))
 

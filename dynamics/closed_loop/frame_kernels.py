@@ -78,6 +78,8 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
     if not task.sensitivities:
         return
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
+    by_commands = record.command_sensitivity[k]
+    copy_rows(d.x[:size, now.parameters :], by_commands, by_commands.shape[1])
     if k + 1 == len(record.pose):
         rows = 2 * size + count
         keep_rows(
@@ -177,6 +179,10 @@ def issue_command(
     if task.sensitivities:
         issued = d.issued[k % (len(d.issued) - 1)]
         copy_rows(d.last_command[:], issued, now.width)
+        if len(plan.directions) > 0:
+            for i in range(len(now.mode)):
+                for j in range(plan.directions.shape[2]):
+                    issued[i, now.parameters + j] += plan.directions[k, i, j]
         scale_received(task, issued, now.width)
     return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
 

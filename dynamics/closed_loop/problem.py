@@ -1,12 +1,13 @@
 """Closed-loop problem: the checked arguments of a run."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from dynamics.checks import check_type, flag, floats, mask, shown
+from dynamics.closed_loop.directions import checked_directions, most_directions
 from dynamics.closed_loop.loop_settings import (
     Controller,
     EveryFrame,
@@ -83,12 +84,18 @@ class LoopProblem:
     sensitivities: bool = False
     start_sensitivities: bool = False
     groups: RigidGroups | None = None
+    directions: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     @property
     def columns(self) -> np.ndarray:
         """Indices (k,) of the parameters with respect to which derivatives are computed."""
         rigid = np.arange(self.sizes.rigid) if self.groups is None else self.groups.pivots
         return np.concatenate([rigid, np.arange(self.sizes.rigid, self.sizes.parameters)])
+
+    @property
+    def further_columns(self) -> int:
+        """Number of columns of the start state or of directions, which follow the parameters'."""
+        return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property
     def frames(self) -> int:
@@ -204,21 +211,33 @@ def controller_problem(
 
 
 def with_derivatives(
-    problem: LoopProblem, by_start: object, groups: RigidGroups | None
+    problem: LoopProblem,
+    by_start: object,
+    groups: RigidGroups | None,
+    directions: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Problem with derivatives. Raises SimulationError for elastic joints."""
+    """Problem with derivatives, also along directions (frames, n, k) of its commands.
+
+    Raises SimulationError for elastic joints, and for directions that do not fit.
+    """
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
     if problem.settings.elasticity is not None:
         raise SimulationError(
             "derivatives exist only for rigid joints: pass settings with elasticity=None"
         )
-    return dataclasses.replace(
+    found = dataclasses.replace(
         problem,
         sensitivities=True,
         start_sensitivities=flag("by_start", by_start, SimulationError),
         groups=groups,
     )
+    if directions is None:
+        return found
+    most = 0 if found.start_sensitivities else most_directions(problem.robot, groups)
+    shape = problem.frames, problem.robot.layout.joints
+    checked = checked_directions(directions, shape, most)
+    return dataclasses.replace(found, directions=checked)
 
 
 def _problem(

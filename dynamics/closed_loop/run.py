@@ -39,6 +39,8 @@ class ClosedLoopRun:
         Derivatives of the poses with respect to the parameters.
     start_sensitivity : ndarray, shape (frames, 6, s)
         Derivatives of the poses with respect to the start state.
+    command_sensitivity : ndarray, shape (frames, 6, k)
+        Derivatives of the poses along k directions of the commands.
     end_sensitivity, end_start_sensitivity : ndarray, shapes (s, p) and (s, s)
         The same derivatives of the state at the last frame.
     motor_angle, motor_rate : ndarray, shape (frames, n)
@@ -74,6 +76,7 @@ class ClosedLoopRun:
     servo_integral: np.ndarray
     pose_sensitivity: np.ndarray | None
     start_sensitivity: np.ndarray | None
+    command_sensitivity: np.ndarray | None
     end_sensitivity: np.ndarray | None
     end_start_sensitivity: np.ndarray | None
     motor_angle: np.ndarray | None

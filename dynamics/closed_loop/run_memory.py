@@ -35,6 +35,7 @@ class Plan(NamedTuple):
     reference: np.ndarray
     reference_rate: np.ndarray
     commands: np.ndarray
+    directions: np.ndarray
     feedforward: np.ndarray
     lost: np.ndarray
     noise: np.ndarray
@@ -58,6 +59,7 @@ class Record(NamedTuple):
     servo_integral: np.ndarray
     pose_sensitivity: np.ndarray
     start_sensitivity: np.ndarray
+    command_sensitivity: np.ndarray
     end_sensitivity: np.ndarray
     end_start_sensitivity: np.ndarray
     motor_angle: np.ndarray
@@ -76,6 +78,7 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
     coordinates = sizes.coordinates
     parameters = len(problem.columns) if problem.sensitivities else 0
     start = sizes.start if problem.start_sensitivities else 0
+    directions = problem.further_columns - start
     elastic_frames = frames if problem.settings.elasticity else 0
     filtered_frames = frames if sizes.filters else 0
     return Record(
@@ -89,6 +92,7 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
         servo_integral=np.zeros((frames, coordinates)),
         pose_sensitivity=np.zeros((frames, coordinates, parameters)),
         start_sensitivity=np.zeros((frames, coordinates, start)),
+        command_sensitivity=np.zeros((frames, coordinates, directions)),
         end_sensitivity=np.zeros((sizes.start, parameters)),
         end_start_sensitivity=np.zeros((sizes.start, start)),
         motor_angle=np.zeros((elastic_frames, joints)),

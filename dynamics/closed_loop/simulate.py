@@ -272,6 +272,7 @@ def differentiate_commands(
     times: np.ndarray | None = None,
     by_start: bool = False,
     groups: RigidGroups | None = None,
+    directions: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the robot under given commands, with derivatives like those of `differentiate_servo`.
@@ -282,11 +283,14 @@ def differentiate_commands(
         As for `simulate_commands`.
     sensor, by_start, groups
         As for `differentiate_servo`.
+    directions : ndarray, shape (frames, n, k), optional
+        Directions of the commands along which the poses are differentiated, too, at most
+        `most_directions`. They are not combined with `by_start`.
 
     Returns
     -------
     ClosedLoopRun
-        As from `differentiate_servo`.
+        As from `differentiate_servo`. With directions, `command_sensitivity` is set.
 
     Raises
     ------
@@ -306,7 +310,7 @@ def differentiate_commands(
     problem = commands_problem(
         robot, parameters, reference, settings, commands, sensor, start, latencies, times
     )
-    return _run(with_derivatives(problem, by_start, groups), compiled)
+    return _run(with_derivatives(problem, by_start, groups, directions), compiled)
 
 
 def _run(problem: LoopProblem, compiled: object) -> ClosedLoopRun:

@@ -6,17 +6,19 @@ columns of `dynamics.rigid_body.passive_friction`. The torques act on the model 
 commands (`identify.model.joint_torques`). Before the motion begins, the drives hold what they need.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
+from dynamics.geometry import RobotGeometry
 from dynamics.parameters import parameter_layout, passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, Change, pose_columns
+from identify.diagnosis.cause import Cause, Change, InList, OnTorques
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.body_torques import (
     RunMotion,
@@ -25,10 +27,9 @@ from identify.model.body_torques import (
     passive_columns,
     run_motion,
 )
-from identify.runtime import in_threads
 
-PROBED = 1e-5
-"""Largest change of a command for differences, rad or m."""
+PASSIVE_GROUP = "friction of passive joints"
+"""Group of the friction of passive joints."""
 
 MOVING = 0.01
 """Velocity above which a joint moves, as a share of its RMS velocity."""
@@ -38,15 +39,17 @@ MOVING = 0.01
 class Needed:
     """Torques that a cause of size one needs at the joints.
 
-    torques: one array (N, n) for each run, N m or N.
+    torques: one array (N, n) for each run, N m or N. along: function of the motions of the runs
+    that returns these torques, where they depend much on the motion.
     """
 
     name: str
     unit: str
     group: str
     torques: tuple[Array, ...]
-    remedy: str
+    remedy: str | InList
     least: float = -np.inf
+    along: Callable[[Sequence[RunMotion]], tuple[Array, ...]] | None = None
 
 
 def body_causes(
@@ -63,22 +66,33 @@ def body_causes(
         *_uneven_friction(problem.runs[0].robot, motions),
     ]
 
-    def columns(changed: OutputErrorProblem, at: Array) -> Array:
-        return _columns(changed, at, needed)
+    return tuple(_cause(one) for one in needed)
 
-    return tuple(
-        Cause(
-            name=one.name,
-            unit=one.unit,
-            group=one.group,
-            change=_added(one),
-            step=1.0,
-            remedy=lambda size, one=one: one.remedy,  # type: ignore[misc]
-            least=one.least,
-            quick=(columns, place),
-        )
-        for place, one in enumerate(needed)
+
+def _cause(one: Needed) -> Cause:
+    along = one.along
+
+    def renewed(there: OutputErrorProblem, at: Array) -> Cause:
+        assert along is not None
+        motions = [run_motion(run, run.simulate(at)) for run in there.runs]
+        return _cause(replace(one, torques=along(motions)))
+
+    return Cause(
+        name=one.name,
+        unit=one.unit,
+        group=one.group,
+        change=_added(one),
+        step=1.0,
+        remedy=_remedy(one.remedy),
+        least=one.least,
+        effect=OnTorques(one.torques),
+        renewed=None if along is None else renewed,
     )
+
+
+def _remedy(remedy: str | InList) -> Callable[[float], str] | InList:
+    """Return the remedy of a cause, which does not depend on its size."""
+    return remedy if isinstance(remedy, InList) else lambda size: remedy
 
 
 def _added(one: Needed) -> Change:
@@ -92,23 +106,6 @@ def _added(one: Needed) -> Change:
         return replace(problem, runs=tuple(runs))
 
     return added
-
-
-def _columns(problem: OutputErrorProblem, parameters: Array, needed: Sequence[Needed]) -> Array:
-    """Return the columns (m, k) of needed torques, by differences of runs of the model."""
-    changes = []
-    for place, run in enumerate(problem.runs):
-        stiffness = float(run.drive_law(parameters).lp.min())
-        peaks = [max(float(np.abs(one.torques[place]).max()), 1e-300) for one in needed]
-        sizes = [PROBED * stiffness / peak for peak in peaks]
-        ends = [run] + [
-            run.with_torques(size * one.torques[place])
-            for one, size in zip(needed, sizes, strict=True)
-        ]
-        poses = in_threads(lambda end: end.model_poses(parameters), ends)
-        parts = [(pose - poses[0]) / size for pose, size in zip(poses[1:], sizes, strict=True)]
-        changes.append(np.stack(parts, axis=2))
-    return pose_columns(problem, parameters, changes)
 
 
 def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]) -> list[Needed]:
@@ -131,7 +128,10 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
         if not own:
             continue
         words = "the platform" if kind == "platform" else f"the {kind}s"
-        remedy = f"--set 'model.inertia={{ {kind} = \"full\" }}'"
+        # one key, so that bodies which the model names stay
+        remedy = f"--set model.inertia.{kind}=full"
+        if kind == "platform":
+            remedy += ", or state a load that is on it"
         for names, unit, group in (
             (FIRST_MOMENTS, "m", f"centre of mass of {words}"),
             (PRODUCTS, "kg m2", f"products of inertia of {words}"),
@@ -162,25 +162,40 @@ def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed
     for place, name in enumerate(names):
         if name in robot.layout.passive_names:
             continue
-        torques = tuple(
-            by_the_joints(one, wrenches[:, :, place])
-            for one, wrenches in zip(motions, columns, strict=True)
-        )
-        joint, law = name.split(".")
-        kind = "dry" if law == "coulomb" else law
-        words = f"{kind} friction of the {joint.replace('_', ' ')}s"
-        known = ", ".join(f'"{one}"' for one in (*robot.layout.passive_names, name))
         found.append(
             Needed(
-                name=words,
+                name=passive_words(name),
                 unit=robot.layout.unit(name),
-                group="friction of passive joints",
-                torques=torques,
-                remedy=f"--set 'model.passive_friction=[{known}]'",
+                group=PASSIVE_GROUP,
+                torques=_at_the_joints(motions, columns, place),
+                remedy=InList("model.passive_friction", robot.layout.passive_names, name),
                 least=0.0,
+                along=partial(_passive_torques, geometry, place),
             )
         )
     return found
+
+
+def _passive_torques(
+    geometry: RobotGeometry, place: int, motions: Sequence[RunMotion]
+) -> tuple[Array, ...]:
+    """Return the torques of a parameter of passive friction along motions, by its place."""
+    return _at_the_joints(motions, [passive_columns(geometry, one) for one in motions], place)
+
+
+def _at_the_joints(
+    motions: Sequence[RunMotion], columns: Sequence[Array], place: int
+) -> tuple[Array, ...]:
+    """Return the torques (N, n) of one of some columns of wrenches (N, 6, k) along each motion."""
+    pairs = zip(motions, columns, strict=True)
+    return tuple(by_the_joints(one, wrenches[:, :, place]) for one, wrenches in pairs)
+
+
+def passive_words(name: str) -> str:
+    """Return the words for a parameter of passive friction."""
+    joint, law = name.split(".")
+    kind = "dry" if law == "coulomb" else law
+    return f"{kind} friction of the {joint.replace('_', ' ')}s"
 
 
 def _uneven_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:

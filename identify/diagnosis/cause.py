@@ -2,7 +2,8 @@
 
 A cause has a size, zero where the model is right. At a size it makes another output-error problem
 of the one that was solved: of other commands, another clock or another robot. The difference of
-their residuals is the column of the cause.
+their residuals is the column of the cause. Most columns also follow from one run of the model that
+is differentiated along many directions at once, for which a cause names its effect.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,8 +20,59 @@ from identify.model.loop_model import LoopModel
 Change = Callable[[OutputErrorProblem, float], OutputErrorProblem]
 """Function that returns the problem with a cause of a given size. It changes nothing else."""
 
-Columns = Callable[[OutputErrorProblem, Array], Array]
-"""Function (problem, parameters) that returns columns (m, g) of the residuals."""
+RunColumn = Callable[[LoopModel, int], Array]
+"""Function (run, its place) that returns what a cause of size one changes at each frame."""
+
+
+@dataclass(frozen=True)
+class OnCommands:
+    """Effect of a cause that changes the commands of a run, by `changes` (N, n)."""
+
+    changes: RunColumn
+
+
+@dataclass(frozen=True)
+class OnTorques:
+    """Effect of a cause for which joints need further torques (N, n), one array for each run."""
+
+    torques: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class OnGain:
+    """Effect of a cause that changes one gain of one joint. Both are counted from 0."""
+
+    joint: int
+    kind: int
+
+
+@dataclass(frozen=True)
+class OnGeometry:
+    """Effect of a cause that changes the robot's geometric numbers, by `deviations` (g,)."""
+
+    deviations: Array
+
+
+@dataclass(frozen=True)
+class OnPoses:
+    """Effect of a cause that changes the measured poses of a run, by `changes` (N, 6)."""
+
+    changes: RunColumn
+
+
+Effect = OnCommands | OnTorques | OnGain | OnGeometry | OnPoses
+
+
+@dataclass(frozen=True)
+class InList:
+    """Remedy that is an entry of a list of settings, beside those that the model has and others.
+
+    key: of the list. known: its entries so far. entry: the further one.
+    """
+
+    key: str
+    known: tuple[str, ...]
+    entry: str
 
 
 @dataclass(frozen=True)
@@ -40,21 +92,22 @@ class Cause:
     step : float
         Size by which the cause is moved for a difference, so small that residuals follow in
         proportion, and so large that rounding does not count. Zero: the cause is there or not.
-    remedy : callable
-        Function (size) that returns a line to type, or one sentence of what to do.
+    remedy : callable or InList
+        Function (size) that returns a line to type, or one sentence of what to do. Or the entry
+        that a list of settings needs.
     least : float
         Least size that there can be.
-    quick : callable and int, optional
-        Function (problem, parameters) that returns columns (m, g) of several causes at once, and
-        the place of this one among them. None: columns are differences of runs.
+    effect : Effect, optional
+        Effect of a size of one. None: the column is a difference of runs.
     alone : bool
         True if the cause is asked alone, too. False: only together with its group.
     exclusive : bool
         True if at most one cause of the group can be there.
     companion : Cause, optional
         Cause that has a size only where this one is there, and is then fitted with it.
-    deviations : ndarray, shape (g,), optional
-        Change of the robot's geometric numbers by a size of one, for causes in the geometry.
+    renewed : callable, optional
+        Function (problem with the causes, parameters) that returns this cause with its effect along
+        the motion there, if its effect depends on it.
     tried : tuple of float
         Sizes at which the cause is looked for, where a small one shows nothing. Empty: about zero.
     """
@@ -64,14 +117,19 @@ class Cause:
     group: str
     change: Change
     step: float
-    remedy: Callable[[float], str]
+    remedy: Callable[[float], str] | InList
     least: float = -np.inf
     tried: tuple[float, ...] = ()
-    quick: tuple[Columns, int] | None = None
+    effect: Effect | None = None
     alone: bool = True
     exclusive: bool = False
     companion: "Cause | None" = None
-    deviations: Array | None = None
+    renewed: "Callable[[OutputErrorProblem, Array], Cause] | None" = None
+
+    @property
+    def differentiable(self) -> bool:
+        """True if differences of runs tell more than that the cause is there."""
+        return self.effect is None and self.step > 0
 
 
 def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
@@ -91,27 +149,19 @@ def prior_std(size: float, least: float) -> float:
     return float(10.0 ** np.ceil(np.log10(max(abs(size), least))))
 
 
-def pose_columns(problem: OutputErrorProblem, parameters: Array, changes: Sequence[Array]) -> Array:
-    """Return the columns (m, k) of changes (N, 6, k) of each run's poses against the measured."""
-    known, _ = problem.known(parameters)
-    parts = [np.zeros((len(known), changes[0].shape[2]))]
-    for run, change in zip(problem.runs, changes, strict=True):
-        white = run.without_common(np.asarray(run.whitener @ change[run.ok]))
-        parts.append(white.reshape(-1, change.shape[2]))
-    return np.vstack(parts)
-
-
 def with_causes(
     problem: OutputErrorProblem, causes: Sequence[Cause], sizes: Array
 ) -> OutputErrorProblem:
     """Return the problem with several causes, each of its size (k,)."""
     # one of size zero changes nothing
     present = [(one, float(size)) for one, size in zip(causes, sizes, strict=True) if size]
-    geometric = [size * one.deviations for one, size in present if one.deviations is not None]
+    geometric = [
+        size * one.effect.deviations for one, size in present if isinstance(one.effect, OnGeometry)
+    ]
     if geometric:
         # a robot is moved once for all numbers, which takes longer than a run of it
         problem = with_geometry(problem, np.sum(geometric, axis=0))
-    others = [pair for pair in present if pair[0].deviations is None]
+    others = [pair for pair in present if not isinstance(pair[0].effect, OnGeometry)]
     return reduce(lambda changed, pair: pair[0].change(changed, pair[1]), others, problem)
 
 

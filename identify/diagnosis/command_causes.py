@@ -6,7 +6,7 @@ import numpy as np
 
 from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run, prior_std
+from identify.diagnosis.cause import Cause, OnCommands, in_each_run, prior_std
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
@@ -38,6 +38,7 @@ def scales() -> tuple[Cause, ...]:
             group="scale of the commands",
             change=in_each_run(scaled),
             step=SCALE_STEP,
+            effect=OnCommands(lambda run, place: run.logged),
             remedy=lambda size: (
                 f"--set model.command_scale_std={prior_std(size, SCALE_STD):g}, or mend the ratio "
                 "of the gears or the encoders"
@@ -54,8 +55,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
         return replace(run, acted=possible(run, run.stated_latencies + size))
 
     def drifting(run: LoopModel, size: float) -> LoopModel:
-        seconds = np.arange(len(run.ok)) / timing.frame_rate_hz
-        return replace(run, acted=possible(run, run.stated_latencies + size * seconds))
+        return replace(run, acted=possible(run, run.stated_latencies + size * seconds_of(run)))
 
     earliest = min(float(run.stated_latencies.min()) for run in problem.runs)
     longest = max(len(run.ok) for run in problem.runs) / timing.frame_rate_hz
@@ -66,6 +66,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             group="latency of the commands",
             change=in_each_run(later),
             step=CLOCK_STEP_S,
+            effect=OnCommands(lambda run, place: delayed(run)),
             remedy=lambda size: (
                 f"state timing.latency_s = {timing.latency_s + size:.6g} with the record: the "
                 f"commands act {1e3 * abs(size):.3g} ms {'later' if size > 0 else 'earlier'} than "
@@ -79,6 +80,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             group="drift of the commands' clock",
             change=in_each_run(drifting),
             step=CLOCK_STEP_S / longest,
+            effect=OnCommands(lambda run, place: delayed(run) * seconds_of(run)[:, None]),
             remedy=lambda size: (
                 f"correct the times of the commands by {1e6 * size:.3g} us a second, or give "
                 "cameras and drives one clock"
@@ -86,6 +88,21 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             least=-earliest / longest,
         ),
     )
+
+
+def seconds_of(run: LoopModel) -> Array:
+    """Return the times (N,) of the frames of a run, s."""
+    return np.arange(len(run.ok)) / run.settings.timing.frame_rate_hz
+
+
+def delayed(run: LoopModel) -> Array:
+    """Return the change (N, n) of the commands by which they act a second later, to first order.
+
+    A held command that acts later by s lets the one before it act for so long, at the beginning of
+    its time. Half of this change is in the time of either one, so that its middle is there.
+    """
+    changes = np.diff(run.logged, axis=0, prepend=run.logged[:1], append=run.logged[-1:])
+    return -run.settings.timing.frame_rate_hz * (changes[:-1] + changes[1:]) / 2
 
 
 def possible(run: LoopModel, latencies: Array) -> Array:

@@ -4,7 +4,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import xarray as xr
 
 from dynamics import Robot
@@ -12,11 +11,9 @@ from identify.arrays import Array
 from identify.diagnosis.catalogue import catalogue
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
-from identify.diagnosis.fit import Point, linearised
 from identify.diagnosis.own_cause import check_columns
 from identify.diagnosis.ranking import Rows
-from identify.diagnosis.score import first_columns
-from identify.diagnosis.selection import select
+from identify.diagnosis.selection import ask_first, select
 from identify.errors import EstimationError
 from identify.estimation.identification import asked_of, identify, output_error_problem
 from identify.estimation.output_error import OutputErrorProblem
@@ -102,20 +99,15 @@ def diagnosis_from(
         raise EstimationError(
             "the drives took torques: a record is diagnosed only where they took joint commands"
         )
-    problem, point = _optimum(problem.driven_by_commands(), start)
-    causes = (*catalogue(problem, point.parameters), *own)
-    causes, columns = first_columns(problem, point.parameters, causes, point.beside)
-    check_columns(tuple(own), columns[:, len(causes) - len(own) :])
-    found = select(problem, replace(point, columns=columns), causes)
-    rows = Rows.of(problem, point.residual)
-    return diagnosis_of(found, causes, rows, time.perf_counter() - began)
-
-
-def _optimum(problem: OutputErrorProblem, start: Array) -> tuple[OutputErrorProblem, Point]:
-    """Return a problem with the modes of its common errors at its optimum, and the optimum."""
     # an estimate that is still under way would be accused of what it has not reached yet
+    problem = problem.driven_by_commands()
     problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
     found = search_with_common_errors(problem, [start], lambda n=1: None)
-    there = found.linearised()
-    solution = found.solution
-    return there, linearised(there, solution.parameters, solution.at_bound, (), np.zeros(0))
+    problem = found.linearised()
+    optimum = found.solution
+    causes = (*catalogue(problem, optimum.parameters), *own)
+    point, first = ask_first(problem, optimum.parameters, optimum.at_bound, causes)
+    check_columns(tuple(own), first.columns[:, len(causes) - len(own) :])
+    selected = select(problem, point, causes, first)
+    rows = Rows.of(problem, point.residual)
+    return diagnosis_of(selected, causes, rows, time.perf_counter() - began)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import chdtrc
 
-from identify.diagnosis.cause import Cause
+from identify.diagnosis.cause import Cause, InList
 from identify.diagnosis.ranking import Ranked, Rows
 from identify.diagnosis.selection import Selected, Selection
 from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whiteness
@@ -213,7 +213,9 @@ def diagnosis_of(
     # a misfit that chance can make has no shares; then it is what the causes explain
     whole = max(excess, gains)
     sizes = dict(zip(selection.places, _sizes(selection, causes, rows), strict=True))
-    findings = tuple(_finding(one, causes, sizes, whole) for one in selection.selected)
+    # what is typed last stands, and so has the entries of the findings before
+    lists: dict[str, list[str]] = {}
+    findings = tuple(_finding(one, causes, sizes, whole, lists) for one in selection.selected)
     noise = noise_finding(selection, rows, whole)
     findings = findings if noise is None else (*findings, noise)
     candidates = tuple(_row(one, causes, whole) for one in selection.ranking)
@@ -265,7 +267,8 @@ def _sizes(selection: Selection, causes: Sequence[Cause], rows: Rows) -> list[Si
         return []
     there = point.score()
     # what is left of the misfit lasts from frame to frame, and spreads the sizes further
-    model = selection.after.share_of_model * rows.spread(point.residual, there.directions)
+    colour = rows.colour(point.residual)
+    model = selection.after.share_of_model * rows.spread(colour, there.directions)
     std = np.sqrt(np.diag(there.covariance(model)))
     return [
         Size(causes[place].name, causes[place].unit, float(value), float(err))
@@ -274,7 +277,11 @@ def _sizes(selection: Selection, causes: Sequence[Cause], rows: Rows) -> list[Si
 
 
 def _finding(
-    one: Selected, causes: Sequence[Cause], sizes: dict[int, Size], whole: float
+    one: Selected,
+    causes: Sequence[Cause],
+    sizes: dict[int, Size],
+    whole: float,
+    lists: dict[str, list[str]],
 ) -> Finding:
     own = [sizes[place] for place in one.places]
     # a group of which one member is left is that member
@@ -291,14 +298,27 @@ def _finding(
         freedoms=one.ranked.score.freedoms,
         chance=one.ranked.chance,
         alike=one.alike,
-        # causes of a group can have the same remedy
-        remedies=tuple(
-            dict.fromkeys(
-                causes[place].remedy(size.value)
-                for place, size in zip(one.places, own, strict=True)
-            )
-        ),
+        remedies=remedies_of([causes[place] for place in one.places], own, lists),
     )
+
+
+def remedies_of(
+    causes: Sequence[Cause], sizes: Sequence[Size], lists: dict[str, list[str]]
+) -> tuple[str, ...]:
+    """Return the remedies of a finding with some causes, and add to lists of settings by key."""
+    found = []
+    keys = []
+    for one, size in zip(causes, sizes, strict=True):
+        if isinstance(one.remedy, InList):
+            lists.setdefault(one.remedy.key, [*one.remedy.known]).append(one.remedy.entry)
+            keys.append(one.remedy.key)
+        else:
+            found.append(one.remedy(size.value))
+    for key in keys:
+        entries = ", ".join(f'"{entry}"' for entry in lists[key])
+        found.append(f"--set '{key}=[{entries}]'")
+    # causes of a group can have the same remedy
+    return tuple(dict.fromkeys(found))
 
 
 def _row(one: Ranked, causes: Sequence[Cause], whole: float) -> CandidateRow:

@@ -1,32 +1,38 @@
 """Fit of causes beside the parameters, with the model linearised anew until their sizes stand."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identify.arrays import Array, triangular_factor
 from identify.diagnosis.cause import Cause, with_causes
-from identify.diagnosis.score import (
-    OrthogonalComplement,
-    Score,
-    allowed,
-    cause_columns,
-    parameter_columns,
-    score,
-)
+from identify.diagnosis.linearisation import Linearisation, allowed, linearisation
+from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.output_error import OutputErrorProblem
 
-STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=6)
-"""Criteria of one search. The causes' columns stay as they are during it."""
+STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=5)
+"""Criteria of one search."""
 
-REFRESHES = 3
-"""Largest number of searches, each with the columns of the causes at the sizes before."""
+ROUNDS = 6
+"""Largest number of searches."""
 
-STANDS = 0.3
-"""Largest change of a size by another search, in standard deviations, at which it stands."""
+FINER = 0.3
+"""Factor of the steps of differences from one search to the next."""
+
+SLOW = 0.25
+"""Fall of the cost by a search, as a share, below which differences become finer."""
+
+RENEWALS = 2
+"""Number of searches after which effects that depend on the motion are those of the new one."""
+
+STANDS = 2e-4
+"""Fall of the cost by another search, as a share, below which sizes stand."""
+
+FOLLOW = replace(STOP, cost_tolerance=1e-2, max_iterations=6)
+"""Criteria of a search of the parameters alone."""
 
 
 @dataclass(frozen=True)
@@ -35,23 +41,52 @@ class Point:
 
     Attributes
     ----------
+    causes : tuple of Cause
+        The k causes as they were fitted.
     parameters : ndarray, shape (p,)
         Parameters of the robot.
     sizes : ndarray, shape (k,)
         Sizes of the causes.
-    residual : ndarray, shape (m,)
-        Residuals.
+    linear : Linearisation
+        Residuals, and their columns by parameters and by these causes.
     beside : OrthogonalComplement
         Space beside the columns of the parameters that no bound holds.
-    columns : ndarray, shape (m, k)
-        Columns of the causes.
     """
 
+    causes: tuple[Cause, ...]
     parameters: Array
     sizes: Array
-    residual: Array
+    linear: Linearisation
     beside: OrthogonalComplement
-    columns: Array
+
+    @classmethod
+    def of(
+        cls,
+        problem: OutputErrorProblem,
+        causes: tuple[Cause, ...],
+        parameters: Array,
+        at_bound: NDArray[np.bool_],
+        sizes: Array,
+        linear: Linearisation,
+    ) -> "Point":
+        """Return an optimum with its linearisation.
+
+        at_bound (p,): coordinates of the parameters that are held at their bounds.
+        """
+        bounds = problem.bounds
+        slopes = linear.by_parameters @ bounds.slope(bounds.coordinates(parameters))
+        beside = OrthogonalComplement.of(slopes[:, ~at_bound])
+        return cls(causes, parameters, sizes, linear, beside)
+
+    @property
+    def residual(self) -> Array:
+        """Residuals (m,)."""
+        return self.linear.residual
+
+    @property
+    def columns(self) -> Array:
+        """Columns (m, k) of the causes."""
+        return self.linear.by_causes
 
     @property
     def cost(self) -> float:
@@ -76,18 +111,25 @@ class Point:
 class WithCauses:
     """Problem in the coordinates of parameters and causes, see `bounded_least_squares.Problem`.
 
-    The sizes stand behind the coordinates of the parameters, in steps of the causes. columns (m,
-    k): derivatives of the residuals with respect to the sizes.
+    The sizes stand behind the coordinates of the parameters, in steps of the causes. held (k,):
+    causes whose sizes do not move. step: that of differences, in the causes' own steps. known:
+    linearisations by the bytes of their coordinates.
     """
 
     problem: OutputErrorProblem
     causes: tuple[Cause, ...]
-    columns: Array
+    held: NDArray[np.bool_]
+    step: float = 1.0
+    known: dict[bytes, Linearisation] = field(default_factory=dict)
 
     @property
     def steps(self) -> Array:
         """Steps (k,) of the causes, one for a cause that is there or not."""
-        return steps_of(self.causes)
+        return np.array([one.step or 1.0 for one in self.causes])
+
+    def coordinates(self, parameters: Array, sizes: Array) -> Array:
+        """Return the coordinates (p + k,) of parameters (p,) and sizes (k,)."""
+        return np.concatenate([self.problem.bounds.coordinates(parameters), sizes / self.steps])
 
     def parameters(self, coordinates: Array) -> Array:
         """Return the parameters (p,) of coordinates (p + k,)."""
@@ -97,89 +139,106 @@ class WithCauses:
         """Return the sizes (k,) of coordinates (p + k,)."""
         return coordinates[len(coordinates) - len(self.causes) :] * self.steps
 
-    def at(self, coordinates: Array) -> OutputErrorProblem:
-        """Return the problem with the causes at coordinates (p + k,)."""
-        return with_causes(self.problem, self.causes, self.sizes(coordinates))
+    def renewed(self, coordinates: Array) -> "WithCauses":
+        """Return the problem with causes of effects along the motion at coordinates (p + k,)."""
+        parameters = self.parameters(coordinates)
+        there = with_causes(self.problem, self.causes, self.sizes(coordinates))
+        causes = tuple(
+            one if one.renewed is None else one.renewed(there, parameters) for one in self.causes
+        )
+        return replace(self, causes=causes, known={})
 
     def cost(self, coordinates: Array) -> float:
         """Return the cost at coordinates (p + k,), infinite where the model cannot run."""
-        return self.at(coordinates).cost(self.parameters(coordinates))
+        there = with_causes(self.problem, self.causes, self.sizes(coordinates))
+        return there.cost(self.parameters(coordinates))
+
+    def at(self, coordinates: Array) -> Linearisation:
+        """Return the linearisation at coordinates (p + k,). Raises LoopFailure."""
+        place = coordinates.tobytes()
+        if place not in self.known:
+            every = range(len(self.causes))
+            self.known[place] = linearisation(
+                self.problem,
+                self.parameters(coordinates),
+                self.causes,
+                self.sizes(coordinates),
+                every,
+                self.step,
+            )
+        return self.known[place]
+
+    def best_known(self, coordinates: Array, cost: float) -> Array:
+        """Return the best linearised coordinates, or these (p + k,) of a cost if far better."""
+        costs = {place: float(one.residual @ one.residual) for place, one in self.known.items()}
+        place = min(costs, key=lambda one: costs[one], default=b"")
+        near = place and costs[place] <= cost * (1 + STOP.cost_tolerance)
+        return np.frombuffer(place) if near else coordinates
 
     def linearise(self, coordinates: Array) -> tuple[float, Array, Array]:
         """Return cost and linearisation at coordinates (p + k,)."""
-        residual, slopes = parameter_columns(self.at(coordinates), self.parameters(coordinates))
-        rows = triangular_factor(
-            slopes @ self.problem.bounds.slope(coordinates[: slopes.shape[1]]),
-            self.columns * self.steps,
-            residual,
-        )
+        found = self.at(coordinates)
         count = len(coordinates)
-        return float(residual @ residual), rows[:count, :count], rows[:count, count]
-
-
-def steps_of(causes: Sequence[Cause]) -> Array:
-    """Return the steps (k,) of causes, one for a cause that is there or not."""
-    return np.array([one.step or 1.0 for one in causes])
-
-
-def linearised(
-    problem: OutputErrorProblem,
-    parameters: Array,
-    at_bound: NDArray[np.bool_],
-    causes: Sequence[Cause],
-    sizes: Array,
-) -> Point:
-    """Return the linearisation of a problem with causes at parameters (p,) and sizes (k,).
-
-    at_bound (p,): coordinates of the parameters that are held at their bounds. Raises LoopFailure
-    if the model is unstable.
-    """
-    there = with_causes(problem, causes, sizes)
-    residual, slopes = parameter_columns(there, parameters)
-    bounds = problem.bounds
-    free = (slopes @ bounds.slope(bounds.coordinates(parameters)))[:, ~at_bound]
-    # a cause is changed from its size while all others stay
-    columns = cause_columns(problem, parameters, causes, sizes)
-    return Point(parameters, sizes, residual, OrthogonalComplement.of(free), columns)
+        bounds = self.problem.bounds
+        rows = triangular_factor(
+            found.by_parameters @ bounds.slope(coordinates[: count - len(self.causes)]),
+            # one whose model does not run on either side stays, too
+            np.nan_to_num(found.by_causes) * self.steps * ~self.held,
+            found.residual,
+        )
+        return float(found.residual @ found.residual), rows[:count, :count], rows[:count, count]
 
 
 def fit(
     problem: OutputErrorProblem,
     start: Array,
-    causes: tuple[Cause, ...],
+    causes: Sequence[Cause],
     sizes: Array,
-    columns: Array,
+    expected: Array,
+    held: NDArray[np.bool_],
+    linear: Linearisation | None,
 ) -> Point:
-    """Fit parameters and causes from parameters (p,), sizes (k,) and columns (m, k) at them.
+    """Fit parameters and causes from parameters (p,) and sizes (k,).
 
-    Raises LoopFailure if the model is unstable at the start.
+    expected (k,): sizes to which the search probably goes. held (k,): causes whose sizes stay until
+    the parameters have followed. linear: linearisation at the start, if it is known. Raises
+    LoopFailure if the model is unstable at the start.
     """
+    whole = WithCauses(problem, tuple(causes), np.zeros_like(held))
     there = with_causes(problem, causes, sizes)
-    bounds = there.bounds
-    steps = steps_of(causes)
-    least = np.array([one.least for one in causes])
-    parameters = allowed(there, start)
-    # A cause that is tried at a size stays there until the parameters have followed. The chord to
-    # it, by which it was ranked, leads the search astray.
-    columns = columns * [float(not one.tried) for one in causes]
-    for _ in range(REFRESHES):
-        whole = WithCauses(problem, causes, columns)
-        coordinates = np.concatenate([bounds.coordinates(parameters), sizes / steps])
-        spread = bounds.spread(coordinates[: len(parameters)], problem.guess.std)
-        far = np.maximum(2 * np.abs(sizes / steps), 10.0)
-        found = minimise(
-            whole,
-            coordinates,
-            np.concatenate([bounds.lower, least / steps]),
-            np.concatenate([spread, far]),
-            STOP,
-        )
-        parameters = whole.parameters(found.parameters)
-        sizes = whole.sizes(found.parameters)
-        held = found.at_bound[: len(parameters)]
-        point = linearised(problem, parameters, held, causes, sizes)
-        columns = point.columns
-        left = point.score()
-        if (np.abs(left.sizes) <= STANDS * np.sqrt(np.diag(left.covariance()))).all():
+    coordinates = whole.coordinates(allowed(there, start), sizes)
+    if linear is not None:
+        whole.known[coordinates.tobytes()] = linear
+    count = len(start)
+    least = np.array([one.least for one in causes]) / whole.steps
+    largest = np.maximum(np.abs(expected), np.abs(sizes))
+    far = np.maximum(2 * largest / whole.steps, 10.0)
+    spread = there.bounds.spread(coordinates[:count], problem.guess.std)
+    limits = np.concatenate([there.bounds.lower, least]), np.concatenate([spread, far])
+    if held.any():
+        # the parameters follow before the sizes move, as joints that stick make many minima
+        coordinates = minimise(replace(whole, held=held), coordinates, *limits, FOLLOW).parameters
+    renewing = RENEWALS if any(one.renewed for one in causes) else 0
+    for _ in range(ROUNDS):
+        # each begins with a wide trust region again, which kinks make narrow
+        found = minimise(whole, coordinates, *limits, STOP)
+        coordinates = found.parameters
+        fall = (found.costs[0] - found.costs[-1]) / found.costs[-1]
+        exact = not any(one.differentiable for one in whole.causes)
+        if not renewing and (fall <= STANDS or (exact and found.iterations < STOP.max_iterations)):
             break
-    return point
+        if renewing:
+            whole = whole.renewed(coordinates)
+            renewing -= 1
+        if fall <= SLOW:
+            # Joints that stick make kinks. Far off, coarse differences see past them.
+            whole = replace(whole, step=FINER * whole.step, known={})
+    coordinates = whole.best_known(found.parameters, found.costs[-1])
+    return Point.of(
+        problem,
+        whole.causes,
+        whole.parameters(coordinates),
+        found.at_bound[:count],
+        whole.sizes(coordinates),
+        whole.at(coordinates),
+    )

@@ -9,7 +9,7 @@ import numpy as np
 from dynamics.closed_loop.drives import READS
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run, pose_columns
+from identify.diagnosis.cause import Cause, OnGain, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.model.unequal_gains import with_unequal_gains
@@ -53,15 +53,5 @@ def _difference(joint: int, kind: int, gain: float, unit: str) -> Cause:
         step=STEP * gain,
         remedy=lambda size: "--set model.gains=each",
         least=LEAST * gain,
-        quick=(difference_columns, (joint - 1) * len(JOINT_PID) + kind),
+        effect=OnGain(joint, kind),
     )
-
-
-def difference_columns(problem: OutputErrorProblem, parameters: Array) -> Array:
-    """Return columns (m, 3 n - 3) of the gains of all joints but the first, joint by joint."""
-    changes = []
-    for run in problem.runs:
-        none = np.zeros((run.robot.layout.joints, len(JOINT_PID)))
-        by_gains = with_unequal_gains(run, none).by_gains(parameters)[:, :, 1:]
-        changes.append(by_gains.reshape(*by_gains.shape[:2], -1))
-    return pose_columns(problem, parameters, changes)

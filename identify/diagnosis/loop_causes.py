@@ -16,7 +16,7 @@ import numpy as np
 from dynamics.closed_loop import ClosedLoopRun, FrictionLaw, LoopSettings
 from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, Change, in_each_run
+from identify.diagnosis.cause import Cause, Change, OnCommands, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel
@@ -75,7 +75,7 @@ def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
         change=in_settings(smoothed),
         step=2e-3 * typical,
         remedy=lambda size: (
-            f"--set model.friction=smoothed --set model.smoothing_velocity_{key}={size:.3g}"
+            f"--set model.friction=smoothed --set model.smoothing_velocity_{key}={size:.6g}"
         ),
         least=5e-4 * typical,
         tried=(0.01 * typical, 0.05 * typical),
@@ -105,7 +105,7 @@ def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
         change=in_settings(faded),
         step=0.05 * velocity,
         remedy=lambda size: (
-            f"and --set model.stribeck_velocity_{key}={velocity + size:.3g} in place of that"
+            f"and --set model.stribeck_velocity_{key}={velocity + size:.6g} in place of that"
         ),
         least=-0.9 * velocity,
         alone=False,
@@ -117,11 +117,10 @@ def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
         change=in_settings(stribeck),
         step=0.02,
         remedy=lambda size: (
-            f"--set model.friction=stribeck --set model.static_ratio={1 + size:.3g} "
-            f"--set model.stribeck_velocity_{key}={velocity:.3g}"
+            f"--set model.friction=stribeck --set model.static_ratio={1 + size:.6g} "
+            f"--set model.stribeck_velocity_{key}={velocity:.6g}"
         ),
         least=0.0,
-        tried=(0.2,),
         exclusive=True,
         companion=width,
     )
@@ -150,6 +149,11 @@ def elasticity(
             changed, runs=tuple(replace(run, logged=run.logged - size * by) for run, by in pairs)
         )
 
+    def along_the_motion(there: OutputErrorProblem, at: Array) -> Cause:
+        moved = [run.simulate(at) for run in there.runs]
+        speeds = [joint_rates(run, found) for run, found in zip(there.runs, moved, strict=True)]
+        return elasticity(there, at, moved, speeds)
+
     peak = max(float(np.abs(one).max()) for one in carried)
     return Cause(
         name="elasticity of the joints",
@@ -162,6 +166,8 @@ def elasticity(
             f"{1 / size:.3g} {torque_unit}/{layout.joint_unit}, and the model has rigid joints"
         ),
         least=0.0,
+        effect=OnCommands(lambda run, place: -carried[place]),
+        renewed=along_the_motion,
     )
 
 
@@ -194,13 +200,13 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
         unit="1",
         group="torque limit of the drives",
         change=in_settings(limited),
-        step=0.01,
+        step=2e-4,
         remedy=lambda size: (
-            f"state control.torque_limit_{key} = {peak * (1 - size):.4g} with the record: the "
-            f"drives cut {100 * size:.3g} % of the largest torque"
+            f"look up the limit of the drives, and state it with the record as "
+            f"control.torque_limit_{key}: in this model's scale it is {peak * (1 - size):.4g}"
         ),
         least=0.0,
-        tried=(0.003, 0.01, 0.03, 0.1, 0.3),
+        tried=(0.003, 0.01, 0.03, 0.1),
     )
 
 

@@ -12,16 +12,14 @@ References
 Cook and Weisberg, Residuals and influence in regression, Chapman and Hall, 1982.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, in_each_run, pose_columns
+from identify.diagnosis.cause import Cause, OnPoses, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 from identify.model.loop_model import LoopModel
@@ -71,13 +69,8 @@ def _shared(name: str, place: int, std: float) -> Cause:
             f"calibrate anew: {name} is off by {size:.3g}, {abs(size) / std:.2g} times the "
             f"standard deviation {std:.2g} that the record states"
         ),
-        quick=(shared_columns, place),
+        effect=OnPoses(lambda run, k: run.common.changes[:, :, place]),
     )
-
-
-def shared_columns(problem: OutputErrorProblem, parameters: Array) -> Array:
-    """Return the columns (m, k) of the errors that all poses have in common."""
-    return pose_columns(problem, parameters, [run.common.changes for run in problem.runs])
 
 
 def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
@@ -87,28 +80,23 @@ def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause,
         for number, run in enumerate(problem.runs)
         for frame in suspicious_frames(run.misses(parameters), run.ok)
     ][:MOST_FRAMES]
-    if not places:
-        return ()
-    quick = partial(frame_columns, places=tuple(places))
     return tuple(
-        _gross(number, frame, component, (quick, 6 * place + component))
-        for place, (number, frame) in enumerate(places)
-        for component in range(6)
+        _gross(number, frame, component) for number, frame in places for component in range(6)
     )
 
 
-def _gross(
-    number: int,
-    frame: int,
-    component: int,
-    quick: tuple[Callable[[OutputErrorProblem, Array], Array], int],
-) -> Cause:
+def _gross(number: int, frame: int, component: int) -> Cause:
     def without(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
         runs = list(problem.runs)
         measured = runs[number].measured.copy()
         measured[frame, component] -= size
         runs[number] = replace(runs[number], measured=measured)
         return replace(problem, runs=tuple(runs))
+
+    def changes(run: LoopModel, place: int) -> Array:
+        found = np.zeros(run.measured.shape)
+        found[frame, component] = float(place == number)
+        return found
 
     which = f" of record {number + 1}" if number else ""
     return Cause(
@@ -118,19 +106,9 @@ def _gross(
         change=without,
         step=float(STEPS[component]),
         remedy=lambda size: f"mark frame {frame}{which} as lost: measured_ok = 0",
-        quick=quick,
+        effect=OnPoses(changes),
         alone=False,
     )
-
-
-def frame_columns(
-    problem: OutputErrorProblem, parameters: Array, places: tuple[tuple[int, int], ...]
-) -> Array:
-    """Return the columns (m, 6 f) of errors of f frames, given as number of the run and frame."""
-    changes = [np.zeros((*run.measured.shape, 6 * len(places))) for run in problem.runs]
-    for place, (number, frame) in enumerate(places):
-        changes[number][frame, :, 6 * place : 6 * place + 6] = np.eye(6)
-    return pose_columns(problem, parameters, changes)
 
 
 def suspicious_frames(residuals: Array, ok: NDArray[np.bool_]) -> NDArray[np.int_]:

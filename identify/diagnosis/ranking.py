@@ -25,8 +25,9 @@ from identify.diagnosis.cause import Cause
 from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.explanation import (
     Misfit,
-    coloured_score_covariance,
     misfit_of_white,
+    score_covariance,
+    spectral_density,
 )
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -110,15 +111,20 @@ class Rows:
         parts = np.split(self.of_poses(rows), ends[:-1])
         return [one.reshape(len(one) // 6, 6, *one.shape[1:]) for one in parts]
 
-    def spread(self, residual: Array, directions: Array) -> Array:
-        """Return the covariance (d, d) of U^T r for residuals as correlated as r (m,).
+    def colour(self, residual: Array) -> tuple[Array, ...]:
+        """Return the spectral density of residuals (m,) in each run."""
+        pairs = zip(self.of_runs(residual), self.frames, strict=True)
+        return tuple(spectral_density(own, ok) for own, ok in pairs)
+
+    def spread(self, colour: Sequence[Array], directions: Array) -> Array:
+        """Return the covariance (d, d) of U^T r for residuals of a colour.
 
         directions (m, d): the columns of U.
         """
-        each = zip(self.of_runs(residual), self.of_runs(directions), self.frames, strict=True)
+        each = zip(colour, self.of_runs(directions), self.frames, strict=True)
         total = np.zeros((directions.shape[1],) * 2)
-        for own, rows, ok in each:
-            total += coloured_score_covariance(own, rows, ok)
+        for density, rows, ok in each:
+            total += score_covariance(density, rows, ok)
         return total
 
 
@@ -144,14 +150,18 @@ def rank(
     lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
     every = candidates(causes)
     price = np.log(len(rows.of_poses(residual)))
+    share = misfit_of(rows, left).share_of_model
+    colour = rows.colour(left) if share else ()
     ranked = []
     for one in every:
         places = list(one.places)
         found = _possible_score(projected, left, lengths, places, causes)
-        chance = min(1.0, len(every) * p_value_of(found, left, rows))
+        # what one of them leaves is hardly less than what all of them have to explain
+        chance = min(1.0, len(every) * _chance(found, left, rows, share, colour))
         worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
         ranked.append(Ranked(one, found, chance, worth))
     ranked.sort(key=lambda one: -one.worth)
+    ranked[0] = _exactly(ranked[0], len(every), left, rows)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)
     # causes that would need a size that nothing can have are left out
@@ -164,8 +174,14 @@ def rank(
         return tuple(ranked)
     chance = min(1.0, len(every) ** len(chain) * p_value_of(found, left, rows))
     first = next(one for one in ranked if one.candidate.places == chain[:1])
-    first = replace(first, chance=min(first.chance, chance))
-    return (first, *(one for one in ranked if one.candidate is not first.candidate))
+    chance = min(_exactly(first, len(every), left, rows).chance, chance)
+    found_first = replace(first, chance=chance)
+    return (found_first, *(one for one in ranked if one is not first))
+
+
+def _exactly(one: Ranked, count: int, left: Array, rows: Rows) -> Ranked:
+    """Return a candidate of a number of them with its chance by what it leaves of residuals."""
+    return replace(one, chance=min(1.0, count * p_value_of(one.score, left, rows)))
 
 
 def _possible_score(
@@ -221,14 +237,21 @@ def p_value_of(found: Score, residual: Array, rows: Rows) -> float:
 
     residual (m,): the one that was projected.
     """
+    left = residual - found.directions @ (found.directions.T @ residual)
+    share = misfit_of(rows, left).share_of_model
+    return _chance(found, residual, rows, share, rows.colour(left) if share else ())
+
+
+def _chance(
+    found: Score, residual: Array, rows: Rows, share: float, colour: Sequence[Array]
+) -> float:
+    """Return the probability of a statistic beside a share of the model's error of some colour."""
     if not found.freedoms:
         return 1.0
     along = found.directions.T @ residual
-    left = residual - found.directions @ along
-    share = misfit_of(rows, left).share_of_model
     spread = np.eye(found.freedoms)
     if share:
-        spread = spread + share * rows.spread(left, found.directions)
+        spread = spread + share * rows.spread(colour, found.directions)
     return float(chdtrc(found.freedoms, along @ np.linalg.solve(spread, along)))
 
 

@@ -17,16 +17,11 @@ Rao, Large sample tests of statistical hypotheses concerning several parameters,
 Philosophical Society 44(1), 1948. Sörbom, Model modification, Psychometrika 54(3), 1989.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from dynamics import DynamicsError
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, with_causes
-from identify.estimation.output_error import OutputErrorProblem
-from identify.runtime import in_threads
 
 HIDDEN = 1e-5
 """Share of a column's length below which nothing is left of it beside the parameters.
@@ -36,101 +31,6 @@ Differences of runs that stick and slip are not more exact.
 
 DEPENDENT = 1e-3
 """Smallest share of the largest singular value for which directions of a group count as several."""
-
-
-def residuals(problem: OutputErrorProblem, parameters: Array) -> Array:
-    """Return all residuals (m,): of what is known beside the poses, then of each run.
-
-    Raises LoopFailure if the model is unstable.
-    """
-    known, _ = problem.known(parameters)
-    return np.concatenate([known, *(run.misses(parameters).ravel() for run in problem.runs)])
-
-
-def parameter_columns(problem: OutputErrorProblem, parameters: Array) -> tuple[Array, Array]:
-    """Return `residuals` (m,) and their derivatives (m, p) with respect to the parameters.
-
-    Raises LoopFailure if the model is unstable.
-    """
-    known, known_rows = problem.known(parameters)
-    parts = [known]
-    rows = [known_rows]
-    for run in problem.runs:
-        missed, shown = run.shown_residuals(parameters)
-        parts.append(missed.ravel())
-        rows.append(run.of_all(shown).reshape(missed.size, -1))
-    return np.concatenate(parts), np.vstack(rows)
-
-
-def allowed(problem: OutputErrorProblem, parameters: Array) -> Array:
-    """Return parameters (p,) that a problem's law of the drives allows, raised where it must be."""
-    bounds = problem.bounds
-    above = np.isin(bounds.layout.names, problem.guess.above_zero)
-    return np.where(above, np.maximum(parameters, bounds.lower), parameters)
-
-
-def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) -> list[Array | None]:
-    """Return the `residuals` (m,) of each problem, None where its model is unstable."""
-
-    def of(problem: OutputErrorProblem) -> Array | None:
-        try:
-            return residuals(problem, allowed(problem, parameters))
-        except DynamicsError:
-            return None
-
-    return in_threads(of, problems)
-
-
-def cause_columns(
-    problem: OutputErrorProblem, parameters: Array, causes: Sequence[Cause], sizes: Array
-) -> Array:
-    """Return derivatives (m, k) of `residuals` with respect to the sizes of causes, at sizes (k,).
-
-    A column is NaN where the model is unstable.
-    """
-    columns = np.zeros((len(residuals(problem, parameters)), len(causes)))
-    slow = [
-        place
-        for place, one in enumerate(causes)
-        # one that is there or not has no derivative, and one that is only tried none at nothing
-        if one.quick is None and one.step and (sizes[place] or not one.tried)
-    ]
-    for place, column in zip(
-        slow, _differences(problem, parameters, causes, sizes, slow), strict=True
-    ):
-        columns[:, place] = column
-    there = with_causes(problem, causes, sizes)
-    for quick in {one.quick[0] for one in causes if one.quick is not None}:
-        found = quick(there, parameters)
-        for place, one in enumerate(causes):
-            if one.quick is not None and one.quick[0] is quick:
-                columns[:, place] = found[:, one.quick[1]]
-    return columns
-
-
-def _differences(
-    problem: OutputErrorProblem,
-    parameters: Array,
-    causes: Sequence[Cause],
-    sizes: Array,
-    places: Sequence[int],
-) -> list[Array | float]:
-    """Return central differences (m,) for the causes at some places, one-sided at least sizes.
-
-    They are NaN where the model is unstable.
-    """
-    spans = [(max(-causes[k].step, causes[k].least - sizes[k]), causes[k].step) for k in places]
-    moves = np.eye(len(causes))[list(places)]
-    ends = [
-        with_causes(problem, causes, sizes + by * move)
-        for span, move in zip(spans, moves, strict=True)
-        for by in span
-    ]
-    found = each_residuals(ends, parameters)
-    return [
-        np.nan if less is None or more is None else (more - less) / (high - low)
-        for less, more, (low, high) in zip(found[::2], found[1::2], spans, strict=True)
-    ]
 
 
 @dataclass(frozen=True)
@@ -204,6 +104,10 @@ def score(columns: Array, residual: Array, lengths: Array) -> Score:
     count = len(left)
     if not shown.any():
         return Score(0.0, 0, np.zeros(count), columns[:, :0], np.zeros((count, 0)))
+    if count == 1:
+        alone = columns / left
+        fall = alone.T @ residual
+        return Score(float(fall @ fall), 1, -fall / left, alone, 1 / left[:, None])
     unit = columns[:, shown] / left[shown]
     directions, lasting, turned = np.linalg.svd(unit, full_matrices=False)
     kept = lasting > DEPENDENT * lasting[0]
@@ -212,34 +116,3 @@ def score(columns: Array, residual: Array, lengths: Array) -> Score:
     inverse = np.zeros((count, int(kept.sum())))
     inverse[shown] = (turned[kept].T / lasting[kept]) / left[shown][:, None]
     return Score(float(along @ along), int(kept.sum()), -inverse @ along, directions, inverse)
-
-
-def first_columns(
-    problem: OutputErrorProblem,
-    parameters: Array,
-    causes: Sequence[Cause],
-    beside: OrthogonalComplement,
-) -> tuple[tuple[Cause, ...], Array]:
-    """Return causes, and their columns (m, k) where none has a size.
-
-    A cause that is tried at some sizes has the difference to the largest gain there as its column,
-    by its size. It is returned with that size alone.
-    """
-    columns = cause_columns(problem, parameters, causes, np.zeros(len(causes)))
-    residual = residuals(problem, parameters)
-    left = beside.part(residual)
-    tried = [(place, size) for place, one in enumerate(causes) for size in one.tried]
-    ends = [causes[place].change(problem, size) for place, size in tried]
-    found = each_residuals(ends, parameters)
-    chosen = list(causes)
-    gains = np.zeros(len(causes))
-    for (place, size), there in zip(tried, found, strict=True):
-        if there is None:
-            continue
-        column = ((there - residual) / size)[:, None]
-        judged = score(beside.part(column), left, np.linalg.norm(column, axis=0))
-        if judged.sizes[0] > 0 and judged.statistic > gains[place]:
-            gains[place] = judged.statistic
-            columns[:, place] = column[:, 0]
-            chosen[place] = replace(causes[place], tried=(size,))
-    return tuple(chosen), columns

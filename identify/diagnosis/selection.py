@@ -12,9 +12,20 @@ from numpy.typing import NDArray
 
 from dynamics import DynamicsError
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause
+from identify.diagnosis.cause import Cause, with_causes
 from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.ranking import ALIKE, NEAR, Ranked, Rows, indistinguishable, misfit_of, rank
+from identify.diagnosis.linearisation import Linearisation, each_residuals, linearisation
+from identify.diagnosis.ranking import (
+    ALIKE,
+    EXACT,
+    NEAR,
+    Ranked,
+    Rows,
+    indistinguishable,
+    misfit_of,
+    rank,
+)
+from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -66,27 +77,121 @@ class Selection:
     after: Misfit
 
 
-def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -> Selection:
+@dataclass(frozen=True)
+class Asked:
+    """Causes as they are asked at an optimum, and their columns (m, k) there.
+
+    A cause that is tried at some sizes has the difference to the largest gain there as its column,
+    by its size. It is returned with that size alone.
+    """
+
+    causes: tuple[Cause, ...]
+    columns: Array
+
+
+def ask(
+    problem: OutputErrorProblem, point: Point, causes: Sequence[Cause], places: tuple[int, ...]
+) -> Asked:
+    """Return the causes at an optimum with those at some places fitted."""
+    sizes = np.zeros(len(causes))
+    sizes[list(places)] = point.sizes
+    asked = to_ask(causes, places)
+    columns = np.zeros((len(point.residual), len(causes)))
+    columns[:, list(places)] = point.columns
+    found = linearisation(problem, point.parameters, causes, sizes, asked)
+    columns[:, asked] = found.by_causes
+    return _tried(problem, point, causes, sizes, asked, columns)
+
+
+def ask_first(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    at_bound: NDArray[np.bool_],
+    causes: Sequence[Cause],
+) -> tuple[Point, Asked]:
+    """Return the optimum (p,) of a problem without any cause, and the causes there.
+
+    at_bound (p,): coordinates of the parameters that are held at their bounds. One run of the model
+    is differentiated for both.
+    """
+    sizes = np.zeros(len(causes))
+    asked = to_ask(causes, ())
+    found = linearisation(problem, parameters, causes, sizes, asked)
+    alone = replace(found, by_causes=found.by_causes[:, :0])
+    point = Point.of(problem, (), parameters, at_bound, sizes[:0], alone)
+    columns = np.zeros((len(found.residual), len(causes)))
+    columns[:, asked] = found.by_causes
+    return point, _tried(problem, point, causes, sizes, asked, columns)
+
+
+def to_ask(causes: Sequence[Cause], places: tuple[int, ...]) -> list[int]:
+    """Return the places of causes that can be asked beside those at other places.
+
+    A companion has no effect before its cause is there.
+    """
+    beside = [one.companion for one in causes if one.companion is not None]
+    return [
+        place
+        for place, one in enumerate(causes)
+        if place not in places and not any(one is companion for companion in beside)
+    ]
+
+
+def _tried(
+    problem: OutputErrorProblem,
+    point: Point,
+    causes: Sequence[Cause],
+    sizes: Array,
+    asked: Sequence[int],
+    columns: Array,
+) -> Asked:
+    """Return causes with columns (m, k), after those that are tried at some sizes.
+
+    sizes (k,): those at the optimum. asked: places of the causes that are asked.
+    """
+    chosen = list(causes)
+    left = point.beside_all.part(point.residual)
+    there = with_causes(problem, causes, sizes)
+    tried = [(place, size) for place in asked for size in causes[place].tried]
+    ends = [causes[place].change(there, size) for place, size in tried]
+    gains = np.zeros(len(causes))
+    for (place, size), end in zip(tried, each_residuals(ends, point.parameters), strict=True):
+        if end is None:
+            continue
+        column = ((end - point.residual) / size)[:, None]
+        judged = score(point.beside_all.part(column), left, np.linalg.norm(column, axis=0))
+        if judged.sizes[0] > 0 and judged.statistic > gains[place]:
+            gains[place] = judged.statistic
+            columns[:, place] = column[:, 0]
+            chosen[place] = replace(causes[place], tried=(size,))
+    return Asked(tuple(chosen), columns)
+
+
+def select(
+    problem: OutputErrorProblem, point: Point, causes: Sequence[Cause], asked: Asked
+) -> Selection:
     """Select the causes that explain the misfit of a problem at its optimum.
 
-    point: optimum with the columns of all causes, none of which has a size.
+    point: optimum without any cause. asked: causes there.
     """
     rows = Rows.of(problem, point.residual)
-    first = rank(causes, point.columns, point.residual, point.beside, rows)
-    nothing = replace(point, sizes=np.zeros(0), columns=point.columns[:, :0])
+    first = rank(asked.causes, asked.columns, point.residual, point.beside, rows)
     chosen: tuple[Selected, ...] = ()
     places: tuple[int, ...] = ()
-    now = nothing
+    now = point
     ranking = first
+    catalogue = tuple(causes)
+    fresh = True
     while len(chosen) < MOST and ranking and ranking[0].chance <= CHANCE:
-        # columns are those without any cause, and follow what was fitted only so far
-        if ranking[0].score.statistic < (1 - ALIKE**2) * (point.cost - now.cost):
+        # columns follow what was fitted only so far, and those that are not new less
+        followed = 1 - (EXACT if fresh else ALIKE) ** 2
+        if ranking[0].score.statistic < followed * (point.cost - now.cost):
             break
         alike = indistinguishable(ranking, rows, now.beside_all.part(now.residual))
         best = alike[0]
-        trial = _trial(problem, point, now, causes, places, best)
-        rival = _rival(causes, best, ranking)
-        other = rival and _trial(problem, point, now, causes, places, rival)
+        trial = _trial(problem, now, asked, places, best)
+        rival = _rival(asked.causes, best, ranking)
+        other = rival and _trial(problem, now, asked, places, rival)
         if rival and other and (trial is None or other.point.cost < trial.point.cost - NEAR):
             # fitted, the two can be told apart
             trial = other
@@ -99,14 +204,28 @@ def select(problem: OutputErrorProblem, point: Point, causes: Sequence[Cause]) -
         places = trial.places
         chosen = _of_places((*chosen, one), places)
         now = trial.point
+        catalogue = _with_fitted(catalogue, places, now.causes)
+        fresh = misfit_of(rows, now.residual).significant
+        if fresh:
+            asked = ask(problem, now, catalogue, places)
+        else:
+            asked = replace(asked, causes=_with_fitted(asked.causes, places, now.causes))
         ranking = tuple(
             one
-            for one in rank(causes, point.columns, now.residual, now.beside_all, rows)
+            for one in rank(asked.causes, asked.columns, now.residual, now.beside_all, rows)
             if not set(one.candidate.places) <= set(places)
             and not _excluded(causes, one.candidate.places, places)
         )
     before, after = (misfit_of(rows, one.residual) for one in (point, now))
     return Selection(chosen, places, now, first, before, after)
+
+
+def _with_fitted(
+    causes: Sequence[Cause], places: tuple[int, ...], fitted: Sequence[Cause]
+) -> tuple[Cause, ...]:
+    """Return causes, those at some places as they were fitted."""
+    known = dict(zip(places, fitted, strict=True))
+    return tuple(known.get(place, one) for place, one in enumerate(causes))
 
 
 @dataclass(frozen=True)
@@ -123,30 +242,30 @@ class FittedCandidate:
 
 
 def _trial(
-    problem: OutputErrorProblem,
-    first: Point,
-    now: Point,
-    causes: Sequence[Cause],
-    places: tuple[int, ...],
-    best: Ranked,
+    problem: OutputErrorProblem, now: Point, asked: Asked, places: tuple[int, ...], best: Ranked
 ) -> FittedCandidate | None:
     """Fit a candidate beside the causes at some places, or return None where that does not help.
 
-    first: optimum without any cause, with the columns of all. now: optimum with those at places.
+    now: optimum with those at places. asked: causes there.
     """
+    causes = asked.causes
     # a group may be asked after one of its members
     new = [k for k, place in enumerate(best.candidate.places) if place not in places]
     own = tuple(best.candidate.places[k] for k in new)
     beside = companions(causes, own)
     added = (*own, *beside)
-    # a column that was tried at a size is exact there
-    starts = [
-        causes[place].tried[:1] or best.score.sizes[[k]] for k, place in zip(new, own, strict=True)
-    ]
-    sizes = np.concatenate([now.sizes, *starts, np.zeros(len(beside))])
-    columns = np.hstack([now.columns, first.columns[:, added]])
+    none = np.zeros(len(beside))
+    tried = [causes[place].tried[0] if causes[place].tried else 0.0 for place in own]
+    sizes = np.concatenate([now.sizes, tried, none])
+    expected = np.concatenate([now.sizes, best.score.sizes[new], none])
+    linear = None
+    if not any(tried):
+        linear = replace(now.linear, by_causes=np.hstack([now.columns, asked.columns[:, added]]))
     try:
-        kept, point = _fitted(problem, now.parameters, causes, (*places, *added), sizes, columns)
+        held = np.isin(np.arange(len(sizes)), len(now.sizes) + np.flatnonzero(tried))
+        kept, point = _fitted(
+            problem, now.parameters, causes, (*places, *added), sizes, expected, held, linear
+        )
     except DynamicsError:
         # the model with the cause does not run
         return None
@@ -187,21 +306,25 @@ def _fitted(
     causes: Sequence[Cause],
     places: tuple[int, ...],
     sizes: Array,
-    columns: Array,
+    expected: Array,
+    held: NDArray[np.bool_],
+    linear: Linearisation | None,
 ) -> tuple[tuple[int, ...], Point]:
     """Fit causes, and again without those that chance explains; return the places of the others.
 
     places (k,): those of the causes in the catalogue. Raises LoopFailure if the model is unstable.
     """
-    point = fit(problem, parameters, tuple(causes[place] for place in places), sizes, columns)
+    own = [causes[place] for place in places]
+    point = fit(problem, parameters, own, sizes, expected, held, linear)
     kept = shown_sizes(point)
-    if kept.all() or not kept.any():
-        return tuple(np.array(places)[kept].tolist()), point
     left = tuple(np.array(places)[kept].tolist())
+    if kept.all() or not kept.any():
+        return left, point
     # those that are left may be explained by others of them
-    return _fitted(
-        problem, point.parameters, causes, left, point.sizes[kept], point.columns[:, kept]
-    )
+    sizes = point.sizes[kept]
+    free = np.zeros(len(left), dtype=bool)
+    fitted = _with_fitted(causes, places, point.causes)
+    return _fitted(problem, point.parameters, fitted, left, sizes, sizes, free, None)
 
 
 def shown_sizes(point: Point) -> NDArray[np.bool_]:

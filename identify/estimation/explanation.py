@@ -122,14 +122,15 @@ def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.
     residuals (n, 6) and jacobian (n, 6, p) are of the good frames, `ok` (N,). Lost frames have no
     residual, and add nothing.
     """
+    return score_covariance(spectral_density(residuals, ok), jacobian, ok)
+
+
+def spectral_density(residuals: Array, ok: NDArray[np.bool_]) -> Array:
+    """Return the spectral density (f, 6, 6) of residuals (n, 6) of the good frames, `ok` (N,)."""
     count = len(ok)
-    size = jacobian.shape[2]
     rows = np.zeros((count, 6))
-    slopes = np.zeros((count, 6, size))
     rows[ok] = residuals
-    slopes[ok] = jacobian
-    # Zero padding to twice the length makes the circular correlation a linear correlation.
-    length = next_fast_len(2 * count, real=True)
+    length = _padded(count)
     spectrum = rfft(rows, length, axis=0)
     correlations = (
         irfft(spectrum[:, :, None] * spectrum[:, None, :].conj(), length, axis=0) / ok.sum()
@@ -137,13 +138,28 @@ def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.
     lags = np.minimum(np.arange(length), length - np.arange(length))
     # A triangular window makes the sum positive semidefinite.
     fading = np.maximum(1 - lags / (REACH * count), 0.0)
-    density = rfft(correlations * fading[:, None, None], axis=0)
+    return np.asarray(rfft(correlations * fading[:, None, None], axis=0))
+
+
+def score_covariance(density: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
+    """Return the covariance (p, p) of J^T r for residuals of a spectral density (f, 6, 6)."""
+    slopes = np.zeros((len(ok), *jacobian.shape[1:]))
+    slopes[ok] = jacobian
+    length = _padded(len(ok))
     seen = rfft(slopes, length, axis=0)
     weighted = np.einsum("fij,fjb->fib", density, seen)
     # Doubling accounts for the negative frequencies, which zero and Nyquist do not have.
     weighted[1 : (length + 1) // 2] *= 2
     total = np.tensordot(seen.conj(), weighted, axes=([0, 1], [0, 1])).real / length
     return np.asarray((total + total.T) / 2, dtype=float)
+
+
+def _padded(count: int) -> int:
+    """Return the length of the transforms of a number of frames.
+
+    Zero padding to twice the length makes the circular correlation a linear correlation.
+    """
+    return int(next_fast_len(2 * count, real=True))
 
 
 LAGS = 10

@@ -76,27 +76,28 @@ def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def _regressor_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the regressor (6, r) of a geometry with full bodies, as a CasADi function."""
+    """Return the regressor (6, r) of a geometry whose bodies are all full, as a CasADi function."""
     given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
-    return function("regressor", given, [rigid_body_regressor(geometry, *given)])
+    full = replace(geometry, full_bodies=("all",))
+    return function("regressor", given, [rigid_body_regressor(full, *given)])
 
 
 def full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
     """Return the regressor (N, 6, r) of full bodies along a motion."""
-    regressor = _regressor_function(replace(geometry, full_bodies=("all",)))
+    regressor = _regressor_function(geometry)
     found = regressor(motion.poses.T, motion.twists.T, motion.twist_dots.T).full()
     return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
 def passive_columns(geometry: RobotGeometry, motion: RunMotion) -> Array:
     """Return the wrenches (N, 6, k) of all parameters of passive friction along a motion."""
-    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
-    found = _passive_function(whole)(motion.poses.T, motion.twists.T).full()
+    found = _passive_function(geometry)(motion.poses.T, motion.twists.T).full()
     return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
 @lru_cache(maxsize=8)
 def _passive_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the wrenches (6, k) of passive friction of a geometry, as a CasADi function."""
+    """Return the wrenches (6, k) of all passive friction of a geometry, as a CasADi function."""
     given = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
-    return function("passive_friction", given, [passive_friction_columns(geometry, *given)])
+    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
+    return function("passive_friction", given, [passive_friction_columns(whole, *given)])

@@ -20,10 +20,10 @@ from identify.arrays import Array
 def equivalent_commands(
     torques: Array, latencies: Array, law: JointLaw, timing: FrameTiming
 ) -> Array:
-    """Return the changes (N, n), rad or m, of commands for which drives add torques (N, n).
+    """Return the changes (N, ..., n), rad or m, of commands for which drives add torques.
 
-    The torques, N m or N, are those at the frames. latencies (N,): time, s, from each frame to the
-    start of the action of its command. Before the first command there is no torque.
+    The torques (N, ..., n), N m or N, are those at the frames. latencies (N,): time, s, from each
+    frame to the start of the action of its command. Before the first command there is no torque.
     """
     period = 1.0 / timing.frame_rate_hz
     ramp = timing.hold == "linear"
@@ -31,8 +31,8 @@ def equivalent_commands(
     stiffness = law.lp + by_rate + law.li * period / 2
     needed = _while_commands_act(torques, latencies, timing)
     commands = np.zeros_like(torques)
-    integral = np.zeros(torques.shape[1])
-    before = np.zeros(torques.shape[1])
+    integral = np.zeros(torques.shape[1:])
+    before = np.zeros(torques.shape[1:])
     for k, torque in enumerate(needed):
         held = by_rate * before - law.li * (integral + ramp * period * before / 2)
         commands[k] = (torque + held) / stiffness
@@ -44,7 +44,7 @@ def equivalent_commands(
 
 
 def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
-    """Return values (N, n) of the frames for the time in which the command of each frame acts.
+    """Return values (N, ...) of the frames for the time in which the command of each frame acts.
 
     It is their mean for a held command, and the value at the end of a ramp.
     """
@@ -57,7 +57,7 @@ def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) ->
     if timing.hold == "linear":
         return np.asarray(spline(end))
     so_far = spline.antiderivative()
-    lasting = (end - begin)[:, None]
+    lasting = (end - begin).reshape(-1, *(1 for _ in values.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = (so_far(end) - so_far(begin)) / lasting
     return np.where(lasting > 0, mean, spline(end))

@@ -98,10 +98,7 @@ class LoopModel:
         return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return a copy of the model that contains these common errors (k,).
-
-        The errors are in standard deviations. They are limited so that the loop is possible.
-        """
+        """Return a copy with common errors (k,), in standard deviations, that a loop can have."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         return replace(self, drawn=contained, marginal=None)
 
@@ -247,13 +244,16 @@ class LoopModel:
         returned in place of the run.
         """
         sensed = np.asarray(self._sensed(noises))
-        given = *self._moving(parameters, self.robot), self.reference, self._loop
         if self.driven:
-            return repeat_commands(
-                *given, self._commands(parameters), sensed, latencies=self.latencies
-            )
+            return repeat_commands(*self.commanded(parameters), sensed, latencies=self.latencies)
+        given = *self._moving(parameters, self.robot), self.reference, self._loop
         fed = fed_forward(self, *given)
         return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies, **fed)
+
+    def commanded(self, parameters: Array) -> tuple[Robot, Array, Reference, LoopSettings, Array]:
+        """Return what a run under the logged commands takes, for parameters (p,)."""
+        moving = self._moving(parameters, self.robot)
+        return *moving, self.reference, self._loop, self._commands(parameters)
 
     def drive_law(self, parameters: Array) -> JointLaw:
         """Return the law of the drives with its gains among parameters (p,)."""
@@ -313,7 +313,7 @@ class LoopModel:
         With `ahead`, the run also computes the sensitivities that `shown_residuals` will need.
         Raises LoopFailure if the model is unstable.
         """
-        return self.without_common(self._missed(self._latest_run(parameters, sensitivities=ahead)))
+        return self.without_common(self.missed(self._latest_run(parameters, sensitivities=ahead)))
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
@@ -356,9 +356,9 @@ class LoopModel:
         run = self._latest_run(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         shown = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self._missed(run), shown
+        return self.missed(run), shown
 
-    def _missed(self, run: ClosedLoopRun) -> Array:
+    def missed(self, run: ClosedLoopRun) -> Array:
         """Return the residuals (n, 6) of a run of the model, whitened by the noise alone.
 
         The part due to the common errors in the model is subtracted.

@@ -47,26 +47,20 @@ class UnequalGains(LoopModel):
         run = super().simulate(parameters, sensitivities, robot, noise)
         if run.pose_sensitivity is None:
             return run
-        others, by_gains = self._split(run.pose_sensitivity)
-        # a shared gain changes the gains of all joints by the same amount
-        shared = np.concatenate([others, by_gains.sum(axis=2)], axis=2)
+        shared, _ = self.by_gains(run.pose_sensitivity)
         return replace(run, pose_sensitivity=shared)
 
-    def by_gains(self, parameters: Array) -> Array:
-        """Return derivatives (N, 6, n, 3) of the poses with respect to the gains of each joint.
+    def by_gains(self, sensitivity: Array) -> tuple[Array, Array]:
+        """Return the derivatives by parameters with shared gains, and by the gains of each joint.
 
-        Raises LoopFailure if the model is unstable.
+        They are (N, 6, k) and (N, 6, n, 3). sensitivity: by the gains of each joint.
         """
-        run = super().simulate(parameters, sensitivities=True)
-        assert run.pose_sensitivity is not None
-        return self._split(run.pose_sensitivity)[1]
-
-    def _split(self, sensitivity: Array) -> tuple[Array, Array]:
-        """Return derivatives (N, 6, q) by all parameters but gains, and by gains (N, 6, n, 3)."""
         gains = self.robot.layout.joints * len(JOINT_PID)
         rows = sensitivity.shape[:2]
         by_gains = sensitivity[:, :, -gains:].reshape(*rows, -1, len(JOINT_PID))
-        return sensitivity[:, :, :-gains], by_gains
+        # a shared gain changes the gains of all joints by the same amount
+        shared = [sensitivity[:, :, :-gains], by_gains.sum(axis=2)]
+        return np.concatenate(shared, axis=2), by_gains
 
 
 def with_unequal_gains(run: LoopModel, differences: Array) -> UnequalGains:

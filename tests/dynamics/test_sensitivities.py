@@ -8,6 +8,7 @@ import pytest
 
 from dynamics import closed_loop
 from dynamics.closed_loop import FrictionLaw
+from dynamics.errors import SimulationError
 from tests.dynamics.conftest import RECORDS
 
 LATE = {"latency_s": 1.3 / 60, "hold": "linear"}
@@ -242,3 +243,41 @@ def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, t
             if misses[-1] <= 1e-6:
                 break
         assert min(misses) <= 1e-6, (move, change, misses)
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_a_run_is_differentiated_along_directions_of_its_commands(loop, hold):
+    """The derivatives are differences of runs, and those by the parameters stay as they are."""
+    settings = loop.settings(latency_s=1.3 / 60, hold=hold)
+    commands = loop.run(loop.reference(45), settings).command
+    directions = np.random.default_rng(2).standard_normal((45, 6, 3))
+    run = loop.run(45, settings, commands=commands, sensitivities=True, directions=directions)
+    plain = loop.run(45, settings, commands=commands, sensitivities=True)
+    np.testing.assert_array_equal(run.pose_sensitivity, plain.pose_sensitivity)
+    for k in range(3):
+        step = 1e-7 / np.abs(run.command_sensitivity[:, :, k]).max()
+        ends = {
+            n: loop.run(45, settings, commands=commands + n * step * directions[:, :, k]).pose
+            for n in (-2, -1, 1, 2)
+        }
+        np.testing.assert_allclose(
+            run.command_sensitivity[:, :, k],
+            _central(ends, step),
+            atol=1e-6 * np.abs(run.command_sensitivity[:, :, k]).max(),
+        )
+
+
+def test_directions_that_do_not_fit_are_refused_with_their_number(loop):
+    most = closed_loop.most_directions(loop.robot)
+    given = {"commands": np.zeros((5, 6)), "sensitivities": True}
+    with pytest.raises(SimulationError, match=f"{most + 1} directions .* at most {most} fit"):
+        loop.run(5, directions=np.zeros((5, 6, most + 1)), **given)
+    with pytest.raises(SimulationError, match=r"directions.*shape \(5, 6, 2\)"):
+        loop.run(5, directions=np.zeros((4, 6, 2)), **given)
+    with pytest.raises(SimulationError, match="at most 0 fit"):
+        loop.run(
+            5,
+            commands=np.zeros((5, 6)),
+            start_sensitivities=True,
+            directions=np.zeros((5, 6, 1)),
+        )

@@ -21,6 +21,7 @@ from identify.studies.gauntlet_table import cases_of, shares
 from identify.studies.rows import KINDS
 from identify.studies.rows.gauntlet import case as case_module
 from identify.studies.rows.gauntlet import row as row_module
+from identify.studies.rows.gauntlet.bodies import possible_moments
 from identify.studies.rows.gauntlet.case import (
     Case,
     drawn,
@@ -30,10 +31,9 @@ from identify.studies.rows.gauntlet.case import (
     run_case,
 )
 from identify.studies.rows.gauntlet.catalogue import INSIDE, OUTSIDE, TROUBLES, drawn_troubles
-from identify.studies.rows.gauntlet.mechanical import possible_moments
 from identify.studies.rows.gauntlet.play import PlantWithPlay
 from identify.studies.rows.gauntlet.trouble import Trouble
-from identify.studies.rows.gauntlet.typed import stated, typed
+from identify.studies.rows.gauntlet.typed import typed
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge
 from tests.identify.commands import command, one_line, refusal
 
@@ -137,8 +137,9 @@ def test_settings_are_typed_as_the_remedy_says_and_the_last_one_stands():
                 "--set model.stribeck_velocity_rad_s=0.05",
                 "and --set model.stribeck_velocity_rad_s=0.04 in place of that",
                 "--set model.drive=cascade, or --set model.drive=auto",
-                "--set 'model.inertia={ platform = \"full\" }'",
-                "--set 'model.inertia={ link = \"full\" }'",
+                "--set model.inertia.platform=full",
+                "--set model.inertia.link=full",
+                "--set 'model.passive_friction=[\"link_joint.viscous\"]'",
             ]
         )
     )
@@ -147,11 +148,11 @@ def test_settings_are_typed_as_the_remedy_says_and_the_last_one_stands():
         "model.static_ratio": 1.2,
         "model.stribeck_velocity_rad_s": 0.04,
         "model.drive": "cascade",
-        "model.inertia": {"platform": "full", "link": "full"},
+        "model.inertia.platform": "full",
+        "model.inertia.link": "full",
+        "model.passive_friction": ["link_joint.viscous"],
     }
     assert typed(finding(remedies=["change leg1.crank_length by 1e-4 m"])).mended
-    limit = stated(finding(remedies=["state control.torque_limit_N_m = 2.5 with the record: so"]))
-    assert limit.settings == {"control.torque_limit_N_m": 2.5}
 
 
 @pytest.mark.parametrize("kind", [*INSIDE, *OUTSIDE])

@@ -78,7 +78,7 @@ def test_a_centre_of_mass_off_the_joint_plane_is_named_with_its_height(height):
     first = found.findings[0]
     assert first.name == "centre of mass of the platform, z"
     assert abs(first.sizes[0].value - height) < 3 * first.sizes[0].std
-    assert first.remedies == ("--set 'model.inertia={ platform = \"full\" }'",)
+    assert first.remedies == ("--set model.inertia.platform=full, or state a load that is on it",)
     assert not found.none_of_these
 
 

@@ -21,6 +21,7 @@ from identify.setup import Setup
 from identify.studies.rows.coverage import intervals_hold
 from identify.studies.rows.gauntlet.catalogue import Wrong, drawn_troubles
 from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble
+from identify.studies.rows.gauntlet.typed import typed
 from identify.studies.rows.identified import designed_trajectories, row_setup
 from identify.studies.rows.kind import robot_named
 from identify.studies.rows.row_sensor import DrawnSensor
@@ -135,6 +136,13 @@ def run_case(case: Drawn) -> Case:
         trouble.remedy(found.findings[place - 1]) if place else Remedied()
         for trouble, (place, _) in zip(case.troubles, places, strict=True)
     ]
+    named = {place for place, _ in places}
+    # a laboratory cannot know which findings are right, and types what the others say, too
+    remedies += [
+        Remedied(typed(one).settings)
+        for place, one in enumerate(found.findings, start=1)
+        if place not in named
+    ]
     before = intervals_hold(result, made.plant)
     after = before
     explained = result.explained
@@ -203,10 +211,13 @@ def recorded(
 
 
 def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[bool, ...], bool]:
-    """Return which intervals hold after the remedies of a case's troubles, as `Case` does, and
-    whether noise explains what is left.
+    """Return which intervals hold after remedies, as `Case` does, and whether noise explains what
+    is left.
+
+    remedies: those of the case's troubles, in their order, then those of other findings.
     """
-    left = [one for one, by in zip(case.troubles, remedies, strict=True) if not by.mended]
+    pairs = zip(case.troubles, remedies, strict=False)
+    left = [one for one, by in pairs if not by.mended]
     settings = {key: value for one in remedies for key, value in one.settings.items()}
     made = case.made
     try:

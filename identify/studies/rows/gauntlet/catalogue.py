@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from identify.studies.rows.gauntlet import measured, mechanical
+from identify.studies.rows.gauntlet import bodies, measured, mechanical
 from identify.studies.rows.gauntlet.trouble import Draw, Laboratory, Trouble
 
 INSIDE: dict[str, Draw] = {
@@ -19,14 +19,22 @@ INSIDE: dict[str, Draw] = {
     "static friction": mechanical.static_friction,
     "smooth friction": mechanical.smooth_friction,
     "elastic joints": mechanical.springs,
-    "centre of mass": mechanical.centre_of_mass,
-    "products of inertia": mechanical.products_of_inertia,
+    "centre of mass": bodies.centre_of_mass,
+    "products of inertia": bodies.products_of_inertia,
     "gross errors": measured.gross_errors,
     "stated noise": measured.stated_noise,
+    "several numbers of the geometry": mechanical.numbers,
+    "passive friction": mechanical.passive_friction,
+    "centre of mass in the legs": bodies.centre_of_leg_bodies,
+    "load that is not stated": bodies.load,
+    "cameras": measured.cameras,
 }
 """Kinds of trouble that the diagnosis has causes for."""
 
-OUTSIDE: dict[str, Draw] = {"backlash": mechanical.backlash}
+OUTSIDE: dict[str, Draw] = {
+    "backlash": mechanical.backlash,
+    "steps of commands": mechanical.quantised,
+}
 """Kinds of trouble outside the catalogue of the diagnosis."""
 
 TROUBLES: tuple[str, ...] = (*INSIDE, *OUTSIDE)

@@ -7,7 +7,9 @@ import numpy as np
 import xarray as xr
 
 from identify.diagnosis.diagnosis import Finding
+from identify.diagnosis.measurement_causes import KINDS
 from identify.record.conditions import COMMAND_TIME
+from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.studies.rows.gauntlet.late import late_plant
 from identify.studies.rows.gauntlet.trouble import (
     Laboratory,
@@ -23,6 +25,9 @@ LATENCY_STD_S = 1e-3
 
 It is so large that the record itself determines the latency.
 """
+
+SCALE_STD = 1e-4
+"""Standard deviation of the scale of the cameras that a record states."""
 
 MOST_FRAMES = 4
 """Largest number of frames with gross errors."""
@@ -156,6 +161,31 @@ def gross_errors(lab: Laboratory, rng: np.random.Generator) -> Trouble:
         groups=("gross errors",),
         record=spoilt,
         remedy=remedy,
+    )
+
+
+def cameras(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw cameras whose scale is off by more than their calibration states."""
+    size = sign(rng) * log_uniform(rng, 1e-3, 5e-3)
+    name = "rig.scale_1"
+
+    def scaled(record: xr.Dataset) -> xr.Dataset:
+        position = record["measured_position"]
+        changes = np.zeros((len(position), 6, 1))
+        changes[:, :3, 0] = position.values - np.nanmean(position.values, axis=0)
+        off = position.values + size * changes[:, :3, 0]
+        record = record.assign(measured_position=(position.dims, off))
+        stated = np.array([[SCALE_STD**2]])
+        store_common_errors(record, CommonErrors((name,), np.nan_to_num(changes), stated))
+        return record
+
+    return Trouble(
+        kind="cameras",
+        size=size,
+        unit="1",
+        groups=(KINDS["rig"],),
+        cause=f"error {name}",
+        record=scaled,
     )
 
 

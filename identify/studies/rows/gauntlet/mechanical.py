@@ -1,4 +1,4 @@
-"""Troubles in the plant: geometry, springs, bodies, friction, limits and laws of the drives."""
+"""Troubles in the plant: geometry, springs, friction, limits and laws of the drives."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,18 +6,31 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.geometry import RobotGeometry
-from identify.arrays import Array
+from dynamics.parameters import passive_parameters
+from identify.diagnosis.body_causes import PASSIVE_GROUP, passive_words
 from identify.diagnosis.geometry_causes import GROUPS, ZEROS
 from identify.experiment.plant import Plant
 from identify.studies.rows.gauntlet.play import PlantWithPlay
-from identify.studies.rows.gauntlet.trouble import Laboratory, Trouble, log_uniform, sign
-from identify.studies.rows.gauntlet.typed import stated, typed
+from identify.studies.rows.gauntlet.trouble import (
+    Laboratory,
+    Remedied,
+    Trouble,
+    log_uniform,
+    sign,
+)
+from identify.studies.rows.gauntlet.typed import typed
 
 ZERO = {"rad": (2e-4, 1.5e-3), "m": (5e-5, 5e-4)}
 """Smallest and largest error of a zero, by the unit of the joints."""
 
 NUMBER = {"rad": (1e-3, 8e-3), "m": (1e-4, 8e-4)}
 """Smallest and largest error of another number of the geometry, by unit."""
+
+STEP = {"rad": (3e-4, 2e-3), "m": (3e-5, 2e-4)}
+"""Smallest and largest step of commands, by the unit of the joints."""
+
+PASSIVE = {"viscous": (0.01, 0.05), "coulomb": (3e-3, 2e-2)}
+"""Smallest and largest friction of passive joints, N m s/rad or N m, by its law."""
 
 PLAY = {"rad": (5e-4, 3e-3), "m": (1e-4, 1e-3)}
 """Smallest and largest width of play, by the unit of the joints."""
@@ -71,6 +84,28 @@ def number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
         unit=unit,
         groups=(GROUPS.get(kind, kind.replace("_", " ")),),
         cause=words,
+        plant=_moved_by(lambda own: own.moved(deviations)),
+    )
+
+
+def numbers(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw several numbers of the geometry of one kind that are off, other than zeros."""
+    geometry = lab.robot.geometry
+    kinds: dict[str, list[int]] = {}
+    for place, name in enumerate(geometry.number_names):
+        number_of_leg = name.partition(".")[2]
+        if number_of_leg not in ZEROS:
+            kinds.setdefault(number_of_leg.partition(".")[0], []).append(place)
+    kind = str(rng.choice(sorted(kinds)))
+    count = int(rng.integers(3, min(8, len(kinds[kind])) + 1))
+    deviations = np.zeros(len(geometry.number_names))
+    for place in rng.choice(kinds[kind], size=count, replace=False):
+        deviations[place] = sign(rng) * log_uniform(rng, *NUMBER[geometry.number_units[place]])
+    return Trouble(
+        kind="several numbers of the geometry",
+        size=float(np.sqrt(np.mean(deviations[deviations != 0] ** 2))),
+        unit=geometry.number_units[kinds[kind][0]],
+        groups=(GROUPS.get(kind, kind.replace("_", " ")),),
         plant=_moved_by(lambda own: own.moved(deviations)),
     )
 
@@ -133,19 +168,36 @@ def _per_unit(lab: Laboratory) -> float:
     return 0.1 if lab.robot.layout.prismatic else 1.0
 
 
+def passive_friction(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw friction of one kind in the passive joints at one place of all legs."""
+    name = str(rng.choice(passive_parameters(lab.robot.geometry.legs)))
+    size = log_uniform(rng, *PASSIVE[name.partition(".")[2]])
+    return Trouble(
+        kind="passive friction",
+        size=size,
+        unit=lab.robot.layout.unit(name),
+        groups=(PASSIVE_GROUP,),
+        cause=passive_words(name),
+        settings={"plant.passive_friction": [name], "plant.values": {name: size}},
+        remedy=typed,
+    )
+
+
 def torque_limit(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw drives that cut the largest torques."""
     # the drives still hold the robot, and lack what the fastest motion needs
     limit = lab.holding + rng.uniform(0.75, 0.92) * (lab.peak - lab.holding)
     size = 1.0 - limit / lab.peak
     unit = lab.robot.layout.unit("joint1.coulomb").replace(" ", "_")
+    settings = {f"control.torque_limit_{unit}": float(limit)}
     return Trouble(
         kind="torque limit",
         size=size,
         unit="1",
         groups=("torque limit of the drives",),
-        settings={f"control.torque_limit_{unit}": float(limit)},
-        remedy=stated,
+        settings=settings,
+        # the drives say what it is, while the record shows it only in the model's scale
+        remedy=lambda finding: Remedied(settings),
     )
 
 
@@ -161,76 +213,6 @@ def cascade(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     )
 
 
-def centre_of_mass(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw a centre of mass of the platform that is off its frame's origin."""
-    size = log_uniform(rng, 8e-3, 4e-2)
-    direction = rng.standard_normal(3)
-    centre = size * direction / np.linalg.norm(direction)
-    mass, *moments = (_of_platform(lab, name) for name in ("mass", "Ixx", "Iyy", "Izz"))
-    return Trouble(
-        kind="centre of mass",
-        size=size,
-        unit="m",
-        groups=("centre of mass of the platform",),
-        settings={"plant.values": _platform(mass, centre, np.diag(possible_moments(moments)))},
-        remedy=typed,
-    )
-
-
-def products_of_inertia(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw principal axes of the platform that are turned in its frame."""
-    mass, *moments = (_of_platform(lab, name) for name in ("mass", "Ixx", "Iyy", "Izz"))
-    size = log_uniform(rng, 0.25, 0.6)
-    principal = np.diag(possible_moments(moments))
-    share = size * rng.uniform(-1.0, 1.0, 3)
-    mean = float(np.trace(principal)) / 3
-    products = np.zeros((3, 3))
-    products[[0, 0, 1], [1, 2, 2]] = mean * share
-    inertia = 1.2 * principal + products + products.T
-    return Trouble(
-        kind="products of inertia",
-        size=size,
-        unit="1",
-        groups=("products of inertia of the platform",),
-        settings={"plant.values": _platform(mass, np.zeros(3), _rigid(inertia))},
-        remedy=typed,
-    )
-
-
-def _of_platform(lab: Laboratory, name: str) -> float:
-    return float(lab.parameters[lab.robot.layout.names.index(f"platform.{name}")])
-
-
-def possible_moments(moments: list[float]) -> Array:
-    """Return moments (3,) of a body that exists, at least as large as those given.
-
-    The smaller two are raised until they exceed the largest one together by a tenth.
-    """
-    found = np.array(moments)
-    order = np.argsort(found)
-    smaller = order[:2]
-    found[smaller] *= max(1.0, 1.1 * found[order[2]] / found[smaller].sum())
-    return found
-
-
-def _rigid(inertia: Array) -> Array:
-    """Return an inertia (3, 3) that a body can have, near one that perhaps none can have."""
-    principal, axes = np.linalg.eigh(inertia)
-    return np.asarray(axes @ np.diag(possible_moments(principal.tolist())) @ axes.T)
-
-
-def _platform(mass: float, centre: Array, inertia: Array) -> dict[str, float]:
-    """Return the parameters of a platform with a centre of mass (3,) and an inertia (3, 3) there.
-
-    Parameters are about the origin of the platform's frame.
-    """
-    about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    first = dict(zip(("mcx", "mcy", "mcz"), mass * centre, strict=True))
-    places = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2)}
-    second = {name: about[place] for name, place in (places | {"Iyz": (1, 2)}).items()}
-    return {f"platform.{name}": float(value) for name, value in (first | second).items()}
-
-
 def backlash(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw play between commands and drives, of which the diagnosis has no cause."""
     unit = lab.robot.layout.joint_unit
@@ -242,6 +224,18 @@ def backlash(lab: Laboratory, rng: np.random.Generator) -> Trouble:
         groups=(),
         plant=lambda plant: PlantWithPlay(**vars(plant), width=size),
     )
+
+
+def quantised(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw drives that get their commands in steps, of which the diagnosis has no cause."""
+    unit = lab.robot.layout.joint_unit
+    size = log_uniform(rng, *STEP[unit])
+
+    def stepped(plant: Plant) -> Plant:
+        drives = replace(plant.settings.drives, command_step=size)
+        return replace(plant, settings=replace(plant.settings, drives=drives))
+
+    return Trouble(kind="steps of commands", size=size, unit=unit, groups=(), plant=stepped)
 
 
 def unequal_gains(lab: Laboratory, rng: np.random.Generator) -> Trouble:

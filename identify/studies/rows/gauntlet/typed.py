@@ -10,9 +10,6 @@ from identify.studies.rows.gauntlet.trouble import Remedied
 SETTING = re.compile(r"--set (?:'([^']+)'|(\S+))")
 """Setting in a remedy, as it would be typed, with or without quotes."""
 
-STATED = re.compile(r"\b([a-z_]+\.\w+) = ([-+.\de]*\d)")
-"""Setting in a remedy that is stated with the record."""
-
 
 def typed(finding: Finding) -> Remedied:
     """Set what the remedies of a finding say. Where one line names an alternative, the first.
@@ -25,23 +22,8 @@ def typed(finding: Finding) -> Remedied:
         line, *_ = remedy.partition(", or ")
         for quoted, plain in SETTING.findall(line):
             key, _, value = (quoted or plain).partition("=")
-            settings = settings | with_table(settings, key, _value(value))
+            settings[key] = _value(value)
     return Remedied(settings, mended=not settings)
-
-
-def stated(finding: Finding) -> Remedied:
-    """Set what the remedies of a finding want to have stated with the record."""
-    return Remedied(
-        {key: float(value) for text in finding.remedies for key, value in STATED.findall(text)}
-    )
-
-
-def with_table(settings: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return one setting. A table is merged with that of the same key among other settings."""
-    earlier = settings.get(key)
-    if isinstance(value, dict) and isinstance(earlier, dict):
-        return {key: earlier | value}
-    return {key: value}
 
 
 def _value(text: str) -> Any:

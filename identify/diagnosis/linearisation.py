@@ -1,0 +1,262 @@
+"""Linearisation of a problem with causes: residuals, and their columns by parameters and causes.
+
+One run of the model is differentiated with respect to the parameters and the gains of each joint,
+and along all directions of the commands that causes have. A torque that joints need beside those of
+the model is a direction, too (`identify.model.joint_torques`). So are the zeros of the joints.
+
+A robot with other geometric numbers moves under the same commands. Its column follows without a run
+of it. At the same joint coordinates the pose is off by what closes the loops, J_g. A run begins at
+the pose of rest, where the joints then are at other coordinates by d, and the drives take them from
+there to where the commands want them. That response is known from the zeros of the joints, whose
+columns Z have the same one: a joint whose zero is off by s begins at its command less s. So
+
+    column = J_g + (J_theta - Z) d,    d = -J_theta^-1 J_g at the first pose.
+
+What the changed lever arms do to the torques is left out.
+
+All other columns are differences of runs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics import DynamicsError
+from dynamics.closed_loop import ClosedLoopRun, differentiate_commands, most_directions
+from dynamics.closure import Closure
+from dynamics.parameters import JOINT_PID
+from identify.arrays import Array
+from identify.diagnosis.cause import (
+    Cause,
+    Effect,
+    OnCommands,
+    OnGain,
+    OnGeometry,
+    OnPoses,
+    OnTorques,
+    with_causes,
+)
+from identify.estimation.output_error import OutputErrorProblem
+from identify.model.joint_torques import equivalent_commands
+from identify.model.loop_model import LoopModel
+from identify.model.unequal_gains import UnequalGains, with_unequal_gains
+from identify.runtime import in_threads
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals (m,) of a problem, with their columns by parameters (m, p) and causes (m, k).
+
+    Rows of what is known beside the poses come first, then those of each run. The column of a cause
+    is NaN where the model with it is unstable, and zero where it has no derivative.
+    """
+
+    residual: Array
+    by_parameters: Array
+    by_causes: Array
+
+
+def linearisation(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    causes: Sequence[Cause],
+    sizes: Array,
+    asked: Sequence[int],
+    step: float = 1.0,
+) -> Linearisation:
+    """Return the linearisation of a problem with causes at parameters (p,) and sizes (k,).
+
+    asked: places of the causes whose columns are wanted. step: that of differences, in the causes'
+    own steps. Raises LoopFailure if the model is unstable.
+    """
+    there = with_causes(problem, causes, sizes)
+    known, known_rows = there.known(parameters)
+    residual = [known]
+    by_parameters = [known_rows]
+    by_causes = [np.zeros((len(known), len(asked)))]
+    effects = [causes[place].effect for place in asked]
+    for place, run in enumerate(there.runs):
+        missed, slopes, columns = _of_run(run, place, parameters, effects)
+        residual.append(missed.ravel())
+        by_parameters.append(slopes)
+        by_causes.append(columns)
+    found = Linearisation(np.concatenate(residual), np.vstack(by_parameters), np.vstack(by_causes))
+    slow = [
+        k
+        for k, place in enumerate(asked)
+        # one that is only tried has no derivative at nothing
+        if causes[place].differentiable and (sizes[place] or not causes[place].tried)
+    ]
+    places = [asked[k] for k in slow]
+    differences = _differences(problem, parameters, causes, sizes, places, step, found.residual)
+    for k, column in zip(slow, differences, strict=True):
+        found.by_causes[:, k] = column
+    return found
+
+
+def _of_run(
+    run: LoopModel, place: int, parameters: Array, effects: Sequence[Effect | None]
+) -> tuple[Array, Array, Array]:
+    """Return residuals (n, 6) of a run, and their columns (6 n, p) and (6 n, k).
+
+    place: that of the run. effects: those of the k causes.
+    """
+    joints = run.robot.layout.joints
+    geometric = [k for k, one in enumerate(effects) if isinstance(one, OnGeometry)]
+    gains = [k for k, one in enumerate(effects) if isinstance(one, OnGain)]
+    driven, directions = _directions(run, place, parameters, effects)
+    if geometric:
+        zeros = np.broadcast_to(np.eye(joints), (len(run.logged), joints, joints))
+        directions = np.concatenate([directions, zeros], axis=2)
+    model = with_unequal_gains(run, np.zeros((joints, len(JOINT_PID)))) if gains else run
+    found, by_commands = _differentiated(model, parameters, directions)
+    sensitivity = found.pose_sensitivity
+    assert sensitivity is not None
+    changes = np.zeros((*found.pose.shape, len(effects)))
+    if isinstance(model, UnequalGains):
+        sensitivity, by_gains = model.by_gains(sensitivity)
+        for k in gains:
+            one = effects[k]
+            assert isinstance(one, OnGain)
+            changes[:, :, k] = by_gains[:, :, one.joint, one.kind]
+    changes[:, :, driven] = by_commands[:, :, : len(driven)]
+    if geometric:
+        by_numbers = geometry_changes(run, found.pose, by_commands[:, :, len(driven) :])
+        deviations = [one.deviations for one in effects if isinstance(one, OnGeometry)]
+        changes[:, :, geometric] = by_numbers @ np.stack(deviations, axis=1)
+    for k, one in enumerate(effects):
+        if isinstance(one, OnPoses):
+            changes[:, :, k] = one.changes(run, place)
+    rows = np.concatenate([sensitivity, changes], axis=2)[run.ok]
+    shown = sensitivity.shape[2]
+    white = run.without_common(np.asarray(run.whitener @ rows))
+    slopes = run.of_all(white[:, :, :shown])
+    missed = run.without_common(run.missed(found))
+    return missed, slopes.reshape(missed.size, -1), white[:, :, shown:].reshape(missed.size, -1)
+
+
+def _directions(
+    run: LoopModel, place: int, parameters: Array, effects: Sequence[Effect | None]
+) -> tuple[list[int], Array]:
+    """Return the places of effects on commands and torques, and their directions (N, n, k)."""
+    commands = {k: one for k, one in enumerate(effects) if isinstance(one, OnCommands)}
+    torques = {k: one for k, one in enumerate(effects) if isinstance(one, OnTorques)}
+    parts = [np.zeros((*run.logged.shape, 0))]
+    if commands:
+        parts.append(np.stack([one.changes(run, place) for one in commands.values()], axis=2))
+    if torques:
+        needed = np.stack([one.torques[place] for one in torques.values()], axis=1)
+        late = run.stated_latencies if run.latencies is None else run.latencies
+        law = run.drive_law(parameters)
+        added = equivalent_commands(needed, late, law, run.settings.timing)
+        parts.append(-added.transpose(0, 2, 1))
+    return [*commands, *torques], np.concatenate(parts, axis=2)
+
+
+def _differentiated(
+    run: LoopModel, parameters: Array, directions: Array
+) -> tuple[ClosedLoopRun, Array]:
+    """Return a run with sensitivities, and the derivatives (N, 6, k) along directions (N, n, k)."""
+    own = run.robot.with_own_gains() if isinstance(run, UnequalGains) else run.robot
+    room = most_directions(own, run.groups)
+    count = directions.shape[2]
+    ends = range(room, count, room)
+    known = run.commanded(parameters)
+    late = run.latencies
+    runs = [
+        differentiate_commands(*known, latencies=late, groups=run.groups, directions=part)
+        for part in np.split(directions, ends, axis=2)
+    ]
+    found = [one.command_sensitivity for one in runs if one.command_sensitivity is not None]
+    none = np.zeros((*runs[0].pose.shape, 0))
+    return runs[0], np.concatenate([none, *found], axis=2)
+
+
+def geometry_changes(run: LoopModel, poses: Array, by_zeros: Array) -> Array:
+    """Return derivatives (N, 6, g) of a run's poses (N, 6) with respect to the geometric numbers.
+
+    by_zeros (N, 6, n): derivatives with respect to the zeros of the joints.
+    """
+    robot = run.robot
+    chart = robot.geometry.chart
+    nominal = robot.functions_of
+    poses = chart.pose(chart.coordinates(poses))
+    by_numbers, by_joints = (
+        chart.lifted(part, axis=1)
+        for part in Closure(nominal).derivatives(
+            poses, robot.inverse_kinematics(poses), robot.geometry.deviations_from(nominal)
+        )
+    )
+    begin = -np.linalg.pinv(by_joints[0]) @ by_numbers[0]
+    return np.asarray(by_numbers + (by_joints - by_zeros) @ begin)
+
+
+def _differences(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    causes: Sequence[Cause],
+    sizes: Array,
+    places: Sequence[int],
+    step: float,
+    residual: Array,
+) -> list[Array | float]:
+    """Return central differences (m,) for the causes at some places, one-sided at least sizes.
+
+    They are one-sided, too, where the model is unstable on one side, and NaN where on both.
+    residual (m,): that at the sizes.
+    """
+    by = [step * causes[k].step for k in places]
+    spans = [
+        (max(-own, causes[k].least - sizes[k]), own) for k, own in zip(places, by, strict=True)
+    ]
+    moves = np.eye(len(causes))[list(places)]
+    ends = [
+        with_causes(problem, causes, sizes + by * move)
+        for span, move in zip(spans, moves, strict=True)
+        for by in span
+    ]
+    found = each_residuals(ends, parameters)
+    return [
+        _slope(residual, less, more, *span)
+        for less, more, span in zip(found[::2], found[1::2], spans, strict=True)
+    ]
+
+
+def _slope(
+    residual: Array, less: Array | None, more: Array | None, low: float, high: float
+) -> Array | float:
+    """Return the difference of residuals (m,) at two moves, or of the one that is there to none."""
+    if less is None:
+        less, low = residual, 0.0
+    if more is None:
+        more, high = residual, 0.0
+    return (more - less) / (high - low) if high > low else np.nan
+
+
+def residuals(problem: OutputErrorProblem, parameters: Array) -> Array:
+    """Return all residuals (m,): of what is known beside the poses, then of each run.
+
+    Raises LoopFailure if the model is unstable.
+    """
+    known, _ = problem.known(parameters)
+    return np.concatenate([known, *(run.misses(parameters).ravel() for run in problem.runs)])
+
+
+def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) -> list[Array | None]:
+    """Return the `residuals` (m,) of each problem, None where its model is unstable."""
+
+    def of(problem: OutputErrorProblem) -> Array | None:
+        try:
+            return residuals(problem, allowed(problem, parameters))
+        except DynamicsError:
+            return None
+
+    return in_threads(of, problems)
+
+
+def allowed(problem: OutputErrorProblem, parameters: Array) -> Array:
+    """Return parameters (p,) that a problem's law of the drives allows, raised where it must be."""
+    bounds = problem.bounds
+    above = np.isin(bounds.layout.names, problem.guess.above_zero)
+    return np.where(above, np.maximum(parameters, bounds.lower), parameters)

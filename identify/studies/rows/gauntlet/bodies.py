@@ -1,0 +1,122 @@
+"""Troubles in the bodies of the plant: centres of mass, products of inertia, and a load."""
+
+import numpy as np
+
+from identify.arrays import Array
+from identify.studies.rows.gauntlet.trouble import Laboratory, Trouble, log_uniform, sign
+from identify.studies.rows.gauntlet.typed import typed
+
+
+def centre_of_mass(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw a centre of mass of the platform that is off its frame's origin."""
+    size = log_uniform(rng, 8e-3, 4e-2)
+    direction = rng.standard_normal(3)
+    centre = size * direction / np.linalg.norm(direction)
+    mass, principal = _known(lab, "platform")
+    return Trouble(
+        kind="centre of mass",
+        size=size,
+        unit="m",
+        groups=("centre of mass of the platform",),
+        settings={"plant.values": _values("platform", mass, centre, principal)},
+        remedy=typed,
+    )
+
+
+def products_of_inertia(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw principal axes of the platform that are turned in its frame."""
+    mass, principal = _known(lab, "platform")
+    size = log_uniform(rng, 0.25, 0.6)
+    share = size * rng.uniform(-1.0, 1.0, 3)
+    mean = float(np.trace(principal)) / 3
+    products = np.zeros((3, 3))
+    products[[0, 0, 1], [1, 2, 2]] = mean * share
+    inertia = 1.2 * principal + products + products.T
+    return Trouble(
+        kind="products of inertia",
+        size=size,
+        unit="1",
+        groups=("products of inertia of the platform",),
+        settings={"plant.values": _values("platform", mass, np.zeros(3), _rigid(inertia))},
+        remedy=typed,
+    )
+
+
+def centre_of_leg_bodies(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw centres of mass of the bodies of one kind in all legs that are off along one axis."""
+    layout = lab.robot.layout
+    kind = str(rng.choice(sorted({one.name for one in layout.kinds} - {"platform"})))
+    size = sign(rng) * log_uniform(rng, 5e-3, 3e-2)
+    centre = size * np.eye(3)[int(rng.integers(3))]
+    values: dict[str, float] = {}
+    for body, own in zip(layout.bodies, layout.kinds, strict=True):
+        if own.name == kind:
+            mass, principal = _known(lab, body)
+            values |= _values(body, mass, centre, principal)
+    return Trouble(
+        kind="centre of mass in the legs",
+        size=size,
+        unit="m",
+        groups=(f"centre of mass of the {kind}s",),
+        settings={"plant.values": values},
+        remedy=typed,
+    )
+
+
+def load(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+    """Draw a load on the platform that nobody has stated. It lies off the middle."""
+    size = log_uniform(rng, 0.3, 2.0)
+    place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
+    mass, principal = _known(lab, "platform")
+    whole = mass + size
+    centre = size * place / whole
+    apart = mass * size / whole
+    inertia = principal + apart * (place @ place * np.eye(3) - np.outer(place, place))
+    values = _values("platform", whole, centre, inertia) | {"platform.mass": whole}
+    return Trouble(
+        kind="load that is not stated",
+        size=size,
+        unit="kg",
+        groups=("centre of mass of the platform",),
+        settings={"plant.values": values},
+    )
+
+
+def _known(lab: Laboratory, body: str) -> tuple[float, Array]:
+    """Return the mass of a body, and its inertia (3, 3) as a body can have it."""
+    names = lab.robot.layout.names
+    mass, *moments = (
+        float(lab.parameters[names.index(f"{body}.{name}")])
+        for name in ("mass", "Ixx", "Iyy", "Izz")
+    )
+    return mass, np.diag(possible_moments(moments))
+
+
+def possible_moments(moments: list[float]) -> Array:
+    """Return moments (3,) of a body that exists, at least as large as those given.
+
+    The smaller two are raised until they exceed the largest one together by a tenth.
+    """
+    found = np.array(moments)
+    order = np.argsort(found)
+    smaller = order[:2]
+    found[smaller] *= max(1.0, 1.1 * found[order[2]] / found[smaller].sum())
+    return found
+
+
+def _rigid(inertia: Array) -> Array:
+    """Return an inertia (3, 3) that a body can have, near one that perhaps none can have."""
+    principal, axes = np.linalg.eigh(inertia)
+    return np.asarray(axes @ np.diag(possible_moments(principal.tolist())) @ axes.T)
+
+
+def _values(body: str, mass: float, centre: Array, inertia: Array) -> dict[str, float]:
+    """Return the parameters of a body with a centre of mass (3,) and an inertia (3, 3) there.
+
+    Parameters are about the origin of the body's frame.
+    """
+    about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    first = dict(zip(("mcx", "mcy", "mcz"), mass * centre, strict=True))
+    places = {"Ixx": (0, 0), "Iyy": (1, 1), "Izz": (2, 2), "Ixy": (0, 1), "Ixz": (0, 2)}
+    second = {name: about[place] for name, place in (places | {"Iyz": (1, 2)}).items()}
+    return {f"{body}.{name}": float(value) for name, value in (first | second).items()}
