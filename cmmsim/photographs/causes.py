@@ -100,9 +100,11 @@ def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str
     )
     if tried[best] < limit:
         return f"{said}with lens.psf_px = {best:g} they are {tried[best]:.2g} times"
+    dark = observer.noise.dark_noise
+    more = dark * np.sqrt(usual)
     return (
-        f"{said}enlarge camera.dark_noise (with lens.psf_px = {best:g} they are still "
-        f"{tried[best]:.2g} times)"
+        f"{said}enlarge camera.dark_noise from {dark:g} to about {more:.2g} electrons "
+        f"(with lens.psf_px = {best:g} they are still {tried[best]:.2g} times)"
     )
 
 

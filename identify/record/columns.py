@@ -207,7 +207,9 @@ class Columns(Section):
 
     measured: PoseColumns
     command: CommandColumns
-    reference: PoseColumns | None = None
+    reference: PoseColumns | None = Field(
+        None, description="columns of the desired poses, with the keys of [columns.measured]"
+    )
 
     @property
     def holds_events(self) -> bool:
