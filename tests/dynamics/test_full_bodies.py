@@ -286,7 +286,7 @@ def test_full_bodies_of_a_robot_file(load_changed):
         robot.layout.check(np.where(np.arange(70) == 3, np.nan, robot.nominal_parameters))
 
 
-@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.thorough)])
 def test_full_bodies_cost_few_more_operations_than_centred_ones(name):
     """At most 1.6 times as many, in the equation of motion and in its derivatives."""
     robot = dynamics.load_robot(name)
