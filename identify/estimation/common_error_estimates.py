@@ -74,27 +74,45 @@ def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[A
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
-    """Return one run for each distinct set of common errors, and a matrix for all runs.
+    """Return the runs for whose common errors numbers are drawn, and a matrix for all runs.
 
-    Records that state the same errors with the same covariance share one set. The matrix (k, d)
-    maps the standard normal numbers (d,) drawn for the returned runs to those (k,) of all runs, in
-    the order of the records.
+    Records that state the same errors with the same covariance share one set, but each has its own
+    clock and start. The matrix (k, d) maps the standard normal numbers (d,) drawn for the returned
+    runs to those (k,) of all runs, in the order of the records.
     """
-    firsts: list[LoopModel] = []
-    for run in runs:
-        if not any(run.common.known_as(first.common) for first in firsts):
-            firsts.append(run)
+    holders = [
+        next(first for first in runs if first is run or run.common.known_as(first.common))
+        for run in runs
+    ]
+    drawing = [
+        run
+        for run, holder in zip(runs, holders, strict=True)
+        if holder is run or run.common.of_record.any()
+    ]
 
-    def made_of(run: LoopModel, first: LoopModel) -> Array:
-        own, other = (one.whitened_modes.shape[2] for one in (run, first))
-        if run is first:
-            return np.eye(own)
-        if not own or not run.common.known_as(first.common):
-            return np.zeros((own, other))
-        # The errors are the same, but each run has its own factor of their covariance.
-        return np.asarray(np.linalg.pinv(run.common.whole_factor) @ first.common.whole_factor)
+    def made_of(run: LoopModel, holder: LoopModel, drawn: LoopModel) -> Array:
+        own, other = (one.whitened_modes.shape[2] for one in (run, drawn))
+        matrix = np.zeros((own, other))
+        if not own:
+            return matrix
+        alone = run.common.of_record
+        if drawn is run:
+            matrix[alone, alone] = 1.0
+        if drawn is holder:
+            # The errors are the same, but each run has its own factor of their covariance.
+            rows, columns = ~alone, ~drawn.common.of_record
+            factor = np.eye(int(rows.sum()))
+            if run is not holder:
+                mine = run.common.whole_factor[np.ix_(rows, rows)]
+                theirs = holder.common.whole_factor[np.ix_(columns, columns)]
+                factor = np.linalg.pinv(mine) @ theirs
+            matrix[np.ix_(rows, columns)] = factor
+        return matrix
 
-    return firsts, np.vstack([np.hstack([made_of(run, first) for first in firsts]) for run in runs])
+    pairs = zip(runs, holders, strict=True)
+    return drawing, np.vstack(
+        [np.hstack([made_of(*pair, one) for one in drawing]) for pair in pairs]
+    )
 
 
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:

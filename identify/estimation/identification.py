@@ -27,7 +27,7 @@ from identify.estimation.prior import model_guess, read_anchor
 from identify.estimation.result import IdentificationResult
 from identify.estimation.warm_start import linear_warm_start
 from identify.model.from_record import identified_model
-from identify.model.model_side import ModelSide, model_side
+from identify.model.model_side import ModelSide, model_side, side_of_record
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.conditions import SERVO, command_time_warnings, drift_warnings, recorded_law
@@ -212,7 +212,12 @@ def output_error_problem(
     robot = side.robot
     groups = structure(robot).rigid_groups
     # The motion depends only on the groups, so only their sensitivities are integrated.
-    runs = tuple(replace(identified_model(record, side), groups=groups) for record in records)
+    # Further records can be of other days, with another timing or servo.
+    sides = [side, *(side_of_record(side, record) for record in records[1:])]
+    runs = tuple(
+        replace(identified_model(record, own), groups=groups)
+        for record, own in zip(records, sides, strict=True)
+    )
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(

@@ -1,11 +1,14 @@
 """Model's side of a scenario: robot and loop as the estimator knows them."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+
+import xarray as xr
 
 from dynamics import Robot
 from dynamics.closed_loop import LoopSettings
 from identify.loop_parameters import carrying, drives_of, in_form, loop_settings
 from identify.record.checks import fewest_frames
+from identify.record.provenance import recorded_scenario
 from identify.scenario import Filter, Model, Scenario, Timing
 from identify.scenario.plant_sections import DriveName
 
@@ -67,3 +70,16 @@ def model_side(robot: Robot, scenario: Scenario) -> ModelSide:
         nuisances=tuple(scenario.identification.nuisances),
         fewest_frames=fewest_frames(timing, scenario.filter, scenario.excitation),
     )
+
+
+def side_of_record(side: ModelSide, record: xr.Dataset) -> ModelSide:
+    """Return a model's side with the timing, the servo and the torque limit of another record.
+
+    Raises RecordError if the record does not state its scenario.
+    """
+    own = recorded_scenario(record)
+    known = own.timing == side.timing and asdict(side.settings.servo) == own.servo.model_dump()
+    if known:
+        return side
+    settings = loop_settings(side.robot, own.servo, own.timing, own.control, side.model)
+    return replace(side, timing=own.timing, settings=settings)

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from identify.arrays import Array
@@ -36,6 +37,9 @@ SCALE = "scale.commands"
 CLOCK_OFFSET = "clock.offset_s"
 CLOCK_DRIFT = "clock.drift_s/s"
 START = "start"
+
+OF_RECORD = ("clock", START)
+"""Kinds of errors that each record has for itself, while records share the others."""
 
 ASSUMPTIONS = ("centres", "products", "passive_friction")
 """Kinds of errors of bodies and passive joints that a model has in a simpler form."""
@@ -89,14 +93,30 @@ class CommonErrors:
         stds = (*self.loop_std.values(), *self.body_std.values())
         return np.asarray(block_diag(self.factor, np.diag(stds), *geometry))
 
+    @property
+    def of_record(self) -> NDArray[np.bool_]:
+        """Marks (k,) of the errors that each record has for itself, which are its clock and start.
+
+        They are also marks of the columns of `whole_factor`.
+        """
+        return np.array([kind_of(name) in OF_RECORD for name in self.all_names], dtype=bool)
+
     def known_as(self, other: "CommonErrors") -> bool:
-        """Return whether other errors have the same names and covariances."""
+        """Return whether other errors, beside those `of_record`, have the same covariances."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
-        same = self.all_names == other.all_names and self.loop_std == other.loop_std
+        same = self._shared_names == other._shared_names and self._shared_loop == other._shared_loop
         same = same and self.body_std == other.body_std
         return same and all(np.array_equal(*pair) for pair in pairs)
+
+    @property
+    def _shared_names(self) -> list[str]:
+        return [name for name in self.all_names if kind_of(name) not in OF_RECORD]
+
+    @property
+    def _shared_loop(self) -> dict[str, float]:
+        return {name: std for name, std in self.loop_std.items() if kind_of(name) not in OF_RECORD}
 
     def by_kind(self, modes: Array) -> dict[str, Array]:
         """Split effects of the errors by their kinds (`kind_of`).

@@ -15,12 +15,18 @@ from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
-from dynamics.closed_loop import LoopFailure, LoopSettings, Reference, simulate_servo
+from dynamics.closed_loop import (
+    IdealSensor,
+    LoopFailure,
+    LoopSettings,
+    Reference,
+    simulate_servo,
+)
 from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
 )
@@ -94,16 +100,21 @@ def model_run(
     parameters: Array,
     reference: Reference,
     latencies: Array | None = None,
+    lost: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Return the poses (N, 6) of the model on a reference. All are NaN if its loop is unstable.
 
     ``latencies`` (N,) [s] are the latencies of its commands, by default the latency of the timing.
+    In ``lost`` (N,) frames its servo measures nothing, by default in none.
 
     Raises dynamics.DynamicsError for parameters of another shape or outside their range, and for
     poses out of reach.
     """
     try:
-        return simulate_servo(robot, parameters, reference, settings, latencies=latencies).pose
+        sensor = IdealSensor(lost=lost)
+        return simulate_servo(
+            robot, parameters, reference, settings, sensor, latencies=latencies
+        ).pose
     except LoopFailure:
         return np.full_like(reference.poses, np.nan)
 
@@ -111,16 +122,18 @@ def model_run(
 def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> Array:
     """Return the poses (N, 6) of the model on the motion of a record.
 
-    All poses are NaN if the model is unstable. The latencies are taken from the record. If the
-    record was made under the servo, the model simulates the servo. Otherwise the logged commands
-    drive the model.
+    All poses are NaN if the model is unstable. Latencies and lost frames are those of the record,
+    because the servo of the model must hold its commands where the plant's did. If the record was
+    made under the servo, the model simulates the servo. Otherwise the logged commands drive the
+    model.
 
     Raises the errors of `model_run`.
     """
     if recorded_law(record) == SERVO and not is_timed(record):
         latencies = logged_latencies(record, side.timing)
         reference = recorded_reference(record)
-        return model_run(side.robot, side.settings, parameters, reference, latencies)
+        lost = record["measured_ok"].values == 0
+        return model_run(side.robot, side.settings, parameters, reference, latencies, lost)
     run = predicting_model(record, side).driven_by_commands()
     try:
         return run.model_poses(parameters)

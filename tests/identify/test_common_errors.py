@@ -328,6 +328,7 @@ def test_records_that_share_a_draw_do_not_average_it():
             whitened_modes=modes[number] @ turn,
             common=SimpleNamespace(**{"known_as": common.known_as, "whole_factor": common.factor @ turn},
                 by_kind=common.by_kind, covariance=common.covariance, geometry=None, loop_std={}, body_std={},
+                of_record=common.of_record, _shared_names=list(common.names), _shared_loop={},
                 all_names=common.all_names),
             driven=True,
             ok=np.ones(frames, dtype=bool),
