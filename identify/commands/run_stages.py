@@ -206,8 +206,8 @@ def identify(
             "--record",
             metavar="FILE",
             help="Identify from a record of your own: netCDF, CSV, or a log of Motive, Vicon or "
-            "ROS 2. Repeat the option for a record of the same robot under a known load, if it "
-            "fixes the scale.",
+            "ROS 2. Repeat the option for further records of the same robot: other motions, days, "
+            "settings or loads.",
             show_default=False,
         ),
     ] = None,

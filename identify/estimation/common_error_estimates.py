@@ -15,6 +15,7 @@ import numpy as np
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
+from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
 
 
 @dataclass(frozen=True)
@@ -150,3 +151,33 @@ def common_error_estimates(
         factor @ whole[own, own] @ factor.T,
         whole[:count, own] @ factor.T,
     )
+
+
+def clock_notes(problem: OutputErrorProblem, parameters: Array, whole: Array) -> tuple[str, ...]:
+    """Return a sentence for each record whose commands have a clock of their own.
+
+    Arguments are as for `common_error_estimates`.
+    """
+    notes = []
+    first = len(parameters)
+    for number, run in enumerate(problem.runs, start=1):
+        count = run.whitened_modes.shape[2]
+        own = slice(first, first + count)
+        first += count
+        names = list(run.common.all_names)
+        if not {CLOCK_OFFSET, CLOCK_DRIFT} & set(names):
+            continue
+        factor = run.common.whole_factor
+        estimate = dict(zip(names, factor @ most_likely(run, parameters), strict=True))
+        variances = np.diag(factor @ whole[own, own] @ factor.T)
+        std = dict(zip(names, np.sqrt(variances), strict=True))
+        said = []
+        if CLOCK_OFFSET in names:
+            offset, doubt = 1e3 * estimate[CLOCK_OFFSET], 1e3 * std[CLOCK_OFFSET]
+            said.append(f"{offset:.3f} ± {doubt:.3f} ms after their logged times")
+        if CLOCK_DRIFT in names:
+            drift, doubt = 1e6 * estimate[CLOCK_DRIFT], 1e6 * std[CLOCK_DRIFT]
+            said.append(f"later by {drift:.1f} ± {doubt:.1f} us every second")
+        of_record = f" of record {number}" if len(problem.runs) > 1 else ""
+        notes.append(f"the commands{of_record} act {', and '.join(said)}: their clock is another")
+    return tuple(notes)

@@ -20,6 +20,7 @@ from identify.estimation.bounds import ParameterBounds
 from identify.estimation.common_error_estimates import most_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.warm_start import linear_warm_start
 from identify.progress import Advance, Progress
 
 LINEARISATIONS = 6
@@ -39,6 +40,12 @@ MOST = 15
 
 HALVINGS = 10
 """Largest number of halvings of a step of the common errors."""
+
+MISSED = 1.2
+"""Mean squared residual above which the search is repeated from another start."""
+
+WORSE = 1.01
+"""Largest ratio of the costs after and before such a step."""
 
 NEAR = 1.0
 """Change of such errors, in the standard deviations that decide, at which they count as near."""
@@ -106,9 +113,15 @@ def search_with_common_errors(
     repeated until these values converge.
     """
     problem, start = _with_common_errors(problem, starts)
-    if any(run.begins_in_motion for run in problem.runs):
+    in_motion = any(run.begins_in_motion for run in problem.runs)
+    if in_motion:
         problem, start = _near_common_errors(problem, start)
     solution = search(problem, start, advance)
+    if in_motion and solution.costs[-1] > MISSED * 6 * sum(run.ok.sum() for run in problem.runs):
+        # Far from the right errors, the parameters can have gone to a wrong minimum.
+        warm = problem.bounds.nearest(linear_warm_start(problem))
+        again = search(problem, warm, lambda n=1: None)
+        solution = min(solution, again, key=lambda one: one.costs[-1])
     for turn in range(LINEARISATIONS if problem.bends else 0):
         errors = most_likely_errors(problem, solution.parameters)
         if problem.has(errors, SETTLED):
@@ -146,21 +159,25 @@ def _near_common_errors(
 def _moved_towards(
     problem: OutputErrorProblem, errors: list[Array], parameters: Array
 ) -> OutputErrorProblem:
-    """Return the problem about these common errors, or part of the way to them.
+    """Return the problem about these common errors, or as near to them as lowers its cost.
 
-    The model can be unstable with errors that follow from a linearisation far from them. Raises
-    LoopFailure if it is unstable half a thousandth of the way.
+    Far from the linearisation from which they follow, the model can be unstable or worse. Raises
+    LoopFailure if it is unstable a thousandth of the way from there.
     """
     had = [run.errors_had for run in problem.runs]
+    before = problem.cost(parameters)
     for halving in range(HALVINGS):
         share = 0.5**halving
-        part = [before + share * (own - before) for before, own in zip(had, errors, strict=True)]
+        part = [own + share * (new - own) for own, new in zip(had, errors, strict=True)]
         try:
-            return problem.having(part).with_common_errors(parameters)
+            moved = problem.having(part).with_common_errors(parameters)
         except LoopFailure:
             if halving == HALVINGS - 1:
                 raise
-    raise AssertionError
+            continue
+        if moved.cost(parameters) <= WORSE * before:
+            break
+    return moved
 
 
 @dataclass(frozen=True)

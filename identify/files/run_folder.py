@@ -70,6 +70,12 @@ class RunFolder:
         """True if the record is from the user, and follows no trajectory designed here."""
         return self.experiment.is_file() and not self.trajectories.exists()
 
+    @property
+    def records(self) -> tuple[str, ...]:
+        """Names of the files with records for an identification, in their order."""
+        found = sorted(path.name for path in self.path.glob("experiment*.nc"))
+        return (*found, *([self.payload.name] if self.payload.is_file() else []))
+
     def require(self, *names: str) -> None:
         """Check that files of earlier stages exist, and that netCDF files are not damaged.
 

@@ -45,7 +45,7 @@ def error_modes(
         still = len(drawn) - len(without) + np.flatnonzero(without)
         moving = [k for k in moving if k not in still]
     ends = [
-        np.maximum(drawn + sign * np.eye(len(drawn))[k], run.lowest_drawn)
+        np.maximum(drawn + sign * np.diag(run.difference_steps)[k], run.lowest_drawn)
         for k in moving
         for sign in (1.0, -1.0)
     ]
@@ -53,7 +53,7 @@ def error_modes(
     for place, k in enumerate(moving):
         more, less = found[2 * place : 2 * place + 2]
         high, low = ends[2 * place : 2 * place + 2]
-        # The distance is less than two units if the loop cannot contain the lower end.
+        # The distance is less than two steps if the loop cannot contain the lower end.
         modes[:, :, k] = (more - less) / (high[k] - low[k])
     if (geometry := run.common.geometry) is None:
         return modes

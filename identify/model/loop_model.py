@@ -6,6 +6,7 @@ covariance of the sensor's noise and of the errors that all measured poses have 
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,8 @@ class LoopModel:
     torques: Array | None = None
     bodies: Array | None = None
     groups: RigidGroups | None = None
+
+    begins_in_motion: ClassVar[bool] = False  # whether the start is estimated, and not at rest
 
     def driven_by_commands(self) -> "LoopModel":
         """Return a copy of the model with joints driven by the logged commands."""
@@ -183,14 +186,14 @@ class LoopModel:
         count = len(common.names) + len(common.loop_std) + len(common.body_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
+    @property
+    def difference_steps(self) -> Array:
+        """Steps (k,) of the common errors by which runs differ in `error_modes`."""
+        return np.ones(len(self.errors_had))
+
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in the standard deviations that decide."""
         return change
-
-    @property
-    def begins_in_motion(self) -> bool:
-        """True if the start of the run is estimated, False if the run begins at rest."""
-        return False
 
     def on_grid(self) -> "LoopModel":
         """Return about this run with frames one period apart, for linear fits."""
@@ -294,10 +297,7 @@ class LoopModel:
         return None if self.driven else ~self.ok
 
     def _sensed(self, noise: Array | None) -> Array | None:
-        """Return the sum of the common errors in the model and of noise (..., N, 6).
-
-        It is added to the poses (N, 6) that the model's servo measures.
-        """
+        """Return what is added to the poses that the servo measures: errors and noise (..., N, 6)."""
         if self.drawn is None or not self.common.names or self.driven:
             return noise
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]

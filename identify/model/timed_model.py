@@ -16,7 +16,7 @@ the stated time t acts at t + offset + drift (t - t0), where t0 is the time of t
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,9 @@ from identify.model.loop_errors import lowest_errors
 from identify.model.loop_model import LoopModel
 from identify.model.stretch import Stretch
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE
+
+CLOCK_STEPS = {CLOCK_OFFSET: 5e-4, CLOCK_DRIFT: 2e-5}
+"""Largest differences of the clock, s and s/s, by which the effect of its errors is computed."""
 
 ROUNDING = 9
 """Decimals of the times of events, s, so that a command and a pose of one time are one event."""
@@ -59,6 +62,8 @@ class TimedModel(LoopModel):
     times: Array = field(kw_only=True)
     acting: Array = field(kw_only=True)
     stretches: tuple[Stretch, ...] = field(kw_only=True)
+
+    begins_in_motion: ClassVar[bool] = True
 
     def driven_by_commands(self) -> "TimedModel":
         """Return a copy of the model, which the logged commands always drive."""
@@ -124,6 +129,15 @@ class TimedModel(LoopModel):
         known |= self._shown_starts(parameters)
         return error_modes(self, parameters, lambda run: run.pose, known)
 
+    @property
+    def difference_steps(self) -> Array:
+        """Steps (k,) of the common errors, small ones for a clock of which little is known."""
+        steps = super().difference_steps
+        for place, (name, std) in enumerate(self.common.loop_std.items(), len(self.common.names)):
+            if name in CLOCK_STEPS:
+                steps[place] = min(1.0, CLOCK_STEPS[name] / std)
+        return steps
+
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in their posterior standard deviations.
 
@@ -133,11 +147,6 @@ class TimedModel(LoopModel):
             return change
         modes = self.marginal.modes[:, : len(change)]
         return np.asarray(np.linalg.qr(np.vstack([np.eye(len(change)), modes]), mode="r") @ change)
-
-    @property
-    def begins_in_motion(self) -> bool:
-        """True, because the start of every stretch is estimated."""
-        return True
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
         """Return the changes (M, j) of the commands for which drives add torques (N, j) at poses.

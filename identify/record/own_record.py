@@ -81,7 +81,7 @@ class Measured(Section):
 def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
     """Read records from files, and return them with the scenario of the first record.
 
-    Further records are records of the same robot under a known load.
+    Further records are of the same robot: other motions, days, settings or loads.
 
     Raises
     ------

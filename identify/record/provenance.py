@@ -215,7 +215,9 @@ class RunFiles:
 
     def content(self, name: str) -> Any:
         """Return the content of a file by its name, such as ``experiment.nc``."""
-        return getattr(self, name.removesuffix(".nc"))
+        stem = name.removesuffix(".nc")
+        # Further records have numbers.
+        return getattr(self, stem) if hasattr(type(self), stem) else read(self.folder.path / name)
 
     def digests(self, *names: str) -> dict[str, str]:
         """Return digests of files by their names."""
@@ -224,8 +226,8 @@ class RunFiles:
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
         """Check that a result was made from the present files of these names.
 
-        Files without a digest in the result are not checked. The default result is the result in
-        the folder, if there is one.
+        Files without a digest in the result are not checked. All records are checked if the first
+        one is. The default result is the result in the folder, if there is one.
 
         Raises
         ------
@@ -241,10 +243,13 @@ class RunFiles:
         known = result.get(ENTRY, {})
         if not isinstance(known, dict):
             raise RecordError(f"{run.result}: {ENTRY} must be digests by file name")
-        for name in (name for name in names if name in known):
+        further = [name for name in known if name.startswith("experiment")]
+        names = (*names, *(further if RECORDS[0] in names else ()))
+        for name in dict.fromkeys(name for name in names if name in known):
             run.require(name)
             if self.digests(name)[name] != known[name]:
-                what = f"another record than {name}" if name in RECORDS else f"another {name}"
+                is_record = name in RECORDS or name in further
+                what = f"another record than {name}" if is_record else f"another {name}"
                 stage = _AGAIN.get(name, "identify")
                 raise RecordError(
                     f"{run.result} is of {what}: run `cmmsim {stage} --out {run.path}` again"

@@ -16,7 +16,7 @@ from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RECORDS, RunFiles
 from identify.reporting.run_result import parameter_vector
 from identify.scenario import load_scenario
-from identify.stages.plan import record_files
+from identify.stages.plan import identified_files
 
 ENTRY = "diagnosis"
 """Name of the entry of result.json."""
@@ -38,7 +38,9 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     robot = known_geometry(load_robot(scenario.robot), scenario.geometry, folder).robot
     identification = result["identification"]
     side = model_side(robot, scenario).with_drive(settled_drive(identification))
-    records = [files.content(name) for name in record_files(scenario.identification)]
+    records = [
+        files.content(name) for name in identified_files(run_folder, scenario.identification)
+    ]
     problem = output_error_problem(records, side, scenario.identification)
     found = diagnosis_from(problem, parameter_vector(side.robot, identification, "estimate"), own)
     save_result(run_folder.result, with_diagnosis(result, found))

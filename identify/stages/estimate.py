@@ -27,11 +27,17 @@ from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import known_geometry
 from identify.record.model_runs import build_model_run, model_groups
 from identify.record.own_record import read_own_records
-from identify.record.provenance import ENTRY, RECORDS, RunFiles, digest
+from identify.record.provenance import ENTRY, RunFiles, digest
 from identify.scenario import Scenario, load_scenario
 from identify.stages.diagnose import ENTRY as DIAGNOSIS
 from identify.stages.diagnose import with_diagnosis
-from identify.stages.plan import check_planned, open_run, record_files, scenario_file
+from identify.stages.plan import (
+    check_planned,
+    identified_files,
+    open_run,
+    own_record_files,
+    scenario_file,
+)
 from identify.validation.unseen import model_on_record
 
 
@@ -56,7 +62,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
         seed = setup.seed
     scenario = planned.with_estimator_settings(settings or {})
     files = RunFiles(run_folder)
-    names = record_files(scenario.identification)
+    names = identified_files(run_folder, scenario.identification)
     run_folder.require(*names)
     records = {name: files.content(name) for name in names}
     if seed is not None:
@@ -79,7 +85,8 @@ def identify_own(
     run_folder = RunFolder(folder)
     contents, stated = read_own_records(list(paths))
     scenario = stated.with_estimator_settings(settings)
-    records = dict(zip(RECORDS, contents, strict=False))
+    names = own_record_files(len(contents), scenario.identification)
+    records = dict(zip(names, contents, strict=True))
     known = known_geometry(load_robot(scenario.robot), scenario.geometry)
     for one in contents:
         if known.covariance is not None and GEOMETRY_COVARIANCE not in one:

@@ -116,6 +116,18 @@ def record_files(settings: Identification) -> tuple[str, ...]:
     return RECORDS if settings.scale_anchor == "payload" else RECORDS[:1]
 
 
+def identified_files(run_folder: RunFolder, settings: Identification) -> tuple[str, ...]:
+    """Return the names of the files from which a run identifies: planned, or a user's own."""
+    return run_folder.records if run_folder.holds_own_record else record_files(settings)
+
+
+def own_record_files(count: int, settings: Identification) -> tuple[str, ...]:
+    """Return the file names for a number of a user's own records, in their order."""
+    if count == len(RECORDS) and settings.scale_anchor == "payload":
+        return RECORDS
+    return (RECORDS[0], *(f"experiment{number:02d}.nc" for number in range(2, count + 1)))
+
+
 def _designed(setup: Setup, progress: Progress) -> TrajectorySet:
     """Return trajectories that avoid limits and singularities. The robot is compiled first."""
     scenario = setup.scenario

@@ -15,6 +15,7 @@ from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes, record_of
 from identify.record.recording import is_timed
 from identify.record.smoothness import gross_errors
+from identify.validation.unseen import model_on_record
 from tests.identify.record_forms import (
     COVARIANCE,
     DRIFT,
@@ -25,7 +26,7 @@ from tests.identify.record_forms import (
     scenario_of,
     true_parameters,
 )
-from tests.identify.synthetic import rss6
+from tests.identify.synthetic import quick, rss6, run_plant, side_of, truth
 
 CHANCE = 4.0
 """Standard deviations that a figure may be off by chance."""
@@ -85,9 +86,34 @@ def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
         assert abs(drift[0] - DRIFT) < CHANCE * drift[1]
 
 
+@pytest.mark.slow
+def test_records_of_several_days_share_the_robot_and_have_clocks_of_their_own():
+    """Two records say more than each of them, and only one of them has another clock."""
+    one, other = record_in("rounded to ms", 4), record_in("two clocks", 5)
+    both = identify([one, other])
+    assert both.explained
+    for alone in (identify(one), identify(other)):
+        chosen = both.identifiable & alone.identifiable
+        assert (both.std[chosen] < alone.std[chosen]).mean() > 0.9
+    (said,) = (text for text in both.warnings if "their clock is another" in text)
+    assert said.startswith("the commands of record 2 act 12.0")
+
+
+def test_the_model_holds_its_command_where_the_plant_lost_a_frame():
+    """Then the true parameters miss nothing on a motion with lost frames."""
+    scenario = quick(**{"timing.dropout": 0.0, "plant.steps_per_frame": 4})
+    lost = (40, 41, 90, 150)
+    record, run = run_plant(scenario, 0, 1e-12 * np.ones(6), lost, duration_s=3.0)
+    found = model_on_record(side_of(scenario), truth(), record)
+    assert np.abs(found - run.pose).max() < 1e-9
+    whole = record.assign(measured_ok=("time", np.ones(len(run.pose), dtype=np.int8)))
+    blind = model_on_record(side_of(scenario), truth(), whole)
+    assert np.abs(blind - run.pose).max() > 1e-5
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("form", FORMS)
-def test_intervals_hold_in_every_form(form, keep_figures):
+def test_intervals_hold_in_every_form(form, record_property):
     seeds = 50
     inside = total = 0
     shifts = []
@@ -99,7 +125,8 @@ def test_intervals_hold_in_every_form(form, keep_figures):
         inside += np.count_nonzero(off < 1.96)
         total += np.count_nonzero(chosen)
         shifts.append(np.mean((found.estimate - known.estimate)[chosen] / known.std[chosen]))
-    keep_figures(coverage=inside / total, mean_shift=float(np.mean(shifts)), records=seeds)
+    record_property("coverage", inside / total)
+    record_property("mean_shift", float(np.mean(shifts)))
     assert 0.93 <= inside / total <= 0.99
     assert abs(np.mean(shifts)) < 0.3
 
