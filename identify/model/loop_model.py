@@ -297,7 +297,7 @@ class LoopModel:
         return None if self.driven else ~self.ok
 
     def _sensed(self, noise: Array | None) -> Array | None:
-        """Return what is added to the poses that the servo measures: errors and noise (..., N, 6)."""
+        """Return what is added to poses that the servo measures: errors, noise (..., N, 6)."""
         if self.drawn is None or not self.common.names or self.driven:
             return noise
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]
