@@ -16,6 +16,7 @@ from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
 from identify.estimation.bounded_least_squares import StopCriteria
+from identify.estimation.clock_hint import clock_hints
 from identify.estimation.common_error_estimates import clock_notes, common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
@@ -127,6 +128,7 @@ def identify(
     told = (
         *reading_notes(records),
         *clock_notes(judged, solution.parameters, uncertainty.whole),
+        *(() if explained.model_holds else clock_hints(problem, warm, explained.misfit.found)),
         *command_time_warnings(records, side.timing),
         *drift_warnings(records),
     )

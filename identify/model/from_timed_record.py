@@ -5,7 +5,6 @@ from math import ceil
 
 import numpy as np
 import xarray as xr
-from scipy.optimize import minimize_scalar
 
 from dynamics import DynamicsError
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
@@ -13,6 +12,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import filtered_derivatives
 from identify.model.body_errors import body_error_stds
+from identify.model.likely_delay import likely_delay
 from identify.model.loop_errors import loop_error_stds
 from identify.model.model_side import ModelSide
 from identify.model.stretch import Stretch, begun_stretch
@@ -34,9 +34,6 @@ from identify.record.stored_common_errors import (
 
 REACH = 4.0
 """Largest offset of a clock that is tried, in its standard deviations."""
-
-DELAYS = 50
-"""Number of delays of either sign that are tried first."""
 
 SAME_RATE = 0.2
 """Largest relative difference of the rate of commands from the frame rate, if they are the same."""
@@ -197,25 +194,3 @@ def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
     drawn = np.zeros(len(run.errors_had))
     drawn[len(run.common.names) + list(stds).index(CLOCK_OFFSET)] = offset / stds[CLOCK_OFFSET]
     return replace(run, drawn=drawn)
-
-
-def likely_delay(times: Array, model: Array, measured: Array, farthest: float) -> float:
-    """Return the delay, s, of measured poses (k, 6) behind those of a model at times (k,).
-
-    It is the delay up to `farthest` with the smallest squared difference, each component in units
-    of its spread.
-    """
-    spread = measured.std(axis=0)
-    moving = spread > 0
-    scaled = [one[:, moving] / spread[moving] for one in (model, measured)]
-    inner = (times > times[0] + farthest) & (times < times[-1] - farthest)
-
-    def apart(delay: float) -> float:
-        moved = interpolated(times[inner] - delay, times, scaled[0])
-        return float(np.mean((moved - scaled[1][inner]) ** 2))
-
-    coarse = np.linspace(-farthest, farthest, 2 * DELAYS + 1)
-    best = coarse[int(np.argmin([apart(delay) for delay in coarse]))]
-    step = coarse[1] - coarse[0]
-    found = minimize_scalar(apart, bounds=(best - step, best + step), method="bounded")
-    return float(found.x)

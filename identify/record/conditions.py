@@ -103,7 +103,11 @@ def check_command_times(record: xr.Dataset, source: str) -> None:
     )
     for frames, what in (
         (unsaid, "is not finite, although the frame was measured"),
-        (early, "is before the frame itself"),
+        (
+            early,
+            "is before the frame itself, which only another clock explains, and "
+            "timing.clock_offset_std_s states its offset",
+        ),
         (back, overtaken),
     ):
         if len(frames):

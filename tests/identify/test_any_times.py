@@ -11,6 +11,7 @@ import pytest
 
 from identify.errors import RecordError
 from identify.estimation.identification import identify
+from identify.estimation.prior import ScaleAnchor, store_anchor
 from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes, record_of
 from identify.record.recording import is_timed
@@ -84,6 +85,17 @@ def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
         )
         assert abs(offset[0] - OFFSET_S) < min(2e-4, CHANCE * offset[1])
         assert abs(drift[0] - DRIFT) < CHANCE * drift[1]
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_not_stated_is_named_where_it_explains_the_record():
+    telemetry, _ = FORMS["two clocks"](0)
+    record = record_of(replace(telemetry, reference=None), rss6(), scenario_of(), COVARIANCE)
+    store_anchor(record, ScaleAnchor("platform_mass", true_parameters()[0], 0.005))
+    found = identify(record)
+    assert not found.explained
+    (said,) = (text for text in found.warnings if "timing.clock_offset_std_s" in text)
+    assert said.startswith("the commands seem to act 12.")
 
 
 @pytest.mark.slow

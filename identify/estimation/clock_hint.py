@@ -1,0 +1,65 @@
+"""Hint at a clock of the commands that a record needs and does not state.
+
+Where the model misses a record at any times, it is identified again with a clock of its own.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.common_error_estimates import most_likely
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import output_error_searches
+from identify.model.loop_model import LoopModel
+from identify.model.timed_model import TimedModel
+from identify.progress import SilentProgress
+from identify.record.stored_common_errors import CLOCK_OFFSET
+
+TRIED_S = 0.03
+"""Standard deviation, s, of the clock that is tried."""
+
+EXPLAINS = 0.3
+"""Smallest share of the mean squared residual that a clock must explain to be named."""
+
+
+def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tuple[str, ...]:
+    """Return a hint for each record at any times that a clock of its commands explains better.
+
+    warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
+    """
+    runs = tuple(_with_clock(run) for run in problem.runs)
+    if not any(CLOCK_OFFSET in run.common.loop_std for run in runs):
+        return ()
+    tried = replace(problem, runs=runs)
+    try:
+        found = output_error_searches(tried, warm, closed_loop=False, progress=SilentProgress())
+        judged = found["command_driven"].linearised()
+    except EstimationError:
+        return ()
+    parameters = found["command_driven"].solution.parameters
+    left = float(np.mean(np.concatenate([run.misses(parameters) for run in judged.runs]) ** 2))
+    if left > (1 - EXPLAINS) * misfit:
+        return ()
+    hints = []
+    for number, run in enumerate(judged.runs, start=1):
+        if CLOCK_OFFSET not in run.common.loop_std:
+            continue
+        errors = run.common.whole_factor @ most_likely(run, parameters)
+        offset = 1e3 * errors[run.common.all_names.index(CLOCK_OFFSET)]
+        of_record = f" of record {number}" if len(runs) > 1 else ""
+        hints.append(
+            f"the commands{of_record} seem to act {offset:.2f} ms after their times, which takes "
+            f"the mean squared residual from {misfit:.4g} to {left:.4g}: let their clock be "
+            "estimated (timing.clock_offset_std_s)"
+        )
+    return tuple(hints)
+
+
+def _with_clock(run: LoopModel) -> LoopModel:
+    """Return a run at any times with a clock of its own. Other runs do not change."""
+    if not isinstance(run, TimedModel) or CLOCK_OFFSET in run.common.loop_std:
+        return run
+    common = replace(run.common, loop_std=run.common.loop_std | {CLOCK_OFFSET: TRIED_S})
+    return replace(run, common=common, drawn=None, marginal=None)
