@@ -9,7 +9,7 @@ Prior knowledge of a start is negligible, so the fit of a start uses 2 m degrees
 residuals of its span.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -289,7 +289,7 @@ def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
     place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
     rate[0] = 0.0  # the run begins at rest, but the filter is inaccurate at the ends
     starts = np.hstack([place, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
-    parts = {name: getattr(run, name) for name in LoopModel.__dataclass_fields__}
+    parts = {one.name: getattr(run, one.name) for one in fields(LoopModel)}
     return TorqueModel(
         **parts | {"settings": replace(run.settings, drives=drives), "driven": True}, starts=starts
     )
