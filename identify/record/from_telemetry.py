@@ -26,7 +26,7 @@ from identify.record.recording import build_record
 from identify.record.smoothness import gross_errors
 from identify.record.telemetry import TIME_ROUNDING, CommandLog, ReferenceLog, Telemetry
 from identify.record.timed_record import build_timed_record
-from identify.scenario import Scenario
+from identify.scenario import Scenario, Timing
 
 MOST_GROSS = 0.1
 """Largest share of poses that can be gross errors."""
@@ -64,7 +64,7 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
         "frame_rate_hz": scenario.timing.frame_rate_hz,
         "prismatic": robot.layout.prismatic,
     }
-    why = _not_on_grid(telemetry, scenario, bool(wrong.any()))
+    why = _not_on_grid(telemetry, scenario.timing, bool(wrong.any()))
     if why is None:
         assert telemetry.reference is not None
         record = build_record(
@@ -79,7 +79,7 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
             **given,
         )
     else:
-        times, acting, more = _event_times(telemetry, scenario)
+        times, acting, more = _event_times(telemetry, scenario.timing)
         kept = _new_commands(telemetry.commands)
         record = build_timed_record(
             time=times,
@@ -157,11 +157,10 @@ def _gross(telemetry: Telemetry, covariances: Array) -> tuple[NDArray[np.bool_],
     return wrong, [f"{count} single poses were left out as gross errors: {named}"]
 
 
-def _not_on_grid(telemetry: Telemetry, scenario: Scenario, gross: bool) -> str | None:
+def _not_on_grid(telemetry: Telemetry, timing: Timing, gross: bool) -> str | None:
     """Return why a log makes no record on the grid, or None."""
     reference = telemetry.reference
     poses = telemetry.poses
-    timing = scenario.timing
     if reference is None:
         return "the record holds no reference"
     if not telemetry.is_one_table:
@@ -213,11 +212,11 @@ def _seen_but_lost(telemetry: Telemetry) -> bool:
     return bool((changes & ~telemetry.poses.ok[1:]).any())
 
 
-def _event_times(telemetry: Telemetry, scenario: Scenario) -> tuple[Array, Array, list[str]]:
+def _event_times(telemetry: Telemetry, timing: Timing) -> tuple[Array, Array, list[str]]:
     """Return the times of poses (N,) and of the action of commands (M,), s, and notes on them."""
     poses = telemetry.poses
     commands = telemetry.commands
-    rate_hz = scenario.timing.frame_rate_hz
+    rate_hz = timing.frame_rate_hz
     times = poses.time
     assert poses.covariance is not None
     good = poses.ok
@@ -236,9 +235,9 @@ def _event_times(telemetry: Telemetry, scenario: Scenario) -> tuple[Array, Array
     if commands.written is not None:
         acting = commands.written
     elif np.array_equal(commands.time, poses.time):
-        acting = times + scenario.timing.latency_s
+        acting = times + timing.latency_s
     else:
-        acting = commands.time + scenario.timing.latency_s
+        acting = commands.time + timing.latency_s
     return times, acting, notes
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from identify.record.suspicions import joint_motion
-from identify.reporting.figures import telemetry as figures
+from identify.reporting.figures import logs as figures
 from identify.reporting.pictures import Picture
 from identify.reporting.report import page_environment, picture_elements
 from identify.reporting.tables import Table, number
