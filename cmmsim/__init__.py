@@ -77,8 +77,10 @@ if TYPE_CHECKING:
     from cmmsim.measuring.pose_estimator import measure_frame as measure_frame
     from cmmsim.measuring.taught import Taught as Taught
     from cmmsim.photographs.measuring import MeasuredPair as MeasuredPair
+    from cmmsim.photographs.photographed_teaching import (
+        PhotographedTeaching as PhotographedTeaching,
+    )
     from cmmsim.photographs.taught_file import read_taught as read_taught
-    from cmmsim.photographs.teaching import PhotographedTeaching as PhotographedTeaching
     from cmmsim.radiometry.stereo_images import StereoFrame as StereoFrame
     from cmmsim.sensor import Sensor as Sensor
     from cmmsim.tracker import Tracker as Tracker
@@ -94,7 +96,7 @@ _HOME = {
     "require_opengl": "cmmsim.imaging.pyrender_renderer",
     **dict.fromkeys(("teach", "measure"), "cmmsim.from_photographs"),
     "read_taught": "cmmsim.photographs.taught_file",
-    "PhotographedTeaching": "cmmsim.photographs.teaching",
+    "PhotographedTeaching": "cmmsim.photographs.photographed_teaching",
     "MeasuredPair": "cmmsim.photographs.measuring",
     **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.measuring.pose_estimator"),
     "Tracker": "cmmsim.tracker",

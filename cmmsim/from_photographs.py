@@ -14,8 +14,8 @@ from cmmsim.loading import load_sensor
 from cmmsim.measuring.taught import Taught
 from cmmsim.photographs.measuring import MeasuredPair, measure_pairs
 from cmmsim.photographs.pairs import Format, Photographs, Source
+from cmmsim.photographs.photographed_teaching import PhotographedTeaching
 from cmmsim.photographs.taught_file import read_taught
-from cmmsim.photographs.teaching import PhotographedTeaching
 from cmmsim.sensor import Sensor
 from cmmsim.uncertainty.known_rig import KnownRig
 

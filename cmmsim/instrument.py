@@ -29,7 +29,7 @@ from cmmsim.measuring.observation import DetectionSettings, Observer
 from cmmsim.measuring.pose_estimator import METHODS, PoseEstimator
 from cmmsim.measuring.taught import Taught, require_taught_for, setup_of
 from cmmsim.photographs.pairs import Photograph, numbered
-from cmmsim.photographs.teaching import PhotographedTeaching, teach_from
+from cmmsim.photographs.photographed_teaching import PhotographedTeaching, teach_from
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages
 from cmmsim.sticker_view import StickerView

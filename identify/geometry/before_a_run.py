@@ -10,7 +10,7 @@ from identify.geometry.calibration import PoseModel, Tolerance, calibrate
 from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough
 from identify.geometry.outcome import GeometryOutcome
-from identify.geometry.selection import Candidates, Designer, Limits
+from identify.geometry.pose_selection import Candidates, Designer, Limits
 from identify.geometry.static_experiment import encoders_of, measure_static_poses, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators

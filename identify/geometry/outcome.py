@@ -17,7 +17,7 @@ from identify.files.run_folder import rms_figures, save_files
 from identify.files.versions import versions
 from identify.geometry.calibration import Calibration, PoseModel, frame_columns, measured_poses
 from identify.geometry.observability import combinations
-from identify.geometry.selection import Candidates
+from identify.geometry.pose_selection import Candidates
 from identify.geometry.static_experiment import true_poses
 from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario

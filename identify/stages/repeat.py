@@ -9,8 +9,8 @@ from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed
 from identify.setup import Setup
 from identify.trajectory import FourierTrajectory
-from identify.validation.processes import mapped
 from identify.validation.unseen import run_unseen
+from identify.validation.worker_processes import mapped
 
 
 def designed_runs(

@@ -49,7 +49,7 @@ from identify.record.conditions import SERVO, logged_latencies, recorded_law
 from identify.record.recording import is_timed, recorded_reference
 from identify.runtime import cores
 from identify.trajectory import FourierTrajectory
-from identify.validation.processes import mapped
+from identify.validation.worker_processes import mapped
 
 POLL_S = 0.2
 """Interval at which the progress of the workers is read, s."""

@@ -11,7 +11,6 @@ import cmmsim
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
-from cmmsim.photographs import teaching
 from cmmsim.photographs.pairs import Photograph
 from tests.cmmsim.photographed import spread_poses
 
@@ -144,7 +143,7 @@ def test_a_sensor_can_be_taught_again_after_it_lacked_a_sticker(good):
 
 
 def test_of_very_many_pairs_some_are_used(sensor, good, monkeypatch):
-    monkeypatch.setattr(teaching, "MOST_PAIRS", 5)
+    monkeypatch.setattr(photographed_teaching, "MOST_PAIRS", 5)
     found = teach(sensor, good)
     assert found.pairs == ("00.png", "01.png", "03.png", "05.png", "07.png")
     assert found.warnings == ("3 pairs are not used: 5 pairs, spread over all, are enough",)

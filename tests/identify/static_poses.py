@@ -9,7 +9,7 @@ from cmmsim.visibility import sight_lines
 from dynamics import load_robot
 from identify.experiment.true_robot import misplaced
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate, measured_poses
-from identify.geometry.selection import Designer, Limits
+from identify.geometry.pose_selection import Designer, Limits
 from identify.geometry.static_experiment import encoders_of, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.scenario import load_scenario

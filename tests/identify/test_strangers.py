@@ -33,7 +33,7 @@ from identify.experiment.rig_as_known import stated_covariance
 from identify.loop_parameters import choose_parameters
 from identify.record.csv_record import columns_of
 from identify.record.own_record import read_own_records
-from identify.record.readers.tables import LoggedTable
+from identify.record.readers.csv_exports import LoggedTable
 from identify.record.record_template import description_text, table_text
 from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import SCENARIOS

@@ -27,8 +27,8 @@ from identify.record.columns import (
     PoseColumns,
 )
 from identify.record.readers.bags import Bag, is_bag
+from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
-from identify.record.readers.tables import LoggedTable
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
 UNIT_LENGTH = 0.01

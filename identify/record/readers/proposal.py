@@ -17,6 +17,7 @@ from dynamics import Robot
 from identify.errors import RecordError
 from identify.record.columns import ASKED, FRAMES
 from identify.record.columns import TIMES as SECONDS
+from identify.record.readers.csv_exports import FRAME
 from identify.record.readers.header_names import (
     COMMANDED,
     UNIT,
@@ -31,7 +32,6 @@ from identify.record.readers.header_names import (
     without_unit,
 )
 from identify.record.readers.streams import Header, LoggedFile, Stream
-from identify.record.readers.tables import FRAME
 
 TIMES = ("time", "t", "timestamp", "stamp", "secs")
 """Words for times."""
