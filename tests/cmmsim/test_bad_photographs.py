@@ -11,6 +11,7 @@ import cmmsim
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.photographs import photographed_teaching
 from cmmsim.photographs.pairs import Photograph
 from tests.cmmsim.photographed import spread_poses
 
