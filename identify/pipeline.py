@@ -13,10 +13,20 @@ from identify.record import recording
 from identify.scenario import Scenario
 from identify.setup import Setup, with_renderer
 from identify.stages.estimate import identify, identify_own
-from identify.stages.plan import begin, excite, is_begun, open_run, record_files
+from identify.stages.plan import begin, excite, is_begun, is_planned, open_run, record_files
 from identify.stages.validate import validate
 
-__all__ = ["excite", "identify", "identify_own", "is_begun", "record", "report", "run", "validate"]
+__all__ = [
+    "excite",
+    "identify",
+    "identify_own",
+    "is_begun",
+    "is_planned",
+    "record",
+    "report",
+    "run",
+    "validate",
+]
 
 
 def run(

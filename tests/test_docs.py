@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 import typer.main
@@ -86,6 +87,25 @@ def test_every_command_line_is_one_that_the_program_takes():
         except (Exception, SystemExit) as error:
             wrong.append(f"{path.relative_to(ROOT)}: cmmsim {shlex.join(words)}: {error}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_each_equation_of_the_paper_names_code_and_a_test_and_each_exhibit_a_command():
+    """The paper has equations 1 to 40 and A1 to A6, thirteen figures and five tables."""
+    text = (ROOT / "docs" / "reference" / "paper.md").read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| ([^|]+) \| [^|]+ \| `([\w.]+)` \| `([^:|]+)::(\w+)` \|$", text, re.MULTILINE
+    )
+    equations = [one for cells in rows for one in cells[0].split(", ") if "section" not in one]
+    wanted = [*map(str, range(1, 41)), *(f"A{k}" for k in range(1, 7))]
+    assert sorted(equations) == sorted(wanted)
+    for _, function, file, test in rows:
+        resolve_name(function)
+        source = (ROOT / file).read_text(encoding="utf-8")
+        assert re.search(rf"^def {test}\(", source, re.MULTILINE), f"{file}::{test}"
+    exhibits = re.findall(
+        r"^\| ((?:Figure|Table) \d+) \| [^|]+ \| `cmmsim [^`]+` \|$", text, re.MULTILINE
+    )
+    assert exhibits == [f"Figure {k}" for k in range(1, 14)] + [f"Table {k}" for k in range(1, 6)]
 
 
 def test_every_link_and_every_file_that_is_named_exists():

@@ -27,6 +27,7 @@ from identify.commands.help import (
 )
 from identify.commands.importing import imports
 from identify.commands.new import new
+from identify.commands.paper import paper
 from identify.commands.photographs import measure, teach
 from identify.commands.robot_pages import base_parameters, export, verify_model, workspace
 from identify.commands.run_stages import excite, identify, record, report, run, validate, warm_up
@@ -157,7 +158,7 @@ STUDIES = "Studies"
 PICTURES = "What it looks like"
 SETTING_UP = "Setting up"
 
-_add(EXPERIMENT, run)
+_add(EXPERIMENT, run, paper)
 _add(STAGES, excite, record, identify, validate, report)
 _add(RECORDS, diagnose, estimators, variation, track)
 _add(PICTURES, replay, show)

@@ -43,6 +43,9 @@ INDEX_FIRST = 0.38
 INDEX_BEST = 1.345
 """Observability index after 324 iterations of a genetic algorithm (section 4.2)."""
 
+PAPER_SETTINGS = "paper_settings"
+"""Name of the built-in scenario with the paper's own search and filter."""
+
 FREE = ("renderer", "description", "sensor_note")
 """Settings that may differ in a run that repeats the experiment."""
 
@@ -53,4 +56,5 @@ def repeats_the_paper(recorded: str) -> bool:
     ``recorded`` is the scenario of the record (TOML).
     """
     base, changed = changed_settings(recorded)
-    return base == BUILT_IN_PAPER and not any(setting.key not in FREE for setting in changed)
+    repeated = base in (BUILT_IN_PAPER, PAPER_SETTINGS)
+    return repeated and not any(setting.key not in FREE for setting in changed)

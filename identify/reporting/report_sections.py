@@ -241,9 +241,13 @@ def _index_text(data: RunData) -> tuple[str, ...]:
 def _paper_text(data: RunData) -> tuple[str, ...]:
     if not data.repeats_paper:
         return ()
+    ours = (
+        "; its filter and its search for a trajectory differ from the paper's, which the scenario "
+        "paper_settings has"
+    )
+    rest = ", filter and search" if data.scenario.name == paper.PAPER_SETTINGS else ours
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
-        "masses, gains and motion frequencies; its filter and its search for a trajectory differ "
-        "from the paper's (scenario.toml). The figures of the paper are given for comparison. They "
-        "are from a real robot, whose truth is not known.",
+        f"masses, gains and motion frequencies{rest}. The figures of the paper are given for "
+        "comparison. They are from a real robot, whose truth is not known.",
     )

@@ -32,10 +32,13 @@ from identify.trajectory import TrajectorySet, check_travel, load_trajectories, 
 
 def is_begun(setup: Setup, folder: Path) -> bool:
     """Return whether a folder has the plan of this run, and no report yet."""
+    return is_planned(setup, folder) and not RunFolder(folder).report.exists()
+
+
+def is_planned(setup: Setup, folder: Path) -> bool:
+    """Return whether a folder has the plan of this run: its scenario and its seed."""
     run_folder = RunFolder(folder)
     if not (run_folder.scenario.is_file() and run_folder.trajectories.is_file()):
-        return False
-    if run_folder.report.exists():
         return False
     text = toml_with_digest(setup.scenario.to_toml())
     same = run_folder.scenario.read_text(encoding="utf-8", errors="replace") == text

@@ -212,7 +212,7 @@ def test_options_are_checked_though_no_test_uses_them(project):
     for option, says in (
         (
             "--accuracy-scenario",
-            "scenario 'nosuch' is neither built in (geometry, paper, quick) nor a file",
+            "scenario 'nosuch' is neither built in (geometry, paper, paper_settings, quick) nor a file",
         ),
         ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: delta3, *rss6, *"),
         (

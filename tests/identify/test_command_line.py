@@ -148,7 +148,7 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
 @pytest.mark.parametrize(
     ("words", "evidence"),
     [
-        ("run nope", "neither built in (geometry, paper, quick)"),
+        ("run nope", "neither built in (geometry, paper, paper_settings, quick)"),
         ("study mine", ") nor a file, but a folder"),
         ("run quick --set filter.cutof_hz=60", "valid names in [filter]: order, cutoff_hz"),
         ("record --out nowhere", "no run folder nowhere"),

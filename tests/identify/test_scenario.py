@@ -60,6 +60,31 @@ def test_paper_scenario_has_the_papers_numbers_and_the_quick_one_differs_only_in
     assert differing == takes_time | {"validation.count", "validation.duration_s"}
 
 
+def test_paper_settings_are_those_that_the_paper_states_and_otherwise_ours():
+    """Sections 3.2, 4.2 and 4.3 of the paper."""
+    theirs = load_scenario("paper_settings")
+    assert (theirs.servo.kp, theirs.servo.kd, theirs.servo.ki) == (0.3, 0.001, 2.4)
+    assert (theirs.excitation.fundamental_hz, theirs.excitation.harmonics) == (0.1, 5)
+    assert (theirs.excitation.method, theirs.excitation.generations) == ("evolutionary", 324)
+    assert theirs.excitation.criterion == "observability"
+    assert (theirs.filter.order, theirs.filter.cutoff_hz) == (8, 60.0)
+    assert theirs.timing.frame_rate_hz > 2 * theirs.filter.cutoff_hz
+    assert (theirs.identification.method, theirs.identification.qr_threshold) == (
+        "closed_loop",
+        1e-3,
+    )
+    assert theirs.validation.count == 10
+    ours = load_scenario("paper").model_dump()
+    differing = {
+        f"{section}.{key}"
+        for section, values in theirs.model_dump().items()
+        if isinstance(values, dict)
+        for key, value in values.items()
+        if ours[section][key] != value
+    }
+    assert differing == {"timing.frame_rate_hz", "excitation.method", "filter.cutoff_hz"}
+
+
 def test_timing_is_the_sensors_unless_the_scenario_states_it():
     paper = load_scenario("paper")
     slow = paper.with_overrides({"sensor": "ctrack780_29hz"})
@@ -170,7 +195,8 @@ def test_scenario_is_that_of_a_file_and_what_is_none_is_named(tmp_path):
     with pytest.raises(ScenarioError, match=r"bad\.toml is not valid TOML"):
         load_scenario(bad)
     with pytest.raises(
-        ScenarioError, match=r"'nope' is neither built in \(geometry, paper, quick\) nor a file"
+        ScenarioError,
+        match=r"'nope' is neither built in \(geometry, paper, paper_settings, quick\) nor a file",
     ):
         load_scenario("nope")
     with pytest.raises(ValueError, match="frozen"):
