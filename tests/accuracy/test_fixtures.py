@@ -192,7 +192,7 @@ WRONG_MARKERS = {
     "sensor",
     "'mine'": "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor",
     "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (geometry, paper, "
-    "quick) nor a file",
+    "paper_settings, quick) nor a file",
     "robot='rss7'": "RobotFileError: *rss7*rss6*",
     "sensor=5": "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file",
 }
