@@ -14,6 +14,7 @@ from identify.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
     from identify.paper.runs import PaperRuns
+    from identify.setup import Setup
 
 OURS = "paper"
 """Scenario with our own search and filter, and the folder of its run."""
@@ -62,6 +63,7 @@ def paper(
     from identify.paper.index_page import INDEX, exhibit_files
     from identify.scene import read_motion
     from identify.scene.replay import page
+    from identify.setup import set_up
 
     # MuJoCo is optional. If it is missing, this raises an error before anything runs.
     import_mujoco()
@@ -71,8 +73,10 @@ def paper(
     path = out or Path("runs") / f"figures-of-the-paper-{seed}"
     folder = context.with_resource(new_run_folder(path, (OURS, SETTINGS))).path
     progress = terminal_progress(quiet)
-    for name, scenario in ((OURS, ours), (SETTINGS, theirs)):
-        _run(scenario, seed, folder / name, progress, workers)
+    # Settings of either run that cannot work are refused before the first one begins.
+    planned = {name: set_up(one, seed) for name, one in ((OURS, ours), (SETTINGS, theirs))}
+    for name, setup in planned.items():
+        _run(setup, folder / name, progress, workers)
     files = exhibit_files(_results(folder, ours, progress), progress)
     files[Path(REPLAY)] = page(read_motion(folder / OURS), progress).encode()
     write_files({folder / name: content for name, content in files.items()}, parents=True)
@@ -80,19 +84,15 @@ def paper(
         typer.echo(f"page: {folder / INDEX}")
 
 
-def _run(
-    scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None
-) -> None:
+def _run(setup: "Setup", folder: Path, progress: Progress, workers: int | None) -> None:
     """Run a scenario in a folder, unless the folder holds this run already."""
     from identify import pipeline
-    from identify.setup import Setup, with_renderer
 
-    planned = Setup(with_renderer(scenario), seed)
-    done = pipeline.is_planned(planned, folder)
-    if done and RunFolder(folder).report.exists():
+    planned = pipeline.is_planned(setup, folder)
+    if planned and RunFolder(folder).report.exists():
         return
-    with new_run_folder(folder, BEGUN if done else UNFINISHED) as run_folder:
-        pipeline.run(scenario, seed, run_folder.path, progress, workers)
+    with new_run_folder(folder, BEGUN if planned else UNFINISHED) as run_folder:
+        pipeline.run(setup.scenario, setup.seed, run_folder.path, progress, workers)
 
 
 def _results(folder: Path, ours: Scenario, progress: Progress) -> "PaperRuns":

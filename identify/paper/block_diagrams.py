@@ -214,7 +214,7 @@ def diagrams() -> list[Exhibit]:
             "Closed loop of the identification",
             "Robot and model, each in its own visual servo, follow the same trajectory. The "
             "difference of their poses changes the parameters and gains of the model.",
-            "The same. `identification.method=command_driven` opens the lower loop and gives the "
+            "The same. identification.method=command_driven opens the lower loop and gives the "
             "logged commands to the model, which is more accurate.",
             LOOP,
         ),
@@ -230,7 +230,7 @@ def diagrams() -> list[Exhibit]:
             "Figure 7",
             "Verification of the dynamic model",
             "The model and a SimMechanics model under the same joint controllers.",
-            "The same with MuJoCo in place of SimMechanics (`cmmsim verify-model`).",
+            "The same with MuJoCo in place of SimMechanics (cmmsim verify-model).",
             VERIFICATION,
         ),
         _exhibit(

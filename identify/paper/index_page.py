@@ -64,7 +64,7 @@ def differences(runs: PaperRuns) -> Table:
             "parameters",
             "50 of 67, and 49 in the table",
             *(
-                f"rank {one.result['identification']['base_rank']} and gains"
+                f"rank {one.result['identification']['base_rank']} and three gains"
                 for one in (ours, settings)
             ),
             "Cranks and links enter only in sums, and poses do not show single values.",

@@ -156,7 +156,7 @@ def exhibit(cell: Workcell, view: StereoView) -> Exhibit:
         f"The same from one pair of our images, with {len(marked.ids)} stickers. They lie "
         f"{rms:.2g} µm (RMS) from their planes, which are fitted with the covariances of the "
         "points where the paper solves three equations. Every pose by "
-        "`pose_method=planes` is found so; `registration`, our default, fits all stickers at once.",
+        "pose_method=planes is found so; registration, our default, fits all stickers at once.",
         columns,
         partial(draw, marked),
     )

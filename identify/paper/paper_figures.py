@@ -81,7 +81,7 @@ def mechanical_model(robot: Robot) -> Exhibit:
         "Figure 5",
         "Mechanical model",
         "A model of the robot in SimMechanics, from bodies and joints.",
-        "The bodies that `cmmsim export mjcf` gives to MuJoCo. It solves the loops as "
+        "The bodies that cmmsim export mjcf gives to MuJoCo. It solves the loops as "
         "constraints, and shares no equation with our model.",
         {
             "body": [part.name for part in parts],
