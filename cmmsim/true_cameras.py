@@ -20,7 +20,13 @@ from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
-from cmmsim.imaging.scene_bodies import Mesh, PlacedBodies, scene_body, solid_mesh
+from cmmsim.imaging.scene_bodies import (
+    Mesh,
+    PlacedBodies,
+    require_convex_near_stickers,
+    scene_body,
+    solid_mesh,
+)
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.uncertainty.known_rig import rig_changes
@@ -31,6 +37,9 @@ from cmmsim.without_images.drawn_stickers import (
     require_proved,
 )
 from cmmsim.without_images.sticker_scene import StickerScene
+
+# Renderers to which a body is the convex hull of its mesh.
+SEE_HULLS = ("analytic", "statistical")
 
 
 @dataclass(frozen=True)
@@ -166,8 +175,14 @@ class TrueCameras:
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
         """Both cameras in front of the scene, without drift.
 
-        Raises CmmError if the statistical renderer is not validated for this sensor file.
+        Raises CmmError if the statistical renderer is not validated for this sensor file, and
+        SensorFileError if a sticker lies in a hollow of a mesh that the renderer does not draw.
         """
+        if self.renderer.name in SEE_HULLS:
+            sections = self._file.platform, self._file.base
+            for body, marked, section in zip(self.scene, self._bodies, sections, strict=True):
+                if section.mesh is not None:
+                    require_convex_near_stickers(body, marked, self.renderer.name)
         return self._without_images() if self.renderer is STATISTICAL else self._drawing()
 
     def _without_images(self) -> StatisticalStereoCamera:

@@ -310,10 +310,26 @@ class Planes(Section):
 
 
 class Body(Section):
-    """Convex body with stickers on three planes. ``cuts`` are its other sides."""
+    """Body with stickers on three planes.
+
+    The body is the convex solid that the planes and ``cuts``, its other sides, enclose. With
+    ``mesh``, it is a closed triangle mesh instead, in the same axes. The format is STL, OBJ, PLY or
+    GLB. A relative path starts at the folder of the file that names the mesh.
+    """
 
     planes: Planes
-    cuts: list[HalfSpace]
+    cuts: list[HalfSpace] = Field(default_factory=list)
+    mesh: str | None = quantity(None, "", "file of a closed triangle mesh")
+    mesh_unit: Literal["m", "cm", "mm", "in"] = quantity("m", "", "unit of the mesh's coordinates")
+    drop: bool = quantity(
+        False, "", "true to move each plane of stickers along its normal onto the mesh"
+    )
+
+    @model_validator(mode="after")
+    def _dropped_on_something(self) -> Body:
+        if self.drop and self.mesh is None:
+            raise ValueError("drop = true needs a mesh, onto which the stickers are dropped")
+        return self
 
 
 class Platform(Body):

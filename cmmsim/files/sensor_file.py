@@ -16,6 +16,7 @@ import numpy as np
 
 from cmmsim.checks import checked, parsed, read_text, require_kind
 from cmmsim.errors import SensorFileError, UnknownSensorError
+from cmmsim.files.body_meshes import with_meshes
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.pose import Array
 
@@ -154,7 +155,8 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
     content = _content(name)
     change(content, changes or {}, source)
-    return _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
+    file = _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
+    return with_meshes(file, source)
 
 
 def sensor_schema() -> dict[str, Any]:
@@ -226,4 +228,10 @@ def _content(name: str | Path) -> dict[str, Any]:
 
 
 def _table(name: str | Path) -> dict[str, Any]:
-    return parsed(sensor_text(name), f"sensor file {name}", SensorFileError)
+    """Return the content of a file, in which the paths of meshes are absolute."""
+    content = parsed(sensor_text(name), f"sensor file {name}", SensorFileError)
+    for body in ("platform", "base"):
+        section = content.get(body)
+        if isinstance(section, dict) and isinstance(section.get("mesh"), str):
+            section["mesh"] = str(Path(name).resolve().parent / section["mesh"])
+    return content

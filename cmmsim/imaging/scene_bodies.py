@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.files.body_meshes import read_mesh
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.geometry.plane_frame import PLANE_NAMES
@@ -137,8 +138,23 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
     drawn = tuple(
         _sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True)
     )
-    solid = solid_mesh(_solid(body, section), stickers.body_level / 255.0)
-    return SceneBody(solid, drawn, places)
+    found = _solid(body, section) if section.mesh is None else _sunk(read_mesh(section, body.name))
+    return SceneBody(solid_mesh(found, stickers.body_level / 255.0), drawn, places)
+
+
+def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: str) -> None:
+    """Raise SensorFileError if a sticker lies in a hollow of a body.
+
+    The renderer, named in the message, takes the convex hull for the body, which would hide it.
+    """
+    normals, offsets = ConvexSolid(body.solid.vertices).faces
+    heights = (body.sticker_places @ normals.T + offsets).max(axis=1)
+    hollow = marked.sticker_ids[heights <= RING_SUNK]
+    if len(hollow):
+        raise SensorFileError(
+            f"{marked.name}: sticker {', '.join(hollow)} lies in a hollow of the mesh, and the "
+            f"renderer {renderer!r} sees the convex hull of a mesh; choose renderer 'pyrender'"
+        )
 
 
 def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
@@ -294,6 +310,20 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         raise SensorFileError(
             f"{body.name}: its planes and cuts enclose no solid: {reason}"
         ) from error
+
+
+def _sunk(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh whose faces lie SUNK below those of the given mesh.
+
+    Stickers can then lie on the surface as on that of a convex solid.
+    """
+    moved = np.array(mesh.vertices)
+    normals = np.asarray(mesh.face_normals)
+    for k, faces in enumerate(mesh.vertex_faces):
+        around = normals[faces[faces >= 0]]
+        # Directions in which the normals hardly differ count as equal: the vertex stays near.
+        moved[k] -= SUNK * np.linalg.lstsq(around, np.ones(len(around)), rcond=0.1)[0]
+    return trimesh.Trimesh(moved, mesh.faces, process=False)
 
 
 def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:

@@ -1,0 +1,165 @@
+"""Bodies of a sensor file that are triangle meshes, and the stickers on their surfaces.
+
+A mesh takes the place of the convex solid that planes and cuts enclose. It is drawn, and it hides
+stickers. The stickers still belong to three planes, because the frame of a body is taught by them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cmmsim.errors import SensorFileError
+from cmmsim.files.rig_and_bodies import MarkedBody, marked_body
+from cmmsim.files.schema import Body, SensorFile, StickerPlane, unit
+from cmmsim.geometry.plane_frame import PLANE_NAMES
+from cmmsim.geometry.pose import Array
+
+if TYPE_CHECKING:
+    import trimesh
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+# m: the room. A larger mesh has a wrong unit.
+LARGEST = 10.0
+# Largest ratio of a mesh's length to the largest distance between its stickers.
+MOST_REACHES = 100.0
+# m: the dark ring of a sticker that lies deeper below the surface would be hidden by the body.
+DEEPEST = 0.0002
+# Share of a triangle by which a line may miss it, so that no line passes between two triangles.
+ON_EDGE = 1e-6
+
+
+def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
+    """Return the mesh of a body in m. Raises SensorFileError if it is missing or not closed."""
+    import trimesh
+
+    path = Path(str(section.mesh))
+    where = f"{name}.mesh {path}"
+    if not path.is_file():
+        raise SensorFileError(f"{where}: there is no such file")
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # each format has its own exceptions
+        reason = " ".join(str(error).split())
+        raise SensorFileError(
+            f"{where} cannot be read: {reason or type(error).__name__}"
+        ) from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise SensorFileError(f"{where} has no triangles")
+    # Formats such as GLB store each sharp edge twice, with two normals.
+    mesh = trimesh.Trimesh(mesh.vertices * METRES[section.mesh_unit], mesh.faces)
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    if not mesh.is_watertight:
+        uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
+        raise SensorFileError(
+            f"{where} is not closed: {np.count_nonzero(uses != 2)} of its {len(uses)} edges do not "
+            "belong to exactly two triangles; close it, as trimesh.repair.fill_holes does"
+        )
+    if not mesh.is_winding_consistent or mesh.volume < 0.0:
+        mesh.fix_normals()
+    return mesh
+
+
+def with_meshes(file: SensorFile, source: str) -> SensorFile:
+    """Return the file after checks of its meshes, with dropped planes on their surfaces.
+
+    Raises SensorFileError for a mesh that cannot be read, is not closed or has a wrong unit, and
+    for a sticker that does not lie on it.
+    """
+    changes = {}
+    for name, section in (("platform", file.platform), ("base", file.base)):
+        if section.mesh is None:
+            continue
+        try:
+            mesh = read_mesh(section, name)
+            require_size(mesh, section, name)
+            on_mesh = _dropped(mesh, section, name) if section.drop else section
+            _require_on_surface(mesh, marked_body(name, on_mesh), file.stickers.radius)
+        except SensorFileError as error:
+            raise SensorFileError(f"{source}: {error}") from error
+        changes[name] = on_mesh
+    return file.model_copy(update=changes)
+
+
+def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
+    """Raise SensorFileError if a mesh is larger than the room, or much larger than the stickers'
+    reach.
+    """
+    places = marked_body(name, section).nominal
+    reach = float(np.linalg.norm(np.ptp(places, axis=0)))
+    size = float(np.max(mesh.extents))
+    if size <= min(LARGEST, MOST_REACHES * reach):
+        return
+    raise SensorFileError(
+        f"{name}.mesh {section.mesh} is {size:g} m long, {size / reach:.0f} times the reach of its "
+        f"stickers, {reach:.3g} m; a file in millimetres needs {name}.mesh_unit = 'mm'"
+    )
+
+
+def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Array:
+    """Return the heights (n,) of a mesh's surface above places (n, 3), along normals (n, 3), m.
+
+    It is the height of the nearest outer surface. It is NaN where the normal's line misses the
+    mesh.
+    """
+    first, second, third = np.moveaxis(np.asarray(mesh.triangles), 1, 0)
+    sides = second - first, third - first
+    heights = np.full(len(places), np.nan)
+    # The Möller-Trumbore intersection, with all triangles at once.
+    for k, (place, normal) in enumerate(zip(places, normals, strict=True)):
+        across = np.cross(normal, sides[1])
+        volume = np.einsum("ni,ni->n", sides[0], across)
+        gap = place - first
+        turned = np.cross(gap, sides[0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.einsum("ni,ni->n", gap, across) / volume
+            v = turned @ normal / volume
+            height = np.einsum("ni,ni->n", sides[1], turned) / volume
+            inside = (u >= -ON_EDGE) & (v >= -ON_EDGE) & (u + v <= 1.0 + ON_EDGE)
+        # The volume is below zero where a line along the normal leaves the body.
+        met = inside & (volume < 0.0)
+        if met.any():
+            heights[k] = height[met][np.abs(height[met]).argmin()]
+    return heights
+
+
+def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
+    """Return the body with each plane moved along its normal onto the surface of the mesh.
+
+    The plane touches the surface below the highest of its stickers.
+    """
+    body = marked_body(name, section)
+    heights = surface_heights(mesh, body.nominal, body.sticker_normals)
+    planes: dict[str, StickerPlane] = {}
+    for k, plane_name in enumerate(PLANE_NAMES):
+        plane = getattr(section.planes, plane_name)
+        met = heights[(body.plane_index == k) & np.isfinite(heights)]
+        if not len(met):
+            raise SensorFileError(
+                f"{name}.mesh {section.mesh}: no sticker of plane {plane_name} can be dropped, the "
+                "surface lies neither below nor above them"
+            )
+        point = tuple((np.array(plane.point) + met.max() * unit(plane.normal)).tolist())
+        planes[plane_name] = plane.model_copy(update={"point": point})
+    return section.model_copy(update={"planes": section.planes.model_copy(update=planes)})
+
+
+def _require_on_surface(mesh: trimesh.Trimesh, body: MarkedBody, radius: float) -> None:
+    """Raise SensorFileError, with a name, unless all stickers lie on the surface of a mesh."""
+    from trimesh.proximity import closest_point_naive  # needs no R-tree
+
+    heights = surface_heights(mesh, body.nominal, body.sticker_normals)
+    for sticker, place, height in zip(body.sticker_ids, body.nominal, heights, strict=True):
+        # A sticker that juts out over an edge lies near the surface, although not along its normal.
+        away = float(closest_point_naive(mesh, place[None])[1][0])
+        deep = height > DEEPEST
+        if deep or away > radius:
+            words = f"{height:.4g} m below" if deep else f"{away:.4g} m away from"
+            raise SensorFileError(
+                f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, at most "
+                f"{DEEPEST if deep else radius:g} m is possible; {body.name}.drop = true moves the "
+                "planes of stickers onto the surface"
+            )
