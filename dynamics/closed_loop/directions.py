@@ -18,6 +18,11 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     groups : RigidGroups, optional
         As for `differentiate_servo`. Columns that they spare are free for directions.
 
+    Returns
+    -------
+    int
+        Largest number of directions.
+
     Examples
     --------
     >>> closed_loop.most_directions(robot)

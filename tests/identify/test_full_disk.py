@@ -242,6 +242,7 @@ CASES = {
         " --out {place}/new/pictures",
         once=("cmmsim.calibration.render_pairs",),
     ),
+    "teach": Case("teach --render 2 --sensor {made}/small.toml --out {place}/new/pairs"),
     "study": Case(
         "study {made}/mine.toml --workers 0 --out {place}/new/study",
         once=("identify.studies.figures._figures",),
@@ -557,7 +558,8 @@ def full_disk(case, disk, folder, capsys, count):
 
 def test_every_command_is_in_the_table_or_writes_the_cache_alone():
     # `paper` writes two runs, and after them all other files at once: tests/identify/test_paper.py
-    written = {case.words for case in CASES.values()} | {"warm-up", "paper"}
+    # `measure` writes one table at once: tests/identify/test_photograph_commands.py
+    written = {case.words for case in CASES.values()} | {"warm-up", "paper", "measure"}
     assert written == {" ".join(words) for words in COMMANDS}
 
 

@@ -267,7 +267,7 @@ PAYLOAD = {"identification.scale_anchor": "payload", "identification.anchor_std"
         ),
         (
             {"payload.Ixx_kg_m2": 100.0},
-            ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2"],
+            ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 by 1e+02 kg m2"],
         ),
         ({"payload.mass_std_kg": 9.0}, ["payload: mass_std_kg = 9 kg exceeds mass_kg = 8 kg"]),
         ({"plant.friction": "smoothed"}, ["smoothing_velocity_rad_s"]),
