@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dynamics.checks import floats
+from dynamics.checks import check_type, floats
 from dynamics.errors import SimulationError
 from dynamics.parameters import RigidGroups
 from dynamics.robot import Robot
@@ -23,11 +23,17 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     int
         Largest number of directions.
 
+    Raises
+    ------
+    SimulationError
+        If `robot` is not a Robot.
+
     Examples
     --------
     >>> closed_loop.most_directions(robot)
     44
     """
+    check_type("robot", robot, Robot, SimulationError)
     layout = robot.layout
     shown = len(layout.names)
     if groups is not None:

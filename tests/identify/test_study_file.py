@@ -105,6 +105,7 @@ def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
         "stickers.per_plane",
         "rig.left.distortion",
         "rig.right.distortion",
+        "rig.covariance.matrix",
     }
     without |= {
         f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")
