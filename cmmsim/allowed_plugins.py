@@ -29,6 +29,7 @@ DEFAULT_DETECTOR = "maximum_likelihood"
 RENDERERS = {
     "analytic": "cmmsim.imaging.analytic:ANALYTIC",
     "pyrender": "cmmsim.imaging.pyrender_renderer:PYRENDER",
+    "scene": "cmmsim.imaging.scene_renderer:SCENE",
     "statistical": "cmmsim.without_images.drawn_stickers:STATISTICAL",
 }
 AUTO = "auto"  # pyrender where OpenGL works, else analytic

@@ -1,4 +1,4 @@
-"""Rendering of many small windows in one pass. No other module imports pyrender.
+"""Rendering of many small windows in one pass.
 
 pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers have
 one channel only, which draws faster than pyrender's four. One large frame buffer, the atlas, has a
@@ -77,6 +77,11 @@ def require_opengl() -> None:
     _shared_atlas()
 
 
+def opengl_context() -> Any:
+    """Return the platform of this process's only OpenGL context. Raises OpenGLMissingError."""
+    return _shared_atlas().platform
+
+
 @lru_cache(maxsize=1)
 def _shared_atlas() -> "_Atlas":
     """Return the only atlas of this process. A second one would leak memory."""
@@ -147,6 +152,11 @@ class _Atlas:
         self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
         self._known: weakref.WeakKeyDictionary[Drawable, _Uploaded] = weakref.WeakKeyDictionary()
 
+    @property
+    def platform(self) -> Any:
+        """pyrender's platform, which owns the context."""
+        return self._context._platform
+
     def draw(
         self,
         drawable: Drawable,
@@ -160,7 +170,7 @@ class _Atlas:
 
         The result is valid until the next call.
         """
-        self._context._platform.make_current()
+        self.platform.make_current()
         # Drawn pixels per radian.
         samples = views.exposures[0].camera.focal_px * cell[0] / views.size[0]
         known = self._uploaded(drawable, samples)

@@ -153,7 +153,7 @@ def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: 
     if len(hollow):
         raise SensorFileError(
             f"{marked.name}: sticker {', '.join(hollow)} lies in a hollow of the mesh, and the "
-            f"renderer {renderer!r} sees the convex hull of a mesh; choose renderer 'pyrender'"
+            f"renderer {renderer!r} sees the convex hull of a mesh; choose 'pyrender' or 'scene'"
         )
 
 

@@ -35,7 +35,7 @@ def acceptance(
     renderer: Annotated[
         str | None,
         typer.Option(
-            help="pyrender, analytic, auto, or statistical, which renders no images.",
+            help="pyrender, analytic, scene, auto, or statistical, which renders no images.",
             show_default="the sensor file's renderer",
         ),
     ] = None,

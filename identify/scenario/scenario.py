@@ -63,7 +63,7 @@ class Scenario(Section):
     )
     renderer: str = Field(
         "auto",
-        description="renderer of the images; pyrender; analytic; auto, which is pyrender if "
+        description="renderer of the images; pyrender; analytic; scene; auto, which is pyrender if "
         "OpenGL works; module:function; or statistical, which has no images and draws errors of "
         "sticker centres",
     )

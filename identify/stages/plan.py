@@ -55,7 +55,7 @@ def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[s
     calibrated_at = time.perf_counter()
     _ = setup.plant, setup.sensor
     # Missing OpenGL is reported before the search for a trajectory, which takes long.
-    if setup.scenario.renderer == "pyrender":
+    if setup.scenario.renderer in ("pyrender", "scene"):
         cmmsim.require_opengl()
     trajectories = _designed(setup, progress)
     excited_at = time.perf_counter()

@@ -21,7 +21,7 @@ from cmmsim.imaging.layer_kernels import (
     draw_layers,
     polygon_contains,
 )
-from cmmsim.imaging.renderer import Drawable
+from cmmsim.imaging.renderer import Drawable, View, choose_renderer
 from cmmsim.imaging.scene_bodies import ConvexSolid, solid_mesh
 from cmmsim.imaging.stereo_camera import SUPERSAMPLING
 from cmmsim.imaging.view_kernels import convex_hull, solid_outlines
@@ -78,6 +78,38 @@ def test_both_renderers_agree_in_every_sticker_centre(lens, supersampling, count
             other, pose, supersampling, size=18
         )
         assert np.abs(gap).max() < 0.005
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize(
+    ("lens", "count"), [("perfect", 1), pytest.param("all", 3, marks=pytest.mark.slow)]
+)
+def test_the_scene_of_pyrender_itself_shows_every_sticker_at_the_same_place(lens, count):
+    """It takes pyrender's camera, light and materials for the window's matrices and levels."""
+    scene, others = exact(lens, renderer="scene"), ("analytic", "pyrender")
+    for pose in poses_about_home(scene, count):
+        centres = centre_errors(scene, pose, size=18)
+        for name in others:
+            gap = centres - centre_errors(exact(lens, renderer=name), pose, size=18)
+            assert np.abs(gap).max() < 0.01
+
+
+@pytest.mark.rendering
+def test_the_scene_lights_a_face_by_its_turn_and_leaves_the_other_renderer_as_it_was():
+    """A face has half of its level from all sides, and the rest by the cosine to the camera."""
+    box = solid_mesh(trimesh.creation.box((0.2, 0.2, 0.2)), 0.6)
+    drawable, camera = Drawable([box], [0], 1.5), exact().rig.left.ideal
+
+    def seen(renderer, turn):
+        place = pose_to_transform([0.0, 0.0, 1.5, 0.0, turn, 0.0])
+        corner = tuple(np.rint(camera.centre).astype(int) - 4)
+        view = View(camera, place[None], corner, (8, 8))
+        return choose_renderer(renderer).draw(drawable, [view], 3, 0.2)[0].mean()
+
+    before = seen("pyrender", 0.0)
+    for turn in (0.0, 0.6):
+        assert seen("scene", turn) == pytest.approx(0.6 * 0.5 * (1.0 + np.cos(turn)), abs=0.01)
+    assert seen("pyrender", 0.0) == before == pytest.approx(0.6, abs=0.003)
 
 
 @pytest.mark.rendering
