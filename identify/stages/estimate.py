@@ -10,6 +10,7 @@ import xarray as xr
 from dynamics import load_robot
 from identify.diagnosis.diagnose import diagnose
 from identify.estimation import identification
+from identify.estimation.result import IdentificationResult
 from identify.files.atomic import write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
 from identify.files.run_folder import (
@@ -98,6 +99,19 @@ def identify_own(
     write_files(files | found, parents=True)
 
 
+LITTLE = 0.1
+"""Excess of the residual under the logged commands, as a share of the noise, that is not asked.
+
+Errors of teaching that count as exact leave as much.
+"""
+
+
+def _is_missed(result: IdentificationResult) -> bool:
+    """Return whether the model misses its records by so much that causes are asked."""
+    excess = result.driven_misfit.found - (1 + LITTLE) * result.driven_misfit.expected
+    return result.misfit.significant or result.whiteness.suspicious or excess > 0
+
+
 def _identified_files(
     run_folder: RunFolder,
     records: Mapping[str, xr.Dataset],
@@ -117,7 +131,7 @@ def _identified_files(
     diagnosis = None
     # Causes are asked of joint commands, one per frame.
     in_frames = result.drive.in_loop and not any(map(recording.is_timed, records.values()))
-    if in_frames and not result.explained:
+    if in_frames and _is_missed(result):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnose(list(records.values()), result, robot, scenario)
             advance()
