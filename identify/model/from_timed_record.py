@@ -35,7 +35,7 @@ from identify.record.stored_common_errors import (
 REACH = 4.0
 """Largest offset of a clock that is tried, in its standard deviations."""
 
-SAME_RATE = 0.2
+SAME_RATE = 0.05
 """Largest relative difference of the rate of commands from the frame rate, if they are the same."""
 
 
@@ -95,9 +95,10 @@ def _settings(settings: LoopSettings, acting: Array) -> LoopSettings:
     intervals = np.diff(acting)
     intervals = intervals[intervals > 0]
     usual = float(np.median(intervals))
-    if abs(usual * rate_hz - 1) > SAME_RATE:
-        # The mean is not rounded to the digits of a log, and the limits exclude gaps.
-        rate_hz = 1.0 / float(intervals[np.abs(intervals - usual) <= usual / 2].mean())
+    # The mean is not rounded to the digits of a log, and the limits exclude gaps.
+    mean = float(intervals[np.abs(intervals - usual) <= usual / 2].mean())
+    if abs(mean * rate_hz - 1) > SAME_RATE:
+        rate_hz = 1.0 / mean
     steps = ceil(settings.steps_per_frame * settings.timing.frame_rate_hz / rate_hz - 1e-9)
     timing = FrameTiming(rate_hz, 0.0, settings.timing.hold)
     return replace(settings, timing=timing, steps_per_frame=max(1, steps))

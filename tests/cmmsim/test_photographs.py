@@ -120,7 +120,7 @@ def pose_errors(taught, poses):
     return sensor.measure_many(poses).poses - poses, common
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_places_reach_the_cramer_rao_bound_and_all_stated_covariances_are_true():
     """100 teachings from 24 pairs: the mean of normalised errors has a deviation of 0.02, and that
     of 20 mean pose errors of 0.13. Poses scatter as those after the simulated teaching.
@@ -175,7 +175,7 @@ def test_a_sensor_measures_with_what_it_was_taught_from_frames(tmp_path):
         assert error @ np.linalg.solve(measured.single_covariance, error) < 22.5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_with_ten_images_of_each_pose_poses_are_as_accurate_as_after_the_simulated_teaching():
     sensor = statistical()
     poses, near = np.repeat(spread_poses(PAIRS, 7), 10, axis=0), spread_poses(200, 8, 0.009, 0.035)
@@ -199,7 +199,7 @@ def test_places_from_rendered_images_are_as_accurate_as_stated():
     assert square / freedom == pytest.approx(1.0, abs=0.57)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_cameras_are_adjusted_within_their_covariance_and_all_errors_stay_as_stated():
     """Ten rigs as known from fifteen photographs of a board. Teaching, rig and poses: means of
     normalised errors, with deviations of 0.06, 0.1 and 0.18."""

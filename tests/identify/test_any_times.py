@@ -65,7 +65,14 @@ def test_commands_that_change_while_no_pose_is_logged_drive_the_model():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["begun in motion", "two clocks", "gaps of the log"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "begun in motion",
+        pytest.param("two clocks", marks=pytest.mark.thorough),
+        pytest.param("gaps of the log", marks=pytest.mark.thorough),
+    ],
+)
 def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
     known = identify(record_in("rounded to ms", 3))
     record = record_in(form, 3)
@@ -87,7 +94,7 @@ def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
         assert abs(drift[0] - DRIFT) < CHANCE * drift[1]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_clock_that_is_not_stated_is_named_where_it_explains_the_record():
     telemetry, _ = FORMS["two clocks"](0)
     record = record_of(replace(telemetry, reference=None), rss6(), scenario_of(), COVARIANCE)
@@ -98,7 +105,7 @@ def test_a_clock_that_is_not_stated_is_named_where_it_explains_the_record():
     assert said.startswith("the commands seem to act 12.")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_records_of_several_days_share_the_robot_and_have_clocks_of_their_own():
     """Two records say more than each of them, and only one of them has another clock."""
     one, other = record_in("rounded to ms", 4), record_in("two clocks", 5)

@@ -100,7 +100,7 @@ def test_mujoco_moves_the_robot_as_our_loop_does():
     np.testing.assert_allclose(theirs[2], ours[2], rtol=0, atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_record_of_mujoco_is_identified_with_its_bodies_and_friction():
     reference, times, theirs = mujoco_run(1, 5.0)
     result = identified(reference, times, *theirs[1:])

@@ -64,7 +64,7 @@ def test_standard_deviations_follow_the_sizes_of_bodies():
     assert not body_error_stds(robot, quick(**WORKSHOP).model, ())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("driven", [True, False], ids=["commands", "servo"])
 def test_an_error_acts_as_the_parameter_that_the_model_lacks(driven):
     """Poses of a model with errors, and of one that has them as parameters, one by one and all."""
@@ -163,7 +163,7 @@ def intervals_held(record, result):
     return table[table.identifiable].holds.to_numpy(dtype=bool)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_robot_that_is_not_as_its_file_models_it_is_identified(own_robot):
     record, result = results(own_robot, 1, duration_s=5.0)
     hits = intervals_held(record, result)
