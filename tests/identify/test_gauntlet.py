@@ -331,7 +331,7 @@ def test_the_trouble_of_known_seeds_is_named_and_its_remedy_lets_the_intervals_h
     assert np.mean(held) > 0.85
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_writes_a_dozen_cases_that_it_continues_and_counts(tmp_path, capsys):
     folder = tmp_path / "gauntlet"
     given = ("--workers", 0, "--quiet", "--seed", 11, "--out", folder)
