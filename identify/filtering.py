@@ -5,6 +5,8 @@ Matlab's filtfilt, so the gain at the cutoff is 1/2. Modules of SciPy are loaded
 because every command reads a scenario, which uses only `padding_samples`.
 """
 
+from typing import Any
+
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
@@ -117,7 +119,12 @@ def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
     At least one sample must be ok.
     """
     frames = np.arange(len(ok))
-    return np.column_stack([np.interp(frames, frames[ok], column[ok]) for column in samples.T])
+    return interpolated(frames, frames[ok], samples[ok])
+
+
+def interpolated(times: NDArray[Any], known: NDArray[Any], values: Array) -> Array:
+    """Return values (k, m), which are known at times (k,), at other times (N,), linearly."""
+    return np.column_stack([np.interp(times, known, column) for column in values.T])
 
 
 def _finite(samples: ArrayLike) -> Array:

@@ -18,6 +18,7 @@ from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, OnCommands, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
+from identify.filtering import interpolated
 from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel
 
@@ -179,7 +180,7 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
     late = run.stated_latencies if run.latencies is None else run.latencies
     period = 1.0 / run.settings.timing.frame_rate_hz
     acting = found.time + late + period / 2
-    return np.stack([np.interp(acting, found.time, one) for one in carried.T], axis=1)
+    return interpolated(acting, found.time, carried)
 
 
 def torque_limit(run: LoopModel, peak: float) -> Cause:

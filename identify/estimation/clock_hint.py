@@ -29,9 +29,13 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
 
     warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
     """
-    runs = tuple(_with_clock(run) for run in problem.runs)
-    if not any(CLOCK_OFFSET in run.common.loop_std for run in runs):
+    unstated = [_lacks_clock(run) for run in problem.runs]
+    if not any(unstated):
         return ()
+    runs = tuple(
+        _with_clock(run) if lacks else run
+        for run, lacks in zip(problem.runs, unstated, strict=True)
+    )
     tried = replace(problem, runs=runs)
     try:
         found = output_error_searches(tried, warm, closed_loop=False, progress=SilentProgress())
@@ -43,8 +47,8 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
     if left > (1 - EXPLAINS) * misfit:
         return ()
     hints = []
-    for number, run in enumerate(judged.runs, start=1):
-        if CLOCK_OFFSET not in run.common.loop_std:
+    for number, (run, lacks) in enumerate(zip(judged.runs, unstated, strict=True), start=1):
+        if not lacks:
             continue
         errors = run.common.whole_factor @ most_likely(run, parameters)
         offset = 1e3 * errors[run.common.all_names.index(CLOCK_OFFSET)]
@@ -57,9 +61,12 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
     return tuple(hints)
 
 
+def _lacks_clock(run: LoopModel) -> bool:
+    """Return whether a run at any times states no clock of its commands."""
+    return isinstance(run, TimedModel) and CLOCK_OFFSET not in run.common.loop_std
+
+
 def _with_clock(run: LoopModel) -> LoopModel:
-    """Return a run at any times with a clock of its own. Other runs do not change."""
-    if not isinstance(run, TimedModel) or CLOCK_OFFSET in run.common.loop_std:
-        return run
+    """Return a run with a clock of its own."""
     common = replace(run.common, loop_std=run.common.loop_std | {CLOCK_OFFSET: TRIED_S})
     return replace(run, common=common, drawn=None, marginal=None)

@@ -131,53 +131,49 @@ def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Arr
 
 def common_error_estimates(
     problem: OutputErrorProblem, parameters: Array, whole: Array
-) -> CommonErrorEstimates:
-    """Return the estimated common errors of the first record of a problem `with_common_errors`.
+) -> list[CommonErrorEstimates]:
+    """Return the estimated common errors of each record of a problem `with_common_errors`.
 
     parameters (p,): the optimum. whole (p + k, p + k): covariance of the parameters and of the
     common errors, in prior standard deviations of the errors.
     """
-    run = problem.runs[0]
     count = len(parameters)
-    if run.marginal is None:
-        nothing = np.zeros(0)
-        return CommonErrorEstimates((), nothing, nothing, np.zeros((0, 0)), np.zeros((count, 0)))
-    factor = run.common.whole_factor
-    own = slice(count, count + len(factor))
-    return CommonErrorEstimates(
-        run.common.all_names,
-        np.sqrt(np.diag(factor @ factor.T)),
-        factor @ most_likely(run, parameters),
-        factor @ whole[own, own] @ factor.T,
-        whole[:count, own] @ factor.T,
-    )
-
-
-def clock_notes(problem: OutputErrorProblem, parameters: Array, whole: Array) -> tuple[str, ...]:
-    """Return a sentence for each record whose commands have a clock of their own.
-
-    Arguments are as for `common_error_estimates`.
-    """
-    notes = []
-    first = len(parameters)
-    for number, run in enumerate(problem.runs, start=1):
-        count = run.whitened_modes.shape[2]
-        own = slice(first, first + count)
-        first += count
-        names = list(run.common.all_names)
-        if not {CLOCK_OFFSET, CLOCK_DRIFT} & set(names):
+    found = []
+    first = count
+    for run in problem.runs:
+        if run.marginal is None:
+            nothing = np.zeros(0)
+            square = np.zeros((0, 0))
+            found.append(CommonErrorEstimates((), nothing, nothing, square, np.zeros((count, 0))))
             continue
         factor = run.common.whole_factor
-        estimate = dict(zip(names, factor @ most_likely(run, parameters), strict=True))
-        variances = np.diag(factor @ whole[own, own] @ factor.T)
-        std = dict(zip(names, np.sqrt(variances), strict=True))
+        own = slice(first, first + len(factor))
+        first += len(factor)
+        estimates = CommonErrorEstimates(
+            run.common.all_names,
+            np.sqrt(np.diag(factor @ factor.T)),
+            factor @ most_likely(run, parameters),
+            factor @ whole[own, own] @ factor.T,
+            whole[:count, own] @ factor.T,
+        )
+        found.append(estimates)
+    return found
+
+
+def clock_notes(records: Sequence[CommonErrorEstimates]) -> tuple[str, ...]:
+    """Return a sentence for each of several records whose commands have a clock of their own."""
+    notes = []
+    for number, found in enumerate(records, start=1):
+        std = dict(zip(found.names, found.std.tolist(), strict=True))
         said = []
-        if CLOCK_OFFSET in names:
-            offset, doubt = 1e3 * estimate[CLOCK_OFFSET], 1e3 * std[CLOCK_OFFSET]
+        if CLOCK_OFFSET in std:
+            offset, doubt = 1e3 * found.learned[CLOCK_OFFSET], 1e3 * std[CLOCK_OFFSET]
             said.append(f"{offset:.3f} ± {doubt:.3f} ms after their logged times")
-        if CLOCK_DRIFT in names:
-            drift, doubt = 1e6 * estimate[CLOCK_DRIFT], 1e6 * std[CLOCK_DRIFT]
+        if CLOCK_DRIFT in std:
+            drift, doubt = 1e6 * found.learned[CLOCK_DRIFT], 1e6 * std[CLOCK_DRIFT]
             said.append(f"later by {drift:.1f} ± {doubt:.1f} us every second")
-        of_record = f" of record {number}" if len(problem.runs) > 1 else ""
-        notes.append(f"the commands{of_record} act {', and '.join(said)}: their clock is another")
+        if said:
+            of_record = f" of record {number}" if len(records) > 1 else ""
+            what = ", and ".join(said)
+            notes.append(f"the commands{of_record} act {what}: their clock is another")
     return tuple(notes)

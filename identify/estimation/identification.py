@@ -125,9 +125,10 @@ def identify(
     driven = by_commands.linearised() if closed_loop else judged
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
+    errors = common_error_estimates(judged, solution.parameters, uncertainty.whole)
     told = (
         *reading_notes(records),
-        *clock_notes(judged, solution.parameters, uncertainty.whole),
+        *clock_notes(errors),
         *(() if explained.model_holds else clock_hints(problem, warm, explained.misfit.found)),
         *command_time_warnings(records, side.timing),
         *drift_warnings(records),
@@ -143,7 +144,7 @@ def identify(
         std=uncertainty.std,
         covariance=uncertainty.covariance,
         scale_anchor=problem.anchor,
-        common_errors=common_error_estimates(judged, solution.parameters, uncertainty.whole),
+        common_errors=errors[0],
         iterations=sum(one.solution.iterations for one in searches.values()),
         evaluations=sum(one.solution.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,

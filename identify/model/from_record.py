@@ -3,17 +3,14 @@
 A record that is not suitable for an identification is refused, see `identify.record.checks`.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import xarray as xr
 
 from identify.errors import EstimationError
-from identify.model.body_errors import body_error_stds
 from identify.model.from_timed_record import timed_model
-from identify.model.loop_errors import loop_error_stds
 from identify.model.loop_model import LoopModel
 from identify.model.model_side import ModelSide
+from identify.model.recorded_errors import with_recorded_errors
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
     check_channels,
@@ -25,10 +22,8 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.conditions import drift_warnings, logged_latencies, takes_torques
-from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.load import recorded_payload
 from identify.record.recording import is_timed, poses, recorded_reference
-from identify.record.stored_common_errors import LATENCY, CommonErrors, read_common_errors
 
 
 def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
@@ -96,25 +91,5 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         acted=logged_latencies(record, side.timing),
     )
     # Common errors are added to the model afterwards, because they need its whitener.
-    run = replace(run, common=_common_errors(record, side, run))
+    run = with_recorded_errors(run, record, side, run.reference.poses)
     return torque_model(run, side.low_pass) if takes_torques(record) else run
-
-
-def _common_errors(record: xr.Dataset, side: ModelSide, run: LoopModel) -> CommonErrors:
-    """Return the common errors of the poses that are estimated beside the parameters."""
-    kinds = side.nuisances
-    geometry = None
-    covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
-    if covariance is not None:
-        geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
-    stds = loop_error_stds(run.robot, side.model, side.timing.latency_std_s, kinds)
-    if takes_torques(record):
-        # no zero and no scale of joint commands acts under torques
-        stds = {name: std for name, std in stds.items() if name == LATENCY}
-    return replace(
-        read_common_errors(record, kinds),
-        loop_std=stds,
-        geometry=geometry,
-        body_std=body_error_stds(run.robot, side.model, kinds),
-        whitener=run.whitener,
-    )

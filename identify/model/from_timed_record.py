@@ -10,27 +10,21 @@ from dynamics import DynamicsError
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.filtering import filtered_derivatives
-from identify.model.body_errors import body_error_stds
+from identify.filtering import filtered_derivatives, interpolated
 from identify.model.likely_delay import likely_delay
-from identify.model.loop_errors import loop_error_stds
 from identify.model.model_side import ModelSide
+from identify.model.recorded_errors import with_recorded_errors
 from identify.model.stretch import Stretch, begun_stretch
-from identify.model.timed_model import TimedModel, grid_times, interpolated
+from identify.model.timed_model import TimedModel, grid_times
 from identify.record.checks import (
     check_channels,
     check_timed_units,
     checked_covariance,
 )
 from identify.record.conditions import takes_torques
-from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.load import recorded_payload
 from identify.record.recording import STRETCH, poses
-from identify.record.stored_common_errors import (
-    CLOCK_DRIFT,
-    CLOCK_OFFSET,
-    read_common_errors,
-)
+from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
 
 REACH = 4.0
 """Largest offset of a clock that is tried, in its standard deviations."""
@@ -83,7 +77,8 @@ def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
         acting=acting,
         stretches=_stretches(record, side, settings, covariance),
     )
-    return _at_likely_offset(_with_errors(run, record, side), side)
+    own = _own_errors(run, side)
+    return _at_likely_offset(with_recorded_errors(run, record, side, run.without_gaps(), own), side)
 
 
 def _settings(settings: LoopSettings, acting: Array) -> LoopSettings:
@@ -150,28 +145,17 @@ def _stretches(
     return tuple(found)
 
 
-def _with_errors(run: TimedModel, record: xr.Dataset, side: ModelSide) -> TimedModel:
-    """Return the model with the common errors of its poses, loop, clock and starts."""
-    kinds = side.nuisances
-    geometry = None
-    covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
-    if covariance is not None:
-        seen = run.without_gaps()
-        geometry = GeometryErrors(run.robot, covariance, seen, run.whitener)
+def _own_errors(run: TimedModel, side: ModelSide) -> dict[str, float]:
+    """Return the standard deviations of the errors of a record's clock and starts, by name."""
+    stds: dict[str, float] = {}
     timing = side.timing
-    stds = loop_error_stds(run.robot, side.model, timing.latency_std_s, kinds)
-    if "clock" in kinds:
+    if "clock" in side.nuisances:
         clock = {CLOCK_OFFSET: timing.clock_offset_std_s, CLOCK_DRIFT: timing.clock_drift_std}
         stds |= {name: std for name, std in clock.items() if std}
-    if "start" in kinds:
+    if "start" in side.nuisances:
         for stretch in run.stretches:
             stds |= stretch.stds
-    of_poses = read_common_errors(record, kinds)
-    bodies = body_error_stds(run.robot, side.model, kinds)
-    common = replace(
-        of_poses, loop_std=stds, body_std=bodies, geometry=geometry, whitener=run.whitener
-    )
-    return replace(run, common=common)
+    return stds
 
 
 def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from identify.arrays import Array
-from identify.model.timed_model import interpolated
+from identify.filtering import interpolated
 
 DELAYS = 50
 """Number of delays of either sign that are tried first."""

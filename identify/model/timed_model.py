@@ -31,6 +31,7 @@ from dynamics.closed_loop import (
 )
 from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
+from identify.filtering import interpolated
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
 from identify.model.loop_errors import lowest_errors
@@ -278,9 +279,3 @@ def grid_times(times: Array, rate_hz: float) -> Array:
     """Return times one period apart over the range of given times (N,)."""
     frames = int((times[-1] - times[0]) * rate_hz) + 1
     return np.asarray(times[0] + np.arange(frames) / rate_hz)
-
-
-def interpolated(times: Array, known: Array, values: Array) -> Array:
-    """Return values (k, m), which are known at times (k,), at other times (N,)."""
-    columns = [np.interp(times, known, column) for column in values.T]
-    return np.column_stack(columns)

@@ -225,7 +225,7 @@ def _event_times(telemetry: Telemetry, timing: Timing) -> tuple[Array, Array, li
     if grid is not None and good.sum() > 30:
         covariance = poses.covariance[good].mean(axis=0)
         found = likelier_times(times[good], poses.pose[good], covariance, rate_hz)
-        if found is not times[good] and not np.array_equal(found, times[good]):
+        if not np.array_equal(found, times[good]):
             off = float(np.std(times - grid))
             notes = [
                 f"poses are smoother at frames of {1 / np.diff(grid).min():.4f} Hz than at the "

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.arrays import Array
+from identify.filtering import interpolated
 
 FINEST_S = 1e-3
 """Smallest step, s, of the lags that are tried. The best is then refined by a parabola."""
@@ -91,7 +92,7 @@ def _correlation(time: Array, coordinates: Array, command_time: Array, command: 
     inside = (time >= command_time[0]) & (time <= command_time[-1])
     if inside.sum() < FEWEST:
         return 0.0
-    held = np.stack([np.interp(time[inside], command_time, one) for one in command.T], axis=1)
+    held = interpolated(time[inside], command_time, command)
     one, other = held - held.mean(axis=0), coordinates[inside] - coordinates[inside].mean(axis=0)
     scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
     moving = scale > 0

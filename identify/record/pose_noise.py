@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from identify.arrays import Array
+from identify.filtering import interpolated
 
 WINDOW = 9
 """Number of poses in a window."""
@@ -170,7 +171,7 @@ def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     """
     even = np.linspace(time[0], time[-1], len(time))
     rate = (len(time) - 1) / (time[-1] - time[0])
-    values = np.stack([np.interp(even, time, one) for one in poses.T], axis=1)
+    values = interpolated(even, time, poses)
     length = min(max(len(time) // SEGMENTS, SHORTEST), len(time))
     frequency, power = welch(values, rate, nperseg=length, detrend="linear", axis=0)
     highest = 0.0

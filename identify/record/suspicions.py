@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dynamics import Robot
 from identify.arrays import Array
+from identify.filtering import interpolated
 from identify.record.motion_lag import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 
@@ -229,7 +230,7 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
 def _commands_at(telemetry: Telemetry, time: Array) -> Array:
     """Return the commands (N, n) at times (N,), and the nearest where there are none."""
     commands = telemetry.commands
-    return np.stack([np.interp(time, commands.time, one) for one in commands.command.T], axis=1)
+    return interpolated(time, commands.time, commands.command)
 
 
 def _all_axes() -> Iterator[tuple[tuple[str, ...], Array]]:

@@ -3,7 +3,7 @@
 Each field states its unit and its limits. A section checks only its own values.
 """
 
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
@@ -171,6 +171,23 @@ GEOMETRY_KNOWN = ["exact", "calibrated"]
 """Ways in which a geometry can be known, besides the path of a calibrated robot."""
 
 
+Nuisance = Literal[
+    "rig",
+    "teaching",
+    "exposure",
+    "latency",
+    "clock",
+    "start",
+    "zeros",
+    "scale",
+    "geometry",
+    "centres",
+    "products",
+    "passive_friction",
+]
+"""Kinds of errors that all poses of a record have in common."""
+
+
 class Identification(Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
@@ -199,36 +216,8 @@ class Identification(Section):
         description="parameters that are known better than the initial guess: { name = { value, "
         "std } }",
     )
-    nuisances: list[
-        Literal[
-            "rig",
-            "teaching",
-            "exposure",
-            "latency",
-            "clock",
-            "start",
-            "zeros",
-            "scale",
-            "geometry",
-            "centres",
-            "products",
-            "passive_friction",
-        ]
-    ] = Field(
-        [
-            "rig",
-            "teaching",
-            "exposure",
-            "latency",
-            "clock",
-            "start",
-            "zeros",
-            "scale",
-            "geometry",
-            "centres",
-            "products",
-            "passive_friction",
-        ],
+    nuisances: list[Nuisance] = Field(
+        list(get_args(Nuisance)),
         description="errors common to all poses that are estimated beside the parameters",
     )
     physical_consistency: bool = Field(
