@@ -42,7 +42,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     --------
     >>> import dynamics
     >>> dynamics.load_robot("rss6")
-    Robot('rss6', 64 parameters, sets: initial, identified)
+    Robot('rss6', 64 parameters, sets: guess, truth)
     """
     return Robot(read_robot_file(name_or_path))
 
@@ -65,7 +65,7 @@ class Robot(RobotDynamics):
     parameter_names : tuple of str
         Names of the p dynamic parameters, such as "platform.mass" and "joint1.coulomb".
     nominal_parameters : ndarray, shape (p,)
-        The set `initial` of the robot file.
+        The set `guess` of the robot file.
     parameter_sets : dict
         All sets of the robot file by name.
     layout : ParameterLayout
@@ -188,15 +188,15 @@ class Robot(RobotDynamics):
 
         Examples
         --------
-        >>> identified = robot.parameter_sets["identified"]
-        >>> other = robot.with_parameters(identified.vector)
-        >>> np.array_equal(other.nominal_parameters, identified.dynamic)
+        >>> truth = robot.parameter_sets["truth"]
+        >>> other = robot.with_parameters(truth.vector)
+        >>> np.array_equal(other.nominal_parameters, truth.dynamic)
         True
         """
         count = len(self.parameter_names)
         values = floats("parameters", parameters, (len(self.layout.names),))
         dynamic = self.layout.check(values[:count])
-        sets = {"initial": ParameterSet(dynamic, values[count:])}
+        sets = {"guess": ParameterSet(dynamic, values[count:])}
         return Robot(RobotDescription(self.name, self.geometry, sets), self.functions_of)
 
     def with_full_bodies(self, names: Sequence[str]) -> Robot:

@@ -76,7 +76,8 @@ class RobotFile(Strict):
         "has one value, or a list with one value per leg"
     )
     parameters: dict[str, Parameters] = Field(
-        description="named sets; `initial` has the initial guess of identification"
+        description="named sets: `guess` is the initial guess of an identification, and `truth` "
+        "is the robot that an experiment simulates by default"
     )
 
     @field_validator("inertia", mode="before")
@@ -235,9 +236,10 @@ def parsed_robot(text: str, source: str) -> RobotDescription:
         }
     except DynamicsError as error:
         raise RobotFileError(f"{source}: {error}") from error
-    if "initial" not in sets:
+    if "guess" not in sets:
         raise RobotFileError(
-            f"{source} needs a parameter set `initial`; it has {sorted(sets) or 'none'}"
+            f"{source} needs a parameter set `guess` (what is known beforehand); it has "
+            f"{sorted(sets) or 'none'}"
         )
     return RobotDescription(content.name, geometry, sets)
 

@@ -44,7 +44,7 @@ class RobotPlatform:
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
         self.layout = self.geometry.layout
         self.parameter_names = self.layout.dynamic_names
-        self.nominal_parameters = description.parameter_sets["initial"].dynamic
+        self.nominal_parameters = description.parameter_sets["guess"].dynamic
 
     def __repr__(self) -> str:
         count = len(self.parameter_names)

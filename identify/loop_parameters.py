@@ -31,7 +31,7 @@ from identify.scenario.payload import Payload
 from identify.scenario.plant_sections import FILTERED, Control, Servo
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
-NOMINAL = "initial"
+NOMINAL = "guess"
 """Default parameter set."""
 
 

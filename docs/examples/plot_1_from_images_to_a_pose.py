@@ -46,8 +46,8 @@ plt.show()
 #
 # One sticker
 # -----------
-# A sticker has a radius of about four pixels. The pixels blur its edge, and all grey values have noise. The centre of
-# the ellipse is nevertheless found to about a hundredth of a pixel, because it depends on dozens of pixels.
+# The image of a sticker is an ellipse with a radius of about four pixels. Its edge is blurred, and all grey values have
+# noise. Its centre is nevertheless found to about a hundredth of a pixel, because dozens of pixels contribute to it.
 
 x, y = measured.left_pixels[0]
 column, row = round(x), round(y)
@@ -67,8 +67,8 @@ plt.show()
 # %%
 # The pose and its covariance
 # ---------------------------
-# A measurement states a covariance. It is the noise of the grey values, propagated through the fit of the ellipses,
-# triangulation and the fit of the pose.
+# A measurement states the covariance of its pose. It is computed from the noise of the grey values, propagated through
+# the fit of the ellipses, the triangulation, and the fit of the pose.
 
 error = measured.pose - pose
 claimed = np.sqrt(np.diag(measured.covariance))
@@ -82,9 +82,9 @@ for name, unit, e, s in zip(
     print(f"{name:6s} error {e:7.2f} {unit:5s} claimed standard deviation {s:6.2f} {unit}")
 
 # %%
-# A single error proves nothing. Repeated measurements check the stated noise: here the same pose is
-# measured 300 times, and the standard deviation of the results is compared with the claimed one.
-# Both bars have the same height if the claim is right.
+# A single error proves nothing. Therefore the same pose is measured 300 times, and the standard
+# deviation of the results is compared with the claimed one. Both bars have the same height if the
+# claim is right.
 
 poses = np.array([sensor.measure(pose).pose for _ in range(300)])
 spread = poses.std(axis=0, ddof=1)
@@ -112,9 +112,9 @@ plt.show()
 # What does not average out
 # -------------------------
 # Before its first measurement the sensor determines the frames of base and platform and the positions of the stickers,
-# from pictures of the platform at home. This is called *teaching*. The error of teaching is the same in every later
-# frame, so that repeated measurements do not show it, and the covariance above does not contain it. A measurement states
-# it separately:
+# from images of the platform at home. This is called *teaching*. The error of teaching is the same in every later
+# frame. Repeated measurements do not show it, and the covariance above does not contain it. A measurement states the
+# covariance of this error separately:
 
 taught = np.sqrt(np.diag(measured.common_covariance))
 offset = poses.mean(axis=0) - pose

@@ -3,9 +3,9 @@ From a motion to parameters with intervals
 ==========================================
 
 This page does one experiment and identifies the robot from it. A robot moves along a trajectory that
-shows its dynamics, the stereo sensor measures its platform, and a visual servo closes the loop
-around these measurements. From the record, masses, inertias, friction and gains are identified,
-each with an interval.
+shows its dynamics. The stereo sensor measures the pose of its platform, and a visual servo corrects
+the motion by it. From the record of poses and commands, masses, inertias, friction and gains are
+identified, each with a 95 % interval.
 """
 
 import matplotlib.pyplot as plt
@@ -20,9 +20,8 @@ POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 # %%
 # The experiment
 # --------------
-# A *scenario* holds everything that decides an experiment. ``quick`` is a short built-in one: the paper's six-legged
-# robot ``rss6``, ten seconds of motion, and 60 frames per second. Here the images are drawn by the renderer that needs
-# no OpenGL.
+# A *scenario* holds the settings of an experiment. ``quick`` is a short built-in one: the paper's six-legged robot
+# ``rss6``, ten seconds of motion, and 60 frames per second. The renderer ``analytic`` draws the images without OpenGL.
 
 scenario = identify.load_scenario("quick").with_overrides({"renderer": "analytic"})
 robot = dynamics.load_robot(scenario.robot)
@@ -38,8 +37,8 @@ print(
 
 # %%
 # The record holds the desired poses, the measured poses and the commands to the joints. The servo
-# lags behind the reference. This does no harm, because the parameters are estimated through the
-# closed loop.
+# lags behind the desired poses. This does no harm, because the model that is identified has the same
+# servo and lags in the same way.
 
 time = record["time"]
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
@@ -65,9 +64,9 @@ plt.show()
 # %%
 # The estimate
 # ------------
-# The estimator gets the record, the geometry of the robot and an initial guess, the manufacturer's figures, which have
-# no friction. It never sees the truth. A linear fit improves the guess. Then the closed loop of the model is fitted to
-# the measured poses.
+# The estimator gets the record, the geometry of the robot, and an initial guess: the manufacturer's values, without
+# friction. It never sees the truth. A linear fit improves the guess. Then the parameters are changed until the closed
+# loop of the model moves as the measured poses do.
 
 result = identify.identify(record, robot, scenario)
 print(result)
@@ -75,9 +74,9 @@ table = result.to_dataframe()
 table.loc[table["identifiable"], ["unit", "initial", "estimate", "low", "high"]].round(4)
 
 # %%
-# The table shows the parameters that this record identifies. The poses do not determine the others
-# one by one, so that they are not reported as numbers. The poses determine *groups*, weighted sums
-# of parameters, which have estimates and intervals of their own:
+# The table shows the parameters that this record determines one by one. The others are not reported as
+# numbers, because the poses determine only weighted sums of them. These sums, called *groups*, have
+# estimates and intervals of their own:
 
 groups = result.groups
 sums = [k for k in range(len(groups.names)) if np.count_nonzero(groups.combinations[k]) > 1]
@@ -89,7 +88,7 @@ for k in sums[:6]:
 # %%
 # Comparison with the truth
 # -------------------------
-# In a simulation the truth is known. It is in a separate group of the record's file, which the estimator never opens.
+# In a simulation the truth is known: it is the parameter set of the robot file with which the simulated robot moved.
 # How many of the 95 % intervals contain it?
 
 truth = robot.parameter_sets[scenario.plant.parameters].vector
@@ -118,19 +117,19 @@ print(f"{inside.sum()} of {len(shown)} intervals contain the truth")
 # %%
 # Is the model right?
 # -------------------
-# The *residuals*, the differences between the measured poses and those of the model, show this without the truth. If
-# the model is right, they contain only the sensor's noise. The first number is the variance of the residuals, and the
-# second is what noise alone would give.
+# The *residuals* are the differences between the measured poses and those of the model. If the model is right, they
+# contain only the sensor's noise. This can be tested without the truth: the variance of the residuals is compared with
+# the variance that noise alone would give them.
 
-print(f"{result.noise_ratio:.3f} times the stated variance is left; noise alone leaves "
-      f"{result.expected_noise_ratio:.3f} ± {result.noise_ratio_std:.3f}")  # fmt: skip
+print(f"residual variance / noise variance: {result.noise_ratio:.3f}; expected from noise "
+      f"alone: {result.expected_noise_ratio:.3f} ± {result.noise_ratio_std:.3f}")  # fmt: skip
 print("warnings:", *(result.warnings or ["none"]))
 
 # %%
 # Validation
 # ----------
-# Motions that were not used for the estimate validate the model. ``unseen_errors`` runs the true robot and a model on
-# the same validation trajectories, and returns the difference of their true poses.
+# The model is validated on motions that were not used for the estimate. ``unseen_errors`` moves the true robot and the
+# model along these trajectories. It returns the differences of their poses, without noise of the sensor.
 
 for who, parameters in (
     ("initial guess", result.initial),
@@ -145,7 +144,8 @@ for who, parameters in (
     )
 
 # %%
-# ``cmmsim run quick`` does the same on the command line, and writes a report to open in a browser.
+# The file of the record also holds the true poses, in a part that the estimator does not open. They show the error of
+# the sensor itself.
 
 with xr.open_dataset(record.attrs["path"], group="truth") as true:
     difference = 1e6 * (true["position"] - record["measured_position"])
@@ -153,3 +153,6 @@ with xr.open_dataset(record.attrs["path"], group="truth") as true:
         f"the sensor itself was off by {float(np.sqrt((difference**2).mean())):.1f} µm rms in "
         "this run"
     )
+
+# %%
+# ``cmmsim run quick`` does the same on the command line, and writes a report to open in a browser.

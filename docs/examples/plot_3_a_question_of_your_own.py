@@ -3,8 +3,8 @@ A question of your own: does a faster camera know friction better?
 ==================================================================
 
 This page answers one question by a study. One experiment cannot answer it, because its noise is a
-single draw. A *study* repeats an experiment over the values of a factor, each time with other
-noise. It compares the results with the truth, and shows the errors with their spread.
+single draw. A *study* repeats an experiment with other noise, at each value of a *factor*, a setting
+that is varied. It compares the results with the truth, and shows the errors with their spread.
 
 A study is one TOML file. This one asks how the error of the identified friction depends on the
 frame rate:
@@ -27,8 +27,9 @@ folder = Path(tempfile.mkdtemp()) / "study"
 cmmsim = Path(sys.executable).with_name("cmmsim")
 
 # %%
-# The command runs it on all cores. It checks each law that the file states, with an interval. If the
-# rows are too few to decide, the law is called *undecided*.
+# The command runs the study on all cores. Each ``[[theory]]`` of the file is a law, here a power of the
+# frame rate, that the command compares with the results. If the experiments are too few to tell, the
+# law is called *undecided*.
 
 ran = subprocess.run(
     [cmmsim, "study", "friction_against_frame_rate.toml", "--out", folder],
@@ -39,9 +40,9 @@ ran = subprocess.run(
 print(ran.stdout.replace(str(folder), "FOLDER"))
 
 # %%
-# All rows are in one table. The name of each column ends with its unit. The following figure shows
-# the error of every single experiment, the root mean square, and the standard deviation that the
-# estimator states without knowing the truth.
+# All results are in one table, with one row for each experiment. The name of a column ends with its
+# unit. The following figure shows the error of every single experiment, the root mean square of the
+# errors, and the standard deviation that the estimator states without knowing the truth.
 
 rows = pd.read_parquet(folder / "study.parquet")
 rate = "scenario.timing.frame_rate_hz"

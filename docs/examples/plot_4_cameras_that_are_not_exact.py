@@ -3,9 +3,9 @@ Cameras that are not exact
 ==========================
 
 This page shows what the error of a camera calibration does to poses. In the pages before, the
-estimator knew the cameras exactly, which no calibration achieves. Here the true cameras are moved by
-what a calibration may leave unknown, and the estimator is not told. Are the poses still right, and
-does their covariance contain the error?
+estimator knew the cameras exactly, which no calibration achieves. Here the true cameras differ from
+the known ones by an error that a calibration may have. Are the poses still right, and does their
+covariance contain the error?
 """
 
 import matplotlib.pyplot as plt
@@ -25,8 +25,8 @@ known_to = [0.0, 0.03, 0.1]  # px, standard deviation of each principal point
 
 # %%
 # ``move_rig`` moves the true cameras, here their principal points. It is called before the first
-# measurement, so that teaching also uses the wrong cameras, as with a real sensor. An error that is
-# the same for base and platform then cancels. The platform moves along a small closed path.
+# measurement, so that teaching also uses the wrong cameras, as with a real sensor. A part of the error
+# is the same for base and platform, and cancels. The platform moves along a small closed path.
 
 turn = np.linspace(0, 2 * np.pi, 25)
 path = np.stack(
@@ -92,6 +92,6 @@ plt.show()
 
 # %%
 # The covariance of a measurement contains the noise of the pixels, and not the error of the cameras.
-# A scenario can tell the estimator how well it knows the cameras: ``rig.known`` takes the covariance
-# of a calibration. The camera error, which is the same in all poses of a run, is then estimated
-# beside the robot's parameters. The tutorial of the same name shows how.
+# The key ``rig.known`` of a scenario tells the estimator how well it knows the cameras, by the
+# covariance of a calibration. The camera error, which is the same in all poses of a run, is then
+# estimated beside the robot's parameters. The tutorial of the same name shows how.

@@ -57,7 +57,7 @@ class ClosedLoopRun:
     >>> still = closed_loop.Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
     >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
     >>> settings = closed_loop.LoopSettings(servo, closed_loop.FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> parameters = robot.parameter_sets["truth"].vector
     >>> run = closed_loop.simulate_servo(robot, parameters, still, settings)
     >>> run.pose.shape
     (3, 6)

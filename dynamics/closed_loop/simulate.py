@@ -94,7 +94,7 @@ def simulate_servo(
     >>> robot = load_robot("rss6")
     >>> still = Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6)))
     >>> settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(60.0))
-    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> parameters = robot.parameter_sets["truth"].vector
     >>> closed_loop.simulate_servo(robot, parameters, still, settings)
     ClosedLoopRun(3 frames to 0.03333 s, 0 lost, 0 events)
     """

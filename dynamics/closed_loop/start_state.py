@@ -193,7 +193,7 @@ def equilibrium(
 
     Examples
     --------
-    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> parameters = robot.parameter_sets["truth"].vector
     >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
     >>> start = closed_loop.equilibrium(robot, parameters, robot.home_pose, servo)
     >>> start.commands.shape

@@ -77,7 +77,7 @@ class Model:
     Examples
     --------
     >>> from dynamics.control import Model
-    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> parameters = robot.parameter_sets["truth"].vector
     >>> model = Model(robot, parameters, closed_loop.FrictionLaw())
     >>> model.dynamic.shape
     (64,)

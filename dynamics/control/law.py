@@ -69,7 +69,7 @@ class Assignment:
     Examples
     --------
     >>> from dynamics.control import Assignment, Feedback, Model
-    >>> parameters = robot.parameter_sets["identified"].vector
+    >>> parameters = robot.parameter_sets["truth"].vector
     >>> servo = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
     >>> task = Assignment(
     ...     model=Model(robot, parameters, closed_loop.FrictionLaw()),

@@ -119,7 +119,7 @@ def mjcf_text(
     dry = values[robot.layout.coulomb]
     viscous = values[robot.layout.viscous]
     chain = _Chain(robot)
-    gains = robot.parameter_sets["initial"].joint_pid
+    gains = robot.parameter_sets["guess"].joint_pid
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")

@@ -64,7 +64,7 @@ TRAVEL_SHARE = 0.1
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
-    """Robot of a mechanism, with one parameter set `initial`, and remarks on the file.
+    """Robot of a mechanism, with one parameter set `guess`, and remarks on the file.
 
     Raises RobotFileError, with the leg and body, if a leg is of no known kind.
     """
@@ -111,7 +111,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
             "joint with the least inertia"
         )
     geometry = replace(geometry, own_gains=len(gains) > len(JOINT_PID))
-    robot = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
+    robot = RobotDescription(plain.name, geometry, {"guess": ParameterSet(dynamic, gains)})
     parsed_robot(robot_text(robot), "the robot")  # raises if a number is out of range
     return robot, notes
 

@@ -1,7 +1,7 @@
 """Plugin of pytest for accuracy benchmarks, like pytest-benchmark for time.
 
 The fixture `accuracy` records figures with their limits. The fixtures `cmmsim_sensor`,
-`cmmsim_robot` and `cmmsim_scenario` provide the testbed. The options `--accuracy-save`,
+`cmmsim_robot` and `cmmsim_scenario` provide what is simulated. The options `--accuracy-save`,
 `--accuracy-compare` and `--accuracy-fail` detect changes of figures from version to version.
 `python -m identify.accuracy FILE` prints saved figures as a Markdown table.
 """

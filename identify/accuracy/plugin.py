@@ -2,7 +2,7 @@
 
 A test can choose its scenario, robot or sensor by `@pytest.mark.cmmsim(sensor="mine.toml")`. The
 option `--accuracy-sensor mine.toml` chooses the sensor of all other tests. Pytest imports this
-module at every start, so slow imports are made only when a test uses the testbed.
+module at every start, so slow imports are made only when a test uses a fixture.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="N",
         type=seed,
         default=0,
-        help="seed of the testbed's fixtures (default: 0)",
+        help="seed of the simulated sensor and robot (default: 0)",
     )
     add(
         "--accuracy-scenario",
         metavar="NAME",
-        help=f"scenario of the testbed, built-in or a file (default: {DEFAULT_SCENARIO})",
+        help=f"scenario of the fixtures, built-in or a file (default: {DEFAULT_SCENARIO})",
     )
     add(
         "--accuracy-robot",

@@ -139,7 +139,7 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
-    """Content of a file: figures, the seed of the testbed, and how they were measured."""
+    """Content of a file: figures, the seed of the fixtures, and how they were measured."""
 
     __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012  as pydantic wants it
 

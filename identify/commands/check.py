@@ -55,7 +55,7 @@ def check(
         typer.Option(
             metavar="SET",
             help="Parameter set of the robot.",
-            show_default="the scenario's truth, else initial",
+            show_default="the scenario's truth, else guess",
         ),
     ] = None,
     settings: Settings = None,

@@ -19,7 +19,7 @@ IMPORT_HELP = """
 Read a robot from a file of another program. Its legs must be of the known kinds.
 
 Writes a robot file with the geometry, inertias and friction of that file, as the parameter set
-`initial`. Each joint is checked. A mechanism that is not such a robot is refused with the reason in
+`guess`. Each joint is checked. A mechanism that is not such a robot is refused with the reason in
 one line.
 """
 

@@ -189,7 +189,7 @@ def mjcf(
         typer.Option(
             metavar="SET|FILE",
             help="Parameter set of the robot, or result.json of a run, for its estimates.",
-            show_default="initial",
+            show_default="guess",
         ),
     ] = None,
     out: Annotated[
@@ -215,7 +215,7 @@ def mjcf(
 
     \b
     Examples:
-      cmmsim export mjcf mine.toml --parameters identified --out mine.xml
+      cmmsim export mjcf mine.toml --parameters truth --out mine.xml
       cmmsim export mjcf rss6 --parameters runs/paper-0/result.json \\
         --allow-unphysical-inertia
     """

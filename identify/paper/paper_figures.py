@@ -75,7 +75,7 @@ def mechanical_model(robot: Robot) -> Exhibit:
     parts = parts_of(robot.geometry).all
     ends = parts_of(robot.geometry).rods(robot, robot.home_pose)
     masses = dict(
-        zip(robot.layout.names, robot.parameter_sets["initial"].vector.tolist(), strict=True)
+        zip(robot.layout.names, robot.parameter_sets["guess"].vector.tolist(), strict=True)
     )
     return Exhibit(
         "Figure 5",

@@ -29,7 +29,7 @@ def tables(runs: PaperRuns) -> list[Exhibit]:
 def initial_parameters(runs: PaperRuns) -> Exhibit:
     """Return table 1: the parameters from which the identification begins."""
     entries = _parameters(runs.ours.result)
-    stated = _set(runs.robot, "initial")
+    stated = _set(runs.robot, "guess")
     names = [name for name in entries if not name.startswith("joint")]
     return Exhibit(
         "Table 1",

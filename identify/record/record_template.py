@@ -76,7 +76,7 @@ def description_text(
 
     The user replaces the example values. `rate_hz` is the frame rate.
     """
-    mass = float(robot.parameter_sets["initial"].vector[robot.layout.names.index("platform.mass")])
+    mass = float(robot.parameter_sets["guess"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(
         with_whole_frames(
             {

@@ -180,7 +180,7 @@ class Plant(_Side):
     """
 
     parameters: str = Field(
-        "identified", description="parameter set of the robot file that is the truth"
+        "truth", description="parameter set of the robot file with which the true robot moves"
     )
     values: dict[str, float] = Field(
         {},
@@ -302,7 +302,7 @@ class Model(_Side):
     """Estimator's model of the robot."""
 
     start_parameters: str = Field(
-        "initial", description="parameter set of the robot file that is the initial guess"
+        "guess", description="parameter set of the robot file that is the initial guess"
     )
     drive: Literal["pid", "pd", "pi", "cascade", "pid_filtered", "auto"] = Field(
         "pid", description="law of the drives; auto takes the most probable one of the record"

@@ -29,7 +29,7 @@ from identify.reporting.figures import COMPONENTS
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
-PARAMETER_SET = "initial"
+PARAMETER_SET = "guess"
 DURATION_S = 10.0
 # Time after which transients from the start of the run have decayed.
 STEADY_FROM_S = 2.0
@@ -80,7 +80,7 @@ class EngineRuns:
 
 
 def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
-    """Run both engines with the parameter set `initial`, without its friction.
+    """Run both engines with the parameter set `guess`, without its friction.
 
     The paper's table 1 has no friction either. Raises the errors of `compare_engines`.
     """

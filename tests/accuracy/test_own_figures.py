@@ -107,7 +107,7 @@ def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
     pytest.importorskip("pinocchio")
     from tests.closed_chain import ClosedChain
 
-    values = cmmsim_robot.parameter_sets["initial"].dynamic  # the paper's Table 1 has no friction
+    values = cmmsim_robot.parameter_sets["guess"].dynamic  # the paper's Table 1 has no friction
     states, chain = (
         random_states(cmmsim_robot, STATES, cmmsim_seed),
         ClosedChain(cmmsim_robot, values),

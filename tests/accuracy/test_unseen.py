@@ -52,7 +52,7 @@ def test_wrong_parameters_err_as_two_runs_of_the_loop_differ():
 
 
 def test_an_unstable_model_has_no_error_and_what_are_no_parameters_is_refused():
-    unstable = rss6().parameter_sets["initial"].vector.copy()
+    unstable = rss6().parameter_sets["guess"].vector.copy()
     unstable[64:67] = [0.1, 500.0, 0.0]
     with pytest.raises(LoopFailure):
         simulated(unstable, 0)

@@ -69,8 +69,8 @@ def robot():
 @cache
 def table():
     """All parameters (67,) of the true robot with its servo."""
-    values = robot().parameter_sets["initial"].vector.copy()
-    found = robot().parameter_sets["identified"].vector
+    values = robot().parameter_sets["guess"].vector.copy()
+    found = robot().parameter_sets["truth"].vector
     values[52:64] = found[52:64]
     values[64:] = found[64], NO_INTEGRAL, found[66]
     return values

@@ -36,7 +36,7 @@ def robot():
 def loop(robot):
     """Runs at 60 Hz with 4 steps a frame, exact friction and the parameters of Table 2;
     compiled."""
-    loop = Loop(robot, robot.parameter_sets["identified"].vector)
+    loop = Loop(robot, robot.parameter_sets["truth"].vector)
     loop.run(3)
     return loop
 

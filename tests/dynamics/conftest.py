@@ -64,7 +64,7 @@ def load_changed(tmp_path: Path) -> Callable[[dict[str, str]], dynamics.Robot]:
 @pytest.fixture(scope="session")
 def identified(robot: dynamics.Robot) -> np.ndarray:
     """The 67 parameters of Table 2, with friction."""
-    return robot.parameter_sets["identified"].vector
+    return robot.parameter_sets["truth"].vector
 
 
 @dataclass(frozen=True)

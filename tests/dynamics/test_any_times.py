@@ -27,7 +27,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def parameters(robot):
-    return robot.parameter_sets["identified"].vector
+    return robot.parameter_sets["truth"].vector
 
 
 def moving(robot, frames=FRAMES, rate_hz=RATE_HZ):

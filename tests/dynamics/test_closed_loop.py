@@ -276,7 +276,7 @@ def test_the_loop_is_stable_where_the_paper_is_or_names_frame_time_and_the_leg_t
     )
     assert np.abs(loop.run(reference, settings).pose - reference.poses)[:, :3].max() < 0.02
     reference = loop.reference(580, 29.0)
-    unstable = robot.parameter_sets["initial"].vector
+    unstable = robot.parameter_sets["guess"].vector
     with pytest.raises(closed_loop.LoopFailure) as caught:
         loop.run(reference, settings, unstable)
     frame = caught.value.frame

@@ -401,7 +401,7 @@ def test_where_numba_is_switched_off_the_plain_lines_run(loop):
     code = (
         "from tests.dynamics.conftest import Loop; import dynamics; robot = "
         "dynamics.load_robot('rss6');"
-        "run = Loop(robot, robot.parameter_sets['identified'].vector).run(3); "
+        "run = Loop(robot, robot.parameter_sets['truth'].vector).run(3); "
         "print(run.pose[-1].tolist())"
     )
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}

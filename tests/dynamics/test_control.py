@@ -79,7 +79,7 @@ def follow(
 ):
     """A run of the true robot under a law, its errors (N, 6), and what the observer expected."""
     parameters, frames = (
-        robot.parameter_sets["identified"].vector,
+        robot.parameter_sets["truth"].vector,
         round(seconds * timing.frame_rate_hz),
     )
     settings = LoopSettings(SERVO, timing, steps_per_frame=8, drives=Drives(law=drive))
@@ -156,7 +156,7 @@ def test_computed_torque_with_an_observer_leaves_an_eighth_of_what_the_servo_alo
 
 def test_a_torque_held_for_a_frame_brings_the_rates_where_the_way_back_has_them(robot):
     """By the simulated robot without friction, from rest beside where it should be."""
-    parameters, motion, period = robot.parameter_sets["initial"].vector, Swing(robot), 1 / 60
+    parameters, motion, period = robot.parameter_sets["guess"].vector, Swing(robot), 1 / 60
     settings = LoopSettings(SERVO, FAST, steps_per_frame=16, drives=Drives(torques=True))
     error = 0.01 * motion.size
     way = DecayingErrors(motion, motion.chart, error_map(Feedback(60.0)), 0.0, error, 0 * error)
@@ -188,7 +188,7 @@ def test_feedforward_and_observer_know_the_law_of_the_drives(robot, drive):
 
 def test_the_pid_gives_the_torque_of_the_inverse_dynamics_in_the_mean_of_each_frame(robot):
     """Oracle: the PID of eq. 31 integrated by hand along the motion, on a fine grid."""
-    parameters, motion, fine = robot.parameter_sets["identified"].vector, Swing(robot), 400
+    parameters, motion, fine = robot.parameter_sets["truth"].vector, Swing(robot), 400
     model, frames = Model(robot, parameters, FrictionLaw()), 30
     commands = joint_commands(model, motion, FAST, frames)
     lp, li, ld = parameters[robot.layout.joint_pid]
@@ -251,7 +251,7 @@ def test_plain_lines_do_what_compiled_code_does(robot, identified, drives):
 
 
 def test_drives_that_take_torques_accelerate_the_robot_as_forward_dynamics_says(robot):
-    parameters, poses = robot.parameter_sets["initial"].vector, np.tile(robot.home_pose, (3, 1))
+    parameters, poses = robot.parameter_sets["guess"].vector, np.tile(robot.home_pose, (3, 1))
     holding = robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic])
     push = holding + np.array([0.1, -0.05, 0.02, 0.0, 0.08, 0.03])
     settings = LoopSettings(SERVO, FrameTiming(1000.0), drives=Drives(torques=True))
@@ -350,7 +350,7 @@ def test_computed_torque_with_an_observer_survives_a_model_without_friction(robo
     """The starting model of the paper: the observer has to learn what friction does, or the loop is
     lost at 29 Hz.
     """
-    known = robot.parameter_sets["initial"].vector
+    known = robot.parameter_sets["guess"].vector
     assert size(follow(robot, SLOW, computed_torque, known=known)[1]) < size(
         follow(robot, SLOW, None)[1]
     )
@@ -360,7 +360,7 @@ def test_the_linear_response_is_that_of_the_simulated_loop(robot):
     """A small oscillation of one coordinate, without dry friction, against the column of the
     response.
     """
-    parameters = robot.parameter_sets["identified"].vector.copy()
+    parameters = robot.parameter_sets["truth"].vector.copy()
     parameters[robot.layout.coulomb] = 0.0
     settings, w, frames = LoopSettings(SERVO, FAST, steps_per_frame=8), 2 * np.pi * 0.5, 1200
     times = np.arange(frames) / 60
@@ -387,7 +387,7 @@ def test_the_linear_response_is_that_of_the_simulated_loop(robot):
 @pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.slow)])
 def test_designed_gains_give_the_bandwidth_and_damping_that_were_asked_for(name):
     robot = dynamics.load_robot(name)
-    model = Model(robot, robot.parameter_sets["identified"].vector, FrictionLaw())
+    model = Model(robot, robot.parameter_sets["truth"].vector, FrictionLaw())
     settings = LoopSettings(SERVO, FAST)
     gains = design_servo(model, settings, robot.home_pose, 3.0, 0.15)
     found = servo_figures(model, replace(settings, servo=gains), robot.home_pose)
@@ -399,7 +399,7 @@ def test_designed_gains_give_the_bandwidth_and_damping_that_were_asked_for(name)
 @pytest.mark.slow
 def test_a_bandwidth_that_no_gains_give_is_refused_with_what_can_be_had():
     robot = dynamics.load_robot("delta3")
-    model = Model(robot, robot.parameter_sets["identified"].vector, FrictionLaw())
+    model = Model(robot, robot.parameter_sets["truth"].vector, FrictionLaw())
     with pytest.raises(
         SimulationError,
         match=r"bandwidth of 40 rad/s with a damping of 0\.9 at 29 Hz: the best gains have",
@@ -411,7 +411,7 @@ def test_a_bandwidth_that_no_gains_give_is_refused_with_what_can_be_had():
 def test_the_loop_of_computed_torque_is_lost_where_its_eigenvalue_says_so():
     """Without observer, where vision alone closes the loop, and without dry friction."""
     robot = dynamics.load_robot("delta3")
-    parameters = robot.parameter_sets["identified"].vector
+    parameters = robot.parameter_sets["truth"].vector
     model = Model(robot, parameters, FrictionLaw())
     settings = LoopSettings(SERVO, FAST)
     at = lambda w: torque_figures(model, settings, robot.home_pose, Feedback(w, 1.0, False)).radius  # noqa: E731

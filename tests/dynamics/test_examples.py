@@ -33,7 +33,7 @@ def _loop(robot):
     """Arguments of a run, as the example of `simulate_servo` makes them."""
     gains = closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4)
     return {
-        "parameters": robot.parameter_sets["identified"].vector,
+        "parameters": robot.parameter_sets["truth"].vector,
         "still": closed_loop.Reference(np.tile(robot.home_pose, (3, 1)), np.zeros((3, 6))),
         "settings": closed_loop.LoopSettings(gains, closed_loop.FrameTiming(60.0)),
     }

@@ -68,7 +68,7 @@ def mixed_robot(folder: Path) -> dynamics.Robot:
         ]
     lines += [
         *(
-            "[parameters.initial]",
+            "[parameters.guess]",
             "platform = { mass = 24.0, Ixx = 0.178, Iyy = 0.19, Izz = 0.35 }",
         ),
         *(
@@ -96,7 +96,7 @@ def values(robot):
     """All parameters: those that play the truth, with other numbers in every body than its file
     has.
     """
-    found = robot.parameter_sets.get("identified", robot.parameter_sets["initial"]).vector.copy()
+    found = robot.parameter_sets.get("truth", robot.parameter_sets["guess"]).vector.copy()
     found[robot.layout.rigid] *= np.random.default_rng(3).uniform(0.7, 1.4, robot.layout.rigid.stop)
     return found
 
@@ -295,7 +295,7 @@ def test_built_in_loops_are_stable_at_60_hz_and_at_29_hz_with_a_frame_of_latency
             radius = stability.spectral_radius(
                 robot, values.vector, LoopSettings(servo, timing), robot.home_pose
             )
-            assert (radius < 1) == ((name, which) != ("rss6", "initial")), (which, timing)
+            assert (radius < 1) == ((name, which) != ("rss6", "guess")), (which, timing)
 
 
 @pytest.mark.parametrize(

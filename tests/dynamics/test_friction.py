@@ -288,7 +288,7 @@ def test_smoothed_law_tends_to_the_exact_one(loop, robot):
     assert (differences[-1] < [5e-6] * 3 + [2.5e-5] * 3).all(), differences[-1]
     laws, frictionless = (
         (loop.settings(), loop.settings(smoothing_velocity=1e-3)),
-        robot.parameter_sets["initial"],
+        robot.parameter_sets["guess"],
     )
     exact, smoothed = (loop.run(60, law, frictionless.vector) for law in laws)
     assert exact.events == 0

@@ -198,18 +198,18 @@ def test_a_full_body_without_first_moments_and_products_is_a_centred_body(robot,
     full = robot.with_full_bodies(["platform", "link3"])
     assert full.layout.full == tuple(name in ("platform", "link3") for name in robot.layout.bodies)
     assert full.with_full_bodies(()).layout == robot.layout
-    values = robot.parameter_sets["identified"].dynamic
+    values = robot.parameter_sets["truth"].dynamic
     torques = np.ones(6)
     for pose, twist in zip(states.pose[:20], states.twist[:20], strict=True):
         centred, other = (
             one.casadi("forward_dynamics")(
-                pose, twist, torques, one.parameter_sets["identified"].dynamic
+                pose, twist, torques, one.parameter_sets["truth"].dynamic
             ).full()
             for one in (robot, full)
         )
         np.testing.assert_allclose(other, centred, rtol=1e-10)
     np.testing.assert_array_equal(
-        full.layout.converted(full.parameter_sets["identified"].dynamic, robot.layout), values
+        full.layout.converted(full.parameter_sets["truth"].dynamic, robot.layout), values
     )
 
 
@@ -260,7 +260,7 @@ def test_full_bodies_of_a_robot_file(load_changed):
         f"platform.{name}" for name in ("mass", "mcx", "mcy", "mcz", "Ixx")
     )
     np.testing.assert_array_equal(
-        robot.parameter_sets["identified"].dynamic[:10], [24, 0, 0, 0.7, 0.2, 0.2, 0.35, 0.01, 0, 0]
+        robot.parameter_sets["truth"].dynamic[:10], [24, 0, 0, 0.7, 0.2, 0.2, 0.35, 0.01, 0, 0]
     )
     assert robot.layout.unit("platform.mcz") == "kg m"
     with pytest.raises(

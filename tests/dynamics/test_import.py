@@ -26,8 +26,8 @@ from tests.identify.commands import refusal
 
 
 def with_bodies(robot):
-    """Parameters (p,) of the set `identified` with inertias that bodies can have."""
-    values = robot.parameter_sets["identified"].dynamic.copy()
+    """Parameters (p,) of the set `truth` with inertias that bodies can have."""
+    values = robot.parameter_sets["truth"].dynamic.copy()
     bodies = physical_inertias(robot.layout, values, allow_changes=True).values
     values[robot.layout.rigid] = robot.layout.rigid_of(bodies)
     return values
@@ -87,8 +87,8 @@ def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_p
     for leg, same in zip(robot.geometry.legs, other.geometry.legs, strict=True):
         drawn = [name for name in type(leg).model_fields if name.endswith("_radius")]
         assert [getattr(leg, name) for name in drawn] == [getattr(same, name) for name in drawn]
-    gains = robot.parameter_sets["initial"].joint_pid
-    np.testing.assert_array_equal(other.parameter_sets["initial"].joint_pid, gains)
+    gains = robot.parameter_sets["guess"].joint_pid
+    np.testing.assert_array_equal(other.parameter_sets["guess"].joint_pid, gains)
 
 
 @pytest.mark.parametrize("name", ["rus6", pytest.param("delta3", marks=pytest.mark.slow)])
@@ -140,7 +140,7 @@ def test_a_robot_written_as_urdf_with_closures_has_the_same_dynamics(
     description, notes = robot_of(tmp_path, *urdf_of(robot, values, platform_on_a_leg))
     assert_same_dynamics(robot, values, description, tmp_path)
     assert ["joint PID" in note for note in notes] == [True]
-    assert (description.parameter_sets["initial"].joint_pid > 0).all()
+    assert (description.parameter_sets["guess"].joint_pid > 0).all()
 
 
 def test_loops_that_are_open_where_all_coordinates_are_zero_are_closed_first(tmp_path):

@@ -105,7 +105,7 @@ def test_rods_are_where_the_frames_of_their_parts_are_and_nowhere_out_of_reach(n
 @pytest.mark.parametrize("name", ROBOTS)
 def test_its_closed_loop_is_that_of_code_of_its_own_whatever_the_servo_knows(name):
     robot, moved, own = both(name)
-    reference, parameters = motion(robot), robot.parameter_sets["identified"].vector
+    reference, parameters = motion(robot), robot.parameter_sets["truth"].vector
     expected = differentiate_servo(own, parameters, reference, SETTINGS)
     found = differentiate_servo(moved, parameters, reference, SETTINGS)
     np.testing.assert_allclose(found.pose, expected.pose, rtol=0, atol=1e-12)

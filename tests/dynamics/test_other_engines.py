@@ -59,7 +59,7 @@ def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot
     assert without.joint("joint1").damping[0] == physical[robot.layout.viscous][0]
 
 
-@pytest.mark.parametrize("name", ["initial", "identified"])
+@pytest.mark.parametrize("name", ["guess", "truth"])
 def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, states, name):
     """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo
     leaves out.
@@ -131,7 +131,7 @@ def test_resting_robot_stays_in_its_dry_friction(mujoco, robot):
     """Half the breakaway torque on every crank for 1 s: MuJoCo's stiff dry friction creeps by less
     than 0.1 um.
     """
-    values = robot.parameter_sets["identified"].dynamic
+    values = robot.parameter_sets["truth"].dynamic
     engine = exported(robot, values)
     engine.put(robot.home_pose, np.zeros(6))
     torque = robot.static_torque(robot.home_pose, values) + 0.5 * values[robot.layout.coulomb]

@@ -28,7 +28,7 @@ SHARES = np.array([[1.0, 0.9, 1.1], [1.1, 1.2, 0.9], [0.85, 1.0, 1.2]])
 def unequal(robot: Robot) -> np.ndarray:
     """Identified parameters with gains that differ by some 10 % between the joints."""
     own = robot.with_own_gains()
-    values = own.parameter_sets["identified"].vector.copy()
+    values = own.parameter_sets["truth"].vector.copy()
     shares = np.tile(SHARES, (own.layout.joints // len(SHARES), 1))
     values[own.layout.joint_pid] *= shares.ravel()
     return values
@@ -45,11 +45,11 @@ def test_the_layout_has_the_gains_of_one_joint_after_another(robot):
     assert own.layout.joint_pid_names[:4] == ("joint1.lp", "joint1.li", "joint1.ld", "joint2.lp")
     assert len(own.layout.names) == 64 + 18
     assert own.layout.unit("joint2.li") == "N m/(rad s)"
-    shared = robot.parameter_sets["initial"].joint_pid
-    np.testing.assert_array_equal(own.parameter_sets["initial"].joint_pid, np.tile(shared, 6))
+    shared = robot.parameter_sets["guess"].joint_pid
+    np.testing.assert_array_equal(own.parameter_sets["guess"].joint_pid, np.tile(shared, 6))
     back = own.with_own_gains(False)
     assert back.layout == robot.layout
-    np.testing.assert_array_equal(back.parameter_sets["initial"].joint_pid, shared)
+    np.testing.assert_array_equal(back.parameter_sets["guess"].joint_pid, shared)
     assert own.with_own_gains() is own
     assert own.geometry != robot.geometry
     assert own.geometry.digest == robot.geometry.digest
@@ -57,7 +57,7 @@ def test_the_layout_has_the_gains_of_one_joint_after_another(robot):
 
 def test_gains_that_become_shared_are_the_mean_of_all_joints(robot):
     own = robot.with_own_gains().with_parameters(unequal(robot))
-    shared = own.with_own_gains(False).parameter_sets["initial"].joint_pid
+    shared = own.with_own_gains(False).parameter_sets["guess"].joint_pid
     each = unequal(robot)[own.layout.joint_pid].reshape(6, 3)
     np.testing.assert_allclose(shared, each.mean(axis=0), rtol=1e-15)
 
@@ -206,7 +206,7 @@ def test_a_loop_of_unequal_gains_is_that_of_mujoco(robot):
     values = unequal(robot)
     values[own.layout.coulomb] = values[own.layout.viscous] = 0.0
     shared = values.copy()
-    shared[own.layout.joint_pid] = np.tile(robot.parameter_sets["identified"].joint_pid, 6)
+    shared[own.layout.joint_pid] = np.tile(robot.parameter_sets["truth"].joint_pid, 6)
     same, other = (
         np.abs(compare_engines(own, values, given, 0.5).difference).max(axis=0)
         for given in (values, shared)
@@ -219,8 +219,8 @@ def test_a_loop_of_unequal_gains_is_that_of_mujoco(robot):
 
 def test_the_linear_loop_agrees_with_that_of_shared_gains_and_differs_with_unequal_ones(robot, own):
     settings, home = own.settings(), robot.home_pose
-    equal = robot.with_own_gains().parameter_sets["identified"].vector
-    shared = robot.parameter_sets["identified"].vector
+    equal = robot.with_own_gains().parameter_sets["truth"].vector
+    shared = robot.parameter_sets["truth"].vector
     radius = stability.spectral_radius(robot, shared, settings, home)
     assert stability.spectral_radius(own.robot, equal, settings, home) == radius
     assert stability.spectral_radius(own.robot, own.parameters, settings, home) != radius
@@ -231,8 +231,8 @@ def test_the_linear_loop_agrees_with_that_of_shared_gains_and_differs_with_unequ
 def test_feedforward_and_observer_know_the_gains_of_each_joint(robot, drive):
     """As the test of shared gains. A feedforward that takes the mean of the gains misses."""
     own = robot.with_own_gains()
-    true = ParameterSet(robot.parameter_sets["identified"].dynamic, unequal(robot)[64:])
-    own.parameter_sets = own.parameter_sets | {"identified": true}
+    true = ParameterSet(robot.parameter_sets["truth"].dynamic, unequal(robot)[64:])
+    own.parameter_sets = own.parameter_sets | {"truth": true}
     given = {"noise": 0 * NOISE, "observer": False, "drive": drive}
     alone = size(follow(own, FAST, None, noise=0 * NOISE, drive=drive)[1])
     fed = size(follow(own, FAST, feedforward, **given)[1])
@@ -267,11 +267,11 @@ def test_a_robot_file_states_one_value_a_leg_and_is_written_again(load_changed):
     text = "joint_pid = { lp = [10, 11, 12, 13, 14, 15], li = 10.0, ld = 0.1 }"
     found = load_changed({SHARED: text})
     assert found.layout.own_gains
-    gains = found.parameter_sets["initial"].joint_pid.reshape(6, 3)
+    gains = found.parameter_sets["guess"].joint_pid.reshape(6, 3)
     np.testing.assert_array_equal(gains[:, 0], [10, 11, 12, 13, 14, 15])
     np.testing.assert_array_equal(gains[:, 1], 10.0)
     # the other set has one value, which each joint has
-    assert np.ptp(found.parameter_sets["identified"].joint_pid.reshape(6, 3), axis=0).max() == 0
+    assert np.ptp(found.parameter_sets["truth"].joint_pid.reshape(6, 3), axis=0).max() == 0
     for robot in (found, found.with_own_gains(False).with_own_gains()):
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
         again = parsed_robot(robot_text(description), "it")
@@ -293,8 +293,8 @@ def test_own_gains_are_exported_to_mjcf_and_imported(robot, tmp_path):
     path.write_text(mjcf_text(own, allow_unphysical_inertia=True), encoding="utf-8")
     found, _ = robot_of_mjcf(path)
     assert found.geometry.own_gains
-    gains = own.parameter_sets["initial"].joint_pid
-    np.testing.assert_array_equal(found.parameter_sets["initial"].joint_pid, gains)
+    gains = own.parameter_sets["guess"].joint_pid
+    np.testing.assert_array_equal(found.parameter_sets["guess"].joint_pid, gains)
 
 
 def test_a_gain_that_the_law_needs_is_refused_by_the_name_of_its_joint(own):

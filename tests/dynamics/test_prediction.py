@@ -32,7 +32,7 @@ def test_steps_from_rest_end_where_the_simulated_robot_does(name, share):
     included.
     """
     robot = dynamics.load_robot(name)
-    parameters = robot.parameter_sets["identified"].vector
+    parameters = robot.parameter_sets["truth"].vector
     model = Model(robot, parameters, SETTINGS.friction)
     coulomb = parameters[robot.layout.coulomb]
     torque = (

@@ -9,7 +9,7 @@ from dynamics import fast_forward_dynamics
 from tests.dynamics.conftest import METHODS, base_from_platform, derivative, link_axes
 
 
-@pytest.fixture(params=["initial", "identified"])
+@pytest.fixture(params=["guess", "truth"])
 def parameters(request, robot):
     return robot.parameter_sets[request.param].dynamic
 
@@ -37,7 +37,7 @@ def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
     np.testing.assert_allclose(wrench, parts, atol=1e-12 * scale)
     np.testing.assert_array_equal(robot.friction_wrench(pose, 0 * twist, parameters), 0)
     assert len(robot.parameter_names) == len(robot.nominal_parameters) == 64
-    defaults = robot.mass_matrix(pose, robot.parameter_sets["initial"].dynamic)
+    defaults = robot.mass_matrix(pose, robot.parameter_sets["guess"].dynamic)
     np.testing.assert_array_equal(robot.mass_matrix(pose), defaults)
 
 

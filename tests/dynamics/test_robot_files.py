@@ -177,9 +177,9 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         ),
         ("home_pose = [0.0, ", "home_pose = [", "home_pose: List should have at least 6 items"),
         (
+            "[parameters.guess]",
             "[parameters.initial]",
-            "[parameters.first]",
-            "needs a parameter set `initial`; it has .*first",
+            "needs a parameter set `guess` .*; it has .*initial.*truth",
         ),
         ('name = "rss6"', "name = ", "is not valid TOML"),
     ],

@@ -56,7 +56,7 @@ def guess_of(values, std):
 
 
 def truth():
-    return rss6().parameter_sets["identified"].vector
+    return rss6().parameter_sets["truth"].vector
 
 
 def trajectory(seed, size=1.0, robot=None):

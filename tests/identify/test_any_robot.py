@@ -69,17 +69,17 @@ def robot(request, tmp_path_factory) -> Robot:
     if request.param != "mixed":
         return load_robot(request.param)
     mixed = mixed_robot(tmp_path_factory.mktemp("mixed"))
-    initial, rng = mixed.parameter_sets["initial"], np.random.default_rng(0)
+    guess, rng = mixed.parameter_sets["guess"], np.random.default_rng(0)
     own = ParameterSet(
-        initial.dynamic * rng.uniform(0.95, 1.05, len(initial.dynamic)), 1.03 * initial.joint_pid
+        guess.dynamic * rng.uniform(0.95, 1.05, len(guess.dynamic)), 1.03 * guess.joint_pid
     )
-    mixed.parameter_sets = {"initial": initial, "identified": own}
+    mixed.parameter_sets = {"guess": guess, "truth": own}
     return mixed
 
 
 def truth_of(robot):
     """The parameters of the plant."""
-    return robot.parameter_sets["identified"].vector.copy()
+    return robot.parameter_sets["truth"].vector.copy()
 
 
 def small_motion(robot, **excitation):
@@ -309,7 +309,7 @@ def test_what_is_known_beforehand_is_named_as_the_scenarios_own_robot_names_it()
 def test_friction_of_a_robot_that_lies_flat_has_the_size_of_what_accelerates_it():
     """Mean torque for 9.81 m/s2 along x and y: more friction than that would be no robot's."""
     robot = load_robot("rrr3")
-    initial = robot.parameter_sets["initial"].dynamic
+    initial = robot.parameter_sets["guess"].dynamic
     assert np.abs(robot.static_torque(robot.home_pose, initial)).max() < 1e-9
     rest, found = np.zeros((2, 6)), holding_torque(robot, initial)
     torques = robot.inverse_dynamics(
@@ -362,7 +362,7 @@ def test_a_model_takes_as_many_steps_as_the_fastest_motion_of_its_robot_needs():
     """
     rss6, scenario = load_robot("rss6"), load_scenario("quick")
     slow = scenario.timing.model_copy(update={"frame_rate_hz": 29.0})
-    gains = rss6.parameter_sets["identified"].vector * np.where(np.arange(67) < 64, 1.0, 4.0)
+    gains = rss6.parameter_sets["truth"].vector * np.where(np.arange(67) < 64, 1.0, 4.0)
     steps = {}
     for name, robot in (("paper", rss6), ("stiff", rss6.with_parameters(gains))):
         settings = loop_settings(robot, scenario.servo, slow, scenario.control, scenario.model)

@@ -183,7 +183,7 @@ def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
     """The paper's starting values break the triangle inequality; the motion does not feel what is
     changed.
     """
-    initial = rss6().parameter_sets["initial"].vector
+    initial = rss6().parameter_sets["guess"].vector
     bounds = parameter_bounds(guess_of(initial, initial), physical=True)
     near = bounds.nearest(initial)
     physical_inertias(LAYOUT, near)

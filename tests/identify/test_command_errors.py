@@ -47,7 +47,7 @@ def settings_of(**drives) -> LoopSettings:
 def test_a_drive_with_another_zero_and_scale_moves_as_under_the_commands_that_it_receives():
     """The commands s U + z given to a right drive are U given to a wrong one."""
     robot, zeros = rss6(), np.array(ZEROS)
-    parameters = robot.parameter_sets["identified"].vector
+    parameters = robot.parameter_sets["truth"].vector
     _, run = run_plant(quick(), 1, duration_s=2.0)
     reference = some_reference()
     wrong = settings_of(command_scale=1.002, joint_zeros=tuple(ZEROS))
@@ -78,7 +78,7 @@ def test_a_servo_takes_up_the_zeros_and_logs_what_it_sent():
 
 def test_commands_are_rounded_to_their_steps():
     robot, step = rss6(), 1e-3
-    parameters = robot.parameter_sets["identified"].vector
+    parameters = robot.parameter_sets["truth"].vector
     _, run = run_plant(quick(), 1, duration_s=1.0)
     reference = replace_frames(some_reference(), len(run.command))
     found = simulate_commands(
@@ -99,7 +99,7 @@ def replace_frames(reference, frames):
 def test_sensitivities_of_the_servo_follow_the_scale(compiled):
     """Against differences of runs, compiled and plain."""
     robot = rss6()
-    parameters = robot.parameter_sets["identified"].vector
+    parameters = robot.parameter_sets["truth"].vector
     reference = replace_frames(some_reference(), 8 if not compiled else 60)
     settings = settings_of(command_scale=1.1, joint_zeros=tuple(ZEROS))
     run = differentiate_servo(robot, parameters, reference, settings, compiled=compiled)
@@ -157,7 +157,7 @@ def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
     """The remedy of the diagnosis is the setting that mends it."""
     true = quick(**{"plant.joint_zero_error_rad": [0, 3e-4, 0, 0, 0, 0]})
     record, _ = run_plant(true, seed=2)
-    values = rss6().parameter_sets["identified"].vector
+    values = rss6().parameter_sets["truth"].vector
     found = diagnosis_from(problem_of([record], quick()), values)
     first = found.findings[0]
     assert first.name == "zero of joint 2"
@@ -169,7 +169,7 @@ def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
 
 def test_the_scale_of_the_commands_is_diagnosed_with_its_setting():
     record, _ = run_plant(quick(**{"plant.command_scale": 1.0017}), seed=3)
-    values = rss6().parameter_sets["identified"].vector
+    values = rss6().parameter_sets["truth"].vector
     first = diagnosis_from(problem_of([record], quick()), values).findings[0]
     assert first.name == "scale of the commands"
     assert first.remedies[0].startswith("--set model.command_scale_std=0.01, ")
@@ -266,7 +266,7 @@ def test_zeros_of_another_number_of_joints_are_refused():
     scenario = quick(**{"plant.joint_zero_error_rad": [1e-4, 1e-4]})
     with pytest.raises(ScenarioError, match=r"joint_zero_error_rad has 2 values, but rss6 has 6"):
         build_plant(scenario, rss6())
-    parameters = rss6().parameter_sets["identified"].vector
+    parameters = rss6().parameter_sets["truth"].vector
     with pytest.raises(SimulationError, match="zeros of 2 joints, the robot has 6"):
         simulate_commands(
             rss6(),

@@ -271,7 +271,7 @@ def test_the_command_driven_model_explains_the_noise_fully_and_scales_with_the_a
     raised = record.assign_attrs(scale_anchor_value=1.1 * record.attrs["scale_anchor_value"])
     ratio = (identify(raised, rss6(), scenario).estimate / one.estimate)[FRICTION_AND_PID]
     assert np.allclose(ratio, 1.1, rtol=0.03), ratio
-    other = scenario.with_overrides({"plant.parameters": "initial", "plant.steps_per_frame": 1})
+    other = scenario.with_overrides({"plant.parameters": "guess", "plant.steps_per_frame": 1})
     assert np.array_equal(identify(record, rss6(), other).estimate, one.estimate)
 
 
@@ -387,7 +387,7 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
     """Too many frames lost to know the sensor's noise; and a model whose loop is unstable: the
     starting guess, which has no friction, at 29 Hz with a frame of latency."""
     slow = quick(sensor="ctrack780_29hz")
-    unstable, known = rss6().parameter_sets["initial"].vector, np.zeros((67, 67))
+    unstable, known = rss6().parameter_sets["guess"].vector, np.zeros((67, 67))
     dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):

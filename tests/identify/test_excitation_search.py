@@ -163,7 +163,7 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
         {**TINY, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0}
     )
     free, z, trajectory = a_motion(robot, 8, scenario)
-    parameters = robot.parameter_sets["initial"].vector.copy()
+    parameters = robot.parameter_sets["guess"].vector.copy()
     parameters[robot.layout.viscous] = 0.5  # without friction the loop rings longer than a period
     run = simulated(robot, parameters, trajectory, scenario)
     s, t = harmonics(free), run.time[6000:]
@@ -187,7 +187,7 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
 def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     """By the singular values of whitened sensitivities over prior rows, with another whitening."""
     _, _, trajectory = a_motion(robot, 9)
-    values, std = robot.parameter_sets["initial"].vector.copy(), known.guess.std.copy()
+    values, std = robot.parameter_sets["guess"].vector.copy(), known.guess.std.copy()
     for name, (value, deviation) in prior.items():
         values[NAMES.index(name)], std[NAMES.index(name)] = value, deviation
     run = simulated(robot, values, trajectory, QUICK)
@@ -212,7 +212,7 @@ def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, 
     assert 0.0 < twice - once < np.log(2) / 2 + 0.05
     late = QUICK.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
     with pytest.raises(
-        TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"
+        TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'guess' is unstable"
     ):
         log_information(robot, known_of(late), trajectory)
 

@@ -38,7 +38,7 @@ def test_a_robot_that_no_code_knows_runs_from_its_file_alone(tmp_path):
     robot = mixed_robot(tmp_path)
     changes = {
         "robot": str(tmp_path / "mixed.toml"),
-        "plant.parameters": "initial",
+        "plant.parameters": "guess",
         "renderer": "analytic",
     }
     changes |= {"excitation.candidates": 2, "validation.count": 1, "validation.duration_s": 3.0}

@@ -22,7 +22,7 @@ FORMS = (
 def platform_robot():
     """The reference robot with a full platform, and its parameters with gains."""
     robot = rss6().with_full_bodies(["platform"])
-    return robot, robot.parameter_sets["identified"].vector.copy()
+    return robot, robot.parameter_sets["truth"].vector.copy()
 
 
 def warned(centre, std, **unseen):
@@ -58,7 +58,7 @@ def test_the_check_of_a_robot_names_a_centre_outside_of_its_drawing():
     assert not outside.ok
     assert outside.value == pytest.approx(1.25)
     assert "platform is 0.25 m from" in outside.text
-    assert not list(_centres(rss6(), rss6().parameter_sets["identified"].vector))
+    assert not list(_centres(rss6(), rss6().parameter_sets["truth"].vector))
 
 
 @pytest.mark.parametrize("side", ["model", "plant"])

@@ -65,7 +65,7 @@ def test_the_base_parameters_alone_decide_the_torque(base):
     robot, rng = rss6(), np.random.default_rng(3)
     pose = robot.home_pose + rng.uniform(-1, 1, (20, 6)) * np.repeat([0.008, 0.03], 3)
     motion = pose, rng.normal(size=(20, 6)) * np.repeat([0.1, 0.5], 3), rng.normal(size=(20, 6))
-    nominal = robot.parameter_sets["identified"].dynamic
+    nominal = robot.parameter_sets["truth"].dynamic
     kernel = np.linalg.svd(base.combinations)[2][base.rank :]
     change = kernel.T @ rng.normal(size=len(kernel))
     torque = robot.inverse_dynamics(*motion, nominal)
@@ -161,17 +161,17 @@ def test_the_record_must_halve_the_guess_and_leave_less_than_half_of_the_size():
     """The guess of the platform's mass is 24 kg ± 100 %, then ± 10 %, then ± 1,000,000 %: from
     that, 0.146 ± 2.73 kg m2 is a large step and no knowledge."""
     for start_std, limit in ((1.0, 12.0), (0.1, 1.2), (1e4, 12.0)):
-        guess = starting_guess(rss6(), "initial", start_std)
+        guess = starting_guess(rss6(), "guess", start_std)
         assert judged(guess, "platform.mass", 0.999 * limit), start_std
         assert not judged(guess, "platform.mass", 1.001 * limit), start_std
     assert not judged(guess, "platform.Ixx", 2.73)
     # Friction that is guessed to be zero has a tenth of the holding torque as its size.
-    guess = starting_guess(rss6(), "initial", 1.0)
+    guess = starting_guess(rss6(), "guess", 1.0)
     assert guess.values[index_of("joint1.coulomb")] == 0
     limit = 0.5 * 0.1 * holding_torque(rss6(), guess.values[:64])
     assert judged(guess, "joint1.coulomb", 0.999 * limit)
     assert not judged(guess, "joint1.coulomb", 1.001 * limit)
-    stated = starting_guess(rss6(), "identified", 1.0)
+    stated = starting_guess(rss6(), "truth", 1.0)
     assert not judged(stated, "joint1.coulomb", 0.51 * truth()[index_of("joint1.coulomb")])
 
 
@@ -190,7 +190,7 @@ def test_the_estimate_does_not_decide(base, factor):
     """Groups with members known to 20 % are identified however small, or large, chance makes their
     estimates.
     """
-    guess = starting_guess(rss6(), "initial", 1.0)
+    guess = starting_guess(rss6(), "guess", 1.0)
     criterion = identifiability(guess, rss6())
     covariance = np.diag((0.2 * criterion.sizes) ** 2)
     uncertainty = Uncertainty(covariance, covariance, covariance, covariance, truth(), None)
@@ -217,7 +217,7 @@ def test_the_share_of_the_guess_is_what_another_guess_makes_of_the_estimate(reco
     """Another guess of all parameters moves the estimate by W^-1 P d, W^-1 the covariance of white
     residuals, and the share is the variance of that for guesses that err as they say."""
     first = identify(record, rss6(), driven())
-    guess = starting_guess(rss6(), "initial", quick().identification.start_std)
+    guess = starting_guess(rss6(), "guess", quick().identification.start_std)
     # friction is never negative
     moved = 0.02 * guess.std * np.random.default_rng(0).uniform(0.2, 2.0, len(NAMES))
     known = {
@@ -256,7 +256,7 @@ def test_weighing_a_platform_that_sliders_carry_does_not_fix_the_scale_and_a_kno
     )
     record = run_plant(scenario, seed=1, duration_s=5.0, robot=sliders)[0]
     place = sliders.layout.names.index("joint_pid.lp")
-    gain = sliders.parameter_sets["identified"].vector[place]
+    gain = sliders.parameter_sets["truth"].vector[place]
     known = with_anchor(record, ScaleAnchor("joint_gain", gain, 5.0))
     weighed, by_gain = (identify(one, sliders, scenario) for one in (record, known))
     assert weighed.prior_share[place] > RESTS_ON_PRIOR
@@ -373,7 +373,7 @@ def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_n
     record,
 ):
     with pytest.raises(
-        ScenarioError, match=r"set 'initial', known beforehand: joint_pid.li\): joint_pid.li is 0.0"
+        ScenarioError, match=r"set 'guess', known beforehand: joint_pid.li\): joint_pid.li is 0.0"
     ):
         identify(record, rss6(), driven(joint_pid_li=(0.0, 1.0)))
     with pytest.raises(

@@ -71,7 +71,7 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     record = record_of(known, robot.moved(errors), scenario, 0, load_robot("rrr3"))
     problem = problem_of([record], scenario, robot)
     run = (problem if method == "closed_loop" else problem.driven_by_commands()).runs[0]
-    values = robot.parameter_sets["identified"].vector
+    values = robot.parameter_sets["truth"].vector
     modes, geometry = run.pose_modes(values), run.common.geometry
     np.testing.assert_allclose(geometry.factor @ geometry.factor.T, known.covariance, atol=1e-22)
     drawn_numbers = np.linalg.solve(geometry.factor, errors)

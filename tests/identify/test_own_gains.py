@@ -48,10 +48,10 @@ def each(**overrides):
 def with_unequal_gains(name: str) -> Robot:
     """A robot whose true gains differ by some 10 % between the joints."""
     robot = load_robot(name).with_own_gains()
-    true = robot.parameter_sets["identified"]
+    true = robot.parameter_sets["truth"]
     shares = np.tile(SHARES, (robot.layout.joints // len(SHARES), 1))
     own = ParameterSet(true.dynamic, true.joint_pid * shares.ravel())
-    robot.parameter_sets = robot.parameter_sets | {"identified": own}
+    robot.parameter_sets = robot.parameter_sets | {"truth": own}
     return robot
 
 
@@ -208,7 +208,7 @@ def test_true_gains_in_another_form():
 
 def test_the_anchor_of_a_known_gain_measures_that_of_the_first_joint():
     robot = with_unequal_gains("rss6")
-    layout, true = robot.layout, robot.parameter_sets["identified"].vector
+    layout, true = robot.layout, robot.parameter_sets["truth"].vector
     assert measured_parameter("joint_gain", layout) == "joint1.lp"
     anchor = measured_anchor("joint_gain", 1e-9, layout, true, np.random.default_rng(0))
     row, value = anchor.row(layout)
@@ -283,7 +283,7 @@ def test_unequal_gains_of_a_robot_file_are_not_shared_without_a_word(tmp_path):
     new = "joint_pid = { lp = [10.5, 10.5, 11.0, 10.5, 10.5, 10.5], li = 11.4, ld = 0.164 }"
     robot = load_robot(changed_robot_file(tmp_path / "unequal.toml", old, new))
     assert not in_form(robot, quick().model).layout.own_gains
-    words = r"plant\.gains = 'shared', but the parameter set 'identified' .*joint3\.lp = 11:"
+    words = r"plant\.gains = 'shared', but the parameter set 'truth' .*joint3\.lp = 11:"
     with pytest.raises(ScenarioError, match=words):
         build_plant(quick(), robot)
     plant = build_plant(quick(**{"plant.gains": "each"}), robot)

@@ -210,8 +210,8 @@ def test_what_cannot_be_run_is_one_line_before_any_file(tmp_path, capfd):
     for setting, words in (
         ("robot=rss7", ["rss7", "rss6"]),
         ("excitation.position_amplitude_m=0.2", ["leg"]),
-        ("plant.parameters=nobody", ["nobody", "identified", "initial"]),
-        ("model.start_parameters=nobody", ["nobody", "identified", "initial"]),
+        ("plant.parameters=nobody", ["nobody", "guess", "truth"]),
+        ("model.start_parameters=nobody", ["nobody", "guess", "truth"]),
     ):
         assert command("run", "quick", "--quiet", "--set", setting, "--out", tmp_path / "out") == 1
         error = one_line(capfd.readouterr().err)

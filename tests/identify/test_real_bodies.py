@@ -105,7 +105,7 @@ def test_possible_bodies_are_found_in_log_cholesky_coordinates():
     for physical in (False, True):
         settings = {
             "model.inertia": {"platform": "full"},
-            "model.start_parameters": "identified",
+            "model.start_parameters": "truth",
             "identification.physical_consistency": physical,
         }
         scenario = setup.scenario.with_estimator_settings(settings)

@@ -29,7 +29,7 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
     assert command("check", "ups6", "--json", tmp_path / "found.json") == 0
     found, robot = _found(tmp_path / "found.json"), load_robot("ups6")
     assert all(entry["ok"] for entry in found.values())
-    held = robot.static_torque(robot.home_pose, robot.parameter_sets["identified"].dynamic)
+    held = robot.static_torque(robot.home_pose, robot.parameter_sets["truth"].dynamic)
     assert found["holding torque"]["value"] == pytest.approx(np.abs(held).max())
     assert (found["holding torque"]["unit"], found["holding torque"]["leg"]) == (
         "N",
@@ -39,7 +39,7 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
     assert found["loop"]["value"] < 1 < found["gain margin"]["value"]
     assert found["frame rate"]["value"] < 60
     assert (found["sensor's home"]["value"], found["sensor's platform"]["ok"]) == (0.0, True)
-    assert "ups6, parameters `identified`" in capfd.readouterr().out
+    assert "ups6, parameters `truth`" in capfd.readouterr().out
 
 
 @pytest.mark.slow
@@ -136,4 +136,4 @@ def test_a_report_that_cannot_be_written_and_an_unknown_set_are_named_in_one_lin
     assert command("check", "ups6", "--quiet", "--json", tmp_path) != 0
     assert "cannot write" in one_line(capfd.readouterr().err)
     assert command("check", "ups6", "--parameters", "best") != 0
-    assert "it has identified, initial" in one_line(capfd.readouterr().err)
+    assert "it has guess, truth" in one_line(capfd.readouterr().err)

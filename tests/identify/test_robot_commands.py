@@ -99,7 +99,7 @@ def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_
 @pytest.mark.slow
 def test_a_wrong_parameter_in_one_engine_is_seen(robot):
     pytest.importorskip("mujoco")
-    initial = robot.parameter_sets["initial"].vector
+    initial = robot.parameter_sets["guess"].vector
     right = judge(compare_engines(robot, initial, initial, 2.1))
     for name, factor in (("platform.mass", 1.01), ("link1.mass", 1.01), ("platform.Ixx", 1.05)):
         other = initial.copy()
@@ -134,7 +134,7 @@ def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(
 ):
     mujoco = pytest.importorskip("mujoco")
     values = dict(
-        zip(LAYOUT.dynamic_names, robot.parameter_sets["identified"].dynamic.tolist(), strict=True)
+        zip(LAYOUT.dynamic_names, robot.parameter_sets["truth"].dynamic.tolist(), strict=True)
     )
     values["platform.mass"] = 23.456
     save_result(tmp_path / "result.json", made_result(values))

@@ -410,7 +410,7 @@ def test_without_settings_the_scenario_is_left_as_it_is_and_by_an_identification
     mine = "# mine\n" + SHORT.to_toml()
     recorded_folder.scenario.write_text(mine, encoding="utf-8")
     with pytest.raises(
-        ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has identified"
+        ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has guess"
     ):
         pipeline.identify(
             recorded_folder.path, SilentProgress(), {"model.start_parameters": "nobody"}

@@ -37,7 +37,7 @@ def test_sensitivities_by_the_parameters_that_stand_for_all_say_those_by_all():
     of runs from rest and from a state half way.
     """
     robot = rss6()
-    given = robot, robot.parameter_sets["identified"].vector, _reference(robot), SETTINGS
+    given = robot, robot.parameter_sets["truth"].vector, _reference(robot), SETTINGS
     groups = structure(robot).rigid_groups
     whole = closed_loop.differentiate_servo(*given)
     shown = closed_loop.differentiate_servo(*given, groups=groups)

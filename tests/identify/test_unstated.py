@@ -47,7 +47,7 @@ def test_a_new_robot_is_of_a_workshop():
 
 
 def test_standard_deviations_follow_the_sizes_of_bodies():
-    """Of the platform: 24 kg, 0.2 m and (0.178 + 0.178 + 0.35) / 3 kg m2 of the set `initial`."""
+    """Of the platform: 24 kg, 0.2 m and (0.178 + 0.178 + 0.35) / 3 kg m2 of the set `guess`."""
     robot, kinds = rss6(), ("centres", "products", "passive_friction")
     assert body_error_stds(robot, quick().model, kinds) == {}
     found = body_error_stds(robot, quick(**WORKSHOP).model, kinds)

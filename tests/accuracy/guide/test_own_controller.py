@@ -55,7 +55,7 @@ def reference(cmmsim_robot):
 
 
 def test_tracking_error(accuracy, cmmsim_robot, cmmsim_sensor, cmmsim_seed, reference):
-    plant = cmmsim_robot.parameter_sets["identified"].vector
+    plant = cmmsim_robot.parameter_sets["truth"].vector
     settings = LoopSettings(ServoGains(kp=0.3, kd=0.001, ki=2.4), FrameTiming(RATE_HZ))
 
     def track(controller=None):

@@ -56,7 +56,7 @@ def solve(balance: np.ndarray, robot: dynamics.Robot, platform_mass: float) -> n
     """Least squares beside the starting guess and the weighed platform, which fixes the scale; none
     below zero.
     """
-    guess = robot.parameter_sets["initial"].vector
+    guess = robot.parameter_sets["guess"].vector
     spread = np.where(guess > 0, 0.5 * guess, UNSEEN_FRICTION)
     weighed = np.zeros(73)
     weighed[0] = 1000.0  # 1/kg: the scale shows grams
@@ -70,7 +70,7 @@ def solve(balance: np.ndarray, robot: dynamics.Robot, platform_mass: float) -> n
 def test_unseen_motion(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_seed):
     record = identify.run_experiment(cmmsim_scenario, seed=cmmsim_seed)
     estimate = least_squares(record, cmmsim_robot)
-    start = cmmsim_robot.parameter_sets["initial"].vector
+    start = cmmsim_robot.parameter_sets["guess"].vector
     for who, parameters, limits in (
         ("least squares", estimate, (15, 75)),
         ("starting guess", start, (None, None)),
