@@ -15,8 +15,8 @@ from dynamics.errors import RobotFileError
 from dynamics.kinematics.platform import FREEDOMS, Chart, base_from_platform
 from dynamics.legs.geometric_numbers import POINTS, deviations, moved, unit_of, values
 from dynamics.legs.leg import Leg
+from dynamics.parameter_set import EXACT, Unstated
 from dynamics.parameters import ParameterLayout, parameter_layout
-from dynamics.unstated import EXACT, Unstated
 
 SAME_PLACE = 1e-6
 """Distance, m, below which joints of two legs coincide."""
@@ -32,8 +32,8 @@ class RobotGeometry:
     are the names of the bodies with ten inertial parameters instead of four (see
     `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
     if all joints share them. `passive_friction` are the names of the parameters of passive joints
-    (see `parameters.passive_parameters`). `unstated` says how far bodies and joints can be from
-    this form of them.
+    (see `parameters.passive_parameters`). `unstated` has the
+    standard deviations of the differences between real bodies and joints and this model of them.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -113,11 +113,14 @@ class RobotGeometry:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RobotGeometry):
             return False
-        own = self.digest, self.travel_limit, self.own_gains
-        return own == (other.digest, other.travel_limit, other.own_gains)
+        return self._compared == other._compared
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    @property
+    def _compared(self) -> tuple[object, ...]:
+        return self.digest, self.travel_limit, self.own_gains, self.unstated
 
     @property
     def symbols(self) -> tuple[ca.SX, ...]:
@@ -243,7 +246,10 @@ class RobotGeometry:
         try:
             return self.moved(errors).zeroed()
         except RobotFileError as error:
-            raise RobotFileError(f"with joints off by {std:g} m: {error}") from error
+            raise RobotFileError(
+                f"with errors of {std:g} m of the joints, {length_std:g} m of the lengths and "
+                f"{turn_std:g} rad of the axes: {error}"
+            ) from error
 
     def _check_freedoms(self) -> None:
         """Raise RobotFileError for legs that do not match the chart or each other."""
@@ -252,7 +258,8 @@ class RobotGeometry:
         if not self.legs:
             raise RobotFileError("a robot needs legs, it has none")
         freedoms = len(self.chart.freedoms)
-        charts = Counter(leg.chart for leg in self.legs)
+        counts = Counter(leg.chart for leg in self.legs)
+        charts = ", ".join(f"{count} of `{chart}`" for chart, count in counts.items())
         for number, leg in enumerate(self.legs, 1):
             if leg.chart != self.chart.name:
                 what = (
@@ -261,7 +268,7 @@ class RobotGeometry:
                 )
                 raise RobotFileError(
                     f"leg {number} is of a kind ({type(leg).__name__}) that works with the chart "
-                    f"`{leg.chart}`, not on a {what}; legs by chart: {dict(charts)}"
+                    f"`{leg.chart}`, not on a {what}; charts of all legs: {charts}"
                 )
             if leg.prismatic != self.prismatic:
                 raise RobotFileError(
@@ -269,7 +276,7 @@ class RobotGeometry:
                     "joint PID"
                 )
         if len(self.legs) != freedoms:
-            kind = "under-actuated" if len(self.legs) < freedoms else "over-constrained"
+            kind = "under-actuated" if len(self.legs) < freedoms else "redundantly actuated"
             raise RobotFileError(
                 f"the machine is {kind}: {len(self.legs)} actuated legs for {freedoms} freedoms of "
                 f"the platform ({', '.join(self.chart.coordinate_names)})"

@@ -1,4 +1,7 @@
-"""Parameter sets of a robot file: bodies, joint friction and gains of the joint PID."""
+"""Parameter sets of a robot file: bodies, joint friction and gains of the joint PID.
+
+A file also states how far real bodies and joints may be from the model (`Unstated`).
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -106,6 +109,36 @@ class Parameters(BaseModel):
     def own_gains(self) -> bool:
         """True if a gain has one value per leg."""
         return any(isinstance(getattr(self.joint_pid, gain), list) for gain in JOINT_PID)
+
+
+class Unstated(Strict):
+    """Standard deviations of the differences between real bodies and joints and the model.
+
+    The model of a centred body has its centre of mass in one place, and its axes of inertia along
+    its own axes. The model of a passive joint without a viscous parameter turns freely. Real bodies
+    and joints are near these models. The defaults are for an ordinary workshop. Zero states that
+    bodies and joints are exactly as modelled.
+    """
+
+    centre_std: float = Field(
+        0.03,
+        description="of each coordinate of a centre of mass, as a share of the length of the body",
+        ge=0,
+        le=1,
+    )
+    product_std: float = Field(
+        0.05,
+        description="of each product of inertia, as a share of the body's mean moment of inertia",
+        ge=0,
+        le=1,
+    )
+    passive_viscous_std: Damping = Field(
+        0.005, description="of the viscous friction of a passive joint, N m s/rad"
+    )
+
+
+EXACT = Unstated(centre_std=0.0, product_std=0.0, passive_viscous_std=0.0)
+"""Bodies and joints that are exactly as modelled."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from dynamics.files import Name, check_name, is_file, parse_toml, read_text
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
-from dynamics.parameter_set import Parameters, ParameterSet, Strict, parameter_set
-from dynamics.unstated import Unstated
+from dynamics.parameter_set import Parameters, ParameterSet, Strict, Unstated, parameter_set
 
 MOST_COMPLAINTS = 24
 """Largest number of faults in a message: four for each of six legs."""

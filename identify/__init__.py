@@ -39,9 +39,9 @@ from identify.errors import IdentifyError as IdentifyError
 if TYPE_CHECKING:
     from identify.diagnosis.diagnose import diagnose as diagnose
     from identify.estimation.identification import identify as identify
-    from identify.estimation.prior import ScaleAnchor as ScaleAnchor
-    from identify.estimation.prior import store_anchor as store_anchor
     from identify.estimation.result import IdentificationResult as IdentificationResult
+    from identify.estimation.scale_anchor import ScaleAnchor as ScaleAnchor
+    from identify.estimation.scale_anchor import store_anchor as store_anchor
     from identify.record.load import payload_vector as payload_vector
     from identify.record.load import store_payload as store_payload
     from identify.record.recording import build_record as build_record
@@ -61,8 +61,8 @@ _HOME = {
     "Study": "identify.studies.in_python",
     "build_record": "identify.record.recording",
     "build_timed_record": "identify.record.timed_record",
-    "ScaleAnchor": "identify.estimation.prior",
-    "store_anchor": "identify.estimation.prior",
+    "ScaleAnchor": "identify.estimation.scale_anchor",
+    "store_anchor": "identify.estimation.scale_anchor",
     "payload_vector": "identify.record.load",
     "store_payload": "identify.record.load",
     "IdentificationResult": "identify.estimation.result",

@@ -15,7 +15,7 @@ The loop is implemented once, in modules named `*_kernels`. Numba compiles them,
 as plain Python. Plant and model use the same code.
 """
 
-from dynamics.closed_loop.directions import most_directions
+from dynamics.closed_loop.checked_arguments import most_directions
 from dynamics.closed_loop.drives import DriveName, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.closed_loop.loop_settings import (

@@ -115,6 +115,14 @@ class ServoGains:
         for name in ("kp", "kd", "ki"):
             real(f"servo gain {name}", getattr(self, name), SimulationError, least=0)
 
+    def demand(self, error: np.ndarray, rate_error: np.ndarray, integral: np.ndarray) -> np.ndarray:
+        """Demand (n,) of the servo in the coordinates of the platform, eq. 30.
+
+        It follows from the error (n,) of the pose, its rate and its integral. The compiled loop has
+        the same law in `frame_kernels.serve`.
+        """
+        return self.kp * error + self.kd * rate_error + self.ki * integral
+
 
 @dataclass(frozen=True)
 class FrameTiming:

@@ -7,7 +7,12 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from dynamics.checks import check_type, flag, floats, mask, shown
-from dynamics.closed_loop.directions import checked_directions, most_directions
+from dynamics.closed_loop.checked_arguments import (
+    checked_directions,
+    checked_times,
+    held_commands,
+    most_directions,
+)
 from dynamics.closed_loop.loop_settings import (
     Controller,
     EveryFrame,
@@ -24,7 +29,6 @@ from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
     equilibrium,
 )
-from dynamics.closed_loop.timed_commands import checked_times, held_commands
 from dynamics.errors import SimulationError
 from dynamics.legs.geometric_numbers import MOST_NUMBERS
 from dynamics.parameters import JOINT_PID, RigidGroups

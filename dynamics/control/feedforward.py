@@ -97,11 +97,7 @@ def feedforward(assignment: Assignment) -> LawInLoop:
         pose, rate, _ = assignment.desired(at)
         error = chart.coordinates(pose) - seen.coordinates
         integral = integral + assignment.period * error
-        demand = (
-            gains.kp * error
-            + gains.kd * (chart.coordinates(rate) - seen.rates)
-            + gains.ki * integral
-        )
+        demand = gains.demand(error, chart.coordinates(rate) - seen.rates, integral)
         jacobian = model.robot.coordinate_jacobian(chart.pose(seen.coordinates))
         issued = np.asarray(commands[frame] + jacobian @ demand)
         watched.issue(frame, issued)

@@ -26,7 +26,7 @@ from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import Chart
 from dynamics.legs.chain import SAME, leg_of
 from dynamics.legs.leg import Body, Leg, Placement
-from dynamics.parameter_set import ParameterSet
+from dynamics.parameter_set import ParameterSet, Unstated
 from dynamics.parameters import JOINT_PID
 from dynamics.pseudo_inertia import full_body, is_centred
 from dynamics.rigid_body.jacobians import joint_jacobian
@@ -34,7 +34,6 @@ from dynamics.rigid_body.virtual_work import mass_matrix
 from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import MOMENTS
-from dynamics.unstated import Unstated
 
 DIAGONAL = 1e-9
 """Share of the largest moment below which products of inertia count as rounding errors."""

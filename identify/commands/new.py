@@ -231,7 +231,7 @@ def _copy(kind: str, like: str, file: Path) -> str:
 
 def _of_a_workshop(text: str) -> str:
     """Return the text of a built-in robot file with bodies and joints known as in a workshop."""
-    from dynamics.unstated import Unstated
+    from dynamics.parameter_set import Unstated
 
     for name, std in Unstated():
         text = re.sub(rf"^{name} = 0\.0 *#", f"{name} = {std}  #", text, flags=re.MULTILINE)

@@ -90,7 +90,7 @@ def teach(
       cmmsim teach --render 24 --sensor mine.toml --out photos
     """
     from cmmsim.from_photographs import photographs_for, sensor_for
-    from identify.verification.photograph_figures import teaching_residuals
+    from identify.verification.sensor_figures import teaching_residuals
 
     folder = context.with_resource(new_run_folder(out)).path
     if render is not None:

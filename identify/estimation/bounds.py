@@ -70,6 +70,16 @@ MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 """Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
 
 
+def least_values(layout: ParameterLayout) -> Array:
+    """Return the smallest values (p,) that parameters can have, zero or -inf.
+
+    Only first moments and products of inertia can be negative.
+    """
+    least = np.zeros(len(layout.names))
+    least[layout.dynamic][layout.signed] = -np.inf
+    return least
+
+
 @dataclass(frozen=True)
 class ParameterBounds:
     """Coordinates (p,) of a search, and their lower bounds.
@@ -91,7 +101,7 @@ class ParameterBounds:
         Negative parameters are raised. Impossible bodies are changed, if possible without an effect
         on the motion.
         """
-        allowed = np.where(self._signed, parameters, np.maximum(parameters, 0.0))
+        allowed = np.maximum(parameters, least_values(self.layout))
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
             allowed[self.layout.inertial] = self.layout.rigid_of(bodies)
@@ -135,12 +145,6 @@ class ParameterBounds:
         return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
 
     @property
-    def _signed(self) -> NDArray[np.bool_]:
-        """Return which parameters (p,) may be negative."""
-        gains = len(self.layout.names) - len(self.layout.signed)
-        return np.append(self.layout.signed, np.zeros(gains, dtype=bool))
-
-    @property
     def _log_cholesky(self) -> tuple[slice, ...]:
         """Slices of the full bodies that have log-Cholesky coordinates."""
         pairs = zip(self.layout.body_slices, self.layout.full, strict=True)
@@ -172,11 +176,10 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     layout = guess.layout
     names = guess.layout.names
     matrix = np.eye(len(names))
-    lower = np.zeros(len(names))
+    lower = least_values(layout)
     for place in (names.index(name) for name in guess.above_zero):
         lower[place] = SMALLEST_SHARE * guess.values[place]
     lower[guess.fixed] = -1.0  # the prior fixes them at zero, so their bounds must not be active
-    lower[layout.dynamic][layout.signed] = -np.inf
     if physical:
         lower[layout.inertial] = np.maximum(lower[layout.inertial], SMALLEST)
         for own, full in zip(layout.body_slices, layout.full, strict=True):

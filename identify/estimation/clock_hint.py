@@ -9,7 +9,7 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.common_error_estimates import most_likely
+from identify.estimation.common_error_estimates import errors_of_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.model.loop_model import LoopModel
@@ -50,7 +50,7 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
     for number, (run, lacks) in enumerate(zip(judged.runs, unstated, strict=True), start=1):
         if not lacks:
             continue
-        errors = run.common.whole_factor @ most_likely(run, parameters)
+        errors = run.common.whole_factor @ errors_of_run(run, parameters)
         offset = 1e3 * errors[run.common.all_names.index(CLOCK_OFFSET)]
         of_record = f" of record {number}" if len(runs) > 1 else ""
         hints.append(

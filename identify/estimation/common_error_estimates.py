@@ -44,18 +44,18 @@ class CommonErrorEstimates:
         return dict(zip(self.names, self.estimate.tolist(), strict=True))
 
 
-def most_likely(run: LoopModel, parameters: Array) -> Array:
+def errors_of_run(run: LoopModel, parameters: Array) -> Array:
     """Return the most likely common errors (k,) of a run at the optimal parameters (p,).
 
     The run is one returned by `with_common_errors`. The errors are in prior standard deviations.
     """
     assert run.marginal is not None
     missed = replace(run, marginal=None).misses(parameters).ravel() - run.marginal.had
-    return most_likely_of(run.marginal.modes, missed)
+    return errors_from_residuals(run.marginal.modes, missed)
 
 
-def most_likely_of(modes: Array, missed: Array) -> Array:
-    """Return the most likely errors (k,) for their modes (m, k) and the residuals (m,).
+def errors_from_residuals(modes: Array, missed: Array) -> Array:
+    """Return the most likely errors (k,) of modes (m, k) and residuals (m,).
 
     Modes and residuals are in standard deviations of the noise alone.
     """
@@ -63,15 +63,17 @@ def most_likely_of(modes: Array, missed: Array) -> Array:
     return np.asarray(-np.linalg.solve(np.eye(modes.shape[1]) + modes.T @ modes, modes.T @ missed))
 
 
-def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
-    """Return the most likely errors (k,) of each run of a problem `with_common_errors`.
+def errors_in_models(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
+    """Return the most likely errors (k,) of poses, loop and bodies for each run of a problem.
 
-    Only errors that a model can contain are returned: errors of the poses, and of the loop.
+    The problem is one returned by `with_common_errors`. Errors of the geometry are left out,
+    because no model contains them (see `LoopModel.errors_had`).
     """
-    return [
-        np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]
-        for run in problem.runs
-    ]
+    found = []
+    for run in problem.runs:
+        errors = np.zeros(0) if run.marginal is None else errors_of_run(run, parameters)
+        found.append(errors[: len(run.errors_had)])
+    return found
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
@@ -152,7 +154,7 @@ def common_error_estimates(
         estimates = CommonErrorEstimates(
             run.common.all_names,
             np.sqrt(np.diag(factor @ factor.T)),
-            factor @ most_likely(run, parameters),
+            factor @ errors_of_run(run, parameters),
             factor @ whole[own, own] @ factor.T,
             whole[:count, own] @ factor.T,
         )

@@ -41,7 +41,7 @@ from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
 from identify.estimation.common_error_estimates import (
     covariance_by_kind,
-    most_likely_of,
+    errors_from_residuals,
     shared_draws,
 )
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
@@ -176,7 +176,7 @@ class _Linear:
     def left(self) -> Array:
         """Residuals (n, 6) that remain with the most likely common errors."""
         modes = self.modes.reshape(self.missed.size, -1)
-        return self.missed + self.modes @ most_likely_of(modes, self.missed.ravel())
+        return self.missed + self.modes @ errors_from_residuals(modes, self.missed.ravel())
 
 
 def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:

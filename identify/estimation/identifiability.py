@@ -49,13 +49,13 @@ from identify.estimation.explanation import Explanation
 from identify.estimation.full_bodies import full_body_warnings
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import (
-    ScaleAnchor,
     StartingGuess,
     asymmetry,
     friction,
     holding_torque,
     passive_torque,
 )
+from identify.estimation.scale_anchor import ScaleAnchor
 
 IDENTIFIABLE_SHARE = 0.5
 """Largest standard deviation of an identified quantity, as a share of its prior and of its size.

@@ -24,8 +24,9 @@ from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import model_guess, read_anchor
+from identify.estimation.prior import model_guess
 from identify.estimation.result import IdentificationResult
+from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.model.from_record import identified_model
 from identify.model.model_side import ModelSide, model_side, side_of_record

@@ -5,8 +5,9 @@ around it and follows the reference. Its ideal sensor has the same sampling, del
 loses the same frames as the real sensor. Driven by commands, the joints of the model get the logged
 commands, which contain the effect of the sensor's noise on the plant.
 
-The residuals are the pose differences of all records, whitened by the sensor's covariance, and a
-row for each prior information: the initial guess of each parameter and the scale anchor.
+The residuals are the pose differences of all records, whitened by the sensor's covariance
+(`LoopModel.misses` computes them), and a row for each prior information: the initial guess of each
+parameter and the scale anchor.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from dynamics import DynamicsError
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
-from identify.estimation.prior import ScaleAnchor, StartingGuess
+from identify.estimation.prior import StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor
 from identify.model.loop_model import LoopModel
 from identify.scenario import Filter
 

@@ -17,7 +17,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, minimise
 from identify.estimation.bounds import ParameterBounds
-from identify.estimation.common_error_estimates import most_likely_errors
+from identify.estimation.common_error_estimates import errors_in_models
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import linear_warm_start
@@ -97,7 +97,7 @@ def output_error_searches(
         if closed_loop:
             # The closed-loop search begins with the common errors of the command-driven search.
             problem = problem.having(
-                most_likely_errors(searched.problem, searched.solution.parameters)
+                errors_in_models(searched.problem, searched.solution.parameters)
             )
             start = _closed_loop_start(problem, searched.solution.parameters)
             found["closed_loop"] = search_with_common_errors(problem, [start], advance)
@@ -123,7 +123,7 @@ def search_with_common_errors(
         again = search(problem, warm, lambda n=1: None)
         solution = min(solution, again, key=lambda one: one.costs[-1])
     for turn in range(LINEARISATIONS if problem.bends else 0):
-        errors = most_likely_errors(problem, solution.parameters)
+        errors = errors_in_models(problem, solution.parameters)
         if problem.has(errors, SETTLED):
             break
         if turn >= FULL_STEPS:
@@ -149,7 +149,7 @@ def _near_common_errors(
     for _ in range(MOST):
         found = search(replace(problem, stop=few), start, lambda n=1: None)
         start = found.parameters
-        errors = most_likely_errors(problem, start)
+        errors = errors_in_models(problem, start)
         if problem.has(errors, NEAR):
             break
         problem = _moved_towards(problem, errors, start)

@@ -28,7 +28,8 @@ from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, GroupEstimates
-from identify.estimation.prior import ScaleAnchor, gains_among
+from identify.estimation.prior import gains_among
+from identify.estimation.scale_anchor import ScaleAnchor
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result
 from identify.loop_parameters import known_value

@@ -36,9 +36,10 @@ from dynamics.closed_loop import FrameTiming
 from dynamics.closed_loop.command_schedule import acting_times
 from dynamics.closed_loop.drives import JointLaw, gain_columns
 from identify.arrays import Array, triangular_factor
-from identify.estimation.bounds import SMALLEST_SHARE
+from identify.estimation.bounds import SMALLEST_SHARE, least_values
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import ScaleAnchor, StartingGuess
+from identify.estimation.prior import StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import LATENCY, SCALE, Marginal
@@ -68,8 +69,7 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
     drives = problem.runs[0].settings.drives
     law = drives.joint_law(layout.split(guess.values)[3])
     matrix, right, common = _stacked(problem, law)
-    signed = np.append(layout.signed, np.zeros(len(layout.joint_pid_names), dtype=bool))
-    least = np.where(signed, -np.inf, 0.0)
+    least = least_values(layout)
     lower = np.concatenate([least, np.full(matrix.shape[1] - count, -np.inf)])
     rows = _condensed(matrix, right, common)
     for _ in range(REWEIGHTINGS):

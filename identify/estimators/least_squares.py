@@ -25,18 +25,20 @@ from dynamics import DynamicsError
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.bounds import least_values
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import ScaleAnchor, StartingGuess
+from identify.estimation.prior import StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
 from identify.model.loop_model import LoopModel
 
-FREE_TORQUE = {False: 1e3, True: 1e6}
-"""Prior standard deviation of the torques at the start, N m, or forces of prismatic joints, N.
+UNKNOWN_TORQUE = 1e3
+"""Prior standard deviation of the torques at the start, N m, so large that it has no effect."""
 
-It is so large that the prior has no effect. The keys are False for torques and True for forces.
-"""
+UNKNOWN_FORCE = 1e6
+"""Prior standard deviation of the forces at the start, N, likewise for joints that slide."""
 
 
 @dataclass(frozen=True)
@@ -113,15 +115,17 @@ def torque_equations(
 
 
 def lower_bounds(layout: ParameterLayout) -> Array:
-    """Return lower bounds (u,): zero for parameters and gains, -inf for torques at the start."""
-    return np.concatenate([np.zeros(len(layout.names)), np.full(layout.joints, -np.inf)])
+    """Return lower bounds (u,): `least_values` of the parameters, and -inf for the torques at the
+    start.
+    """
+    return np.concatenate([least_values(layout), np.full(layout.joints, -np.inf)])
 
 
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
     """Return prior values (u,) and prior standard deviations (u,) of the unknowns."""
     joints = guess.layout.joints
-    free = FREE_TORQUE[guess.layout.prismatic]
-    return np.append(guess.values, np.zeros(joints)), np.append(guess.std, np.full(joints, free))
+    unknown = UNKNOWN_FORCE if guess.layout.prismatic else UNKNOWN_TORQUE
+    return np.append(guess.values, np.zeros(joints)), np.append(guess.std, [unknown] * joints)
 
 
 def nearest_admissible(

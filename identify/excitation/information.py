@@ -49,13 +49,8 @@ from dynamics.closed_loop import LoopFailure, LoopSettings, differentiate_servo
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
-from identify.estimation.prior import (
-    MEASURING,
-    StartingGuess,
-    default_std,
-    measured_parameter,
-    model_guess,
-)
+from identify.estimation.prior import StartingGuess, model_guess
+from identify.estimation.scale_anchor import MEASURING, default_std, measured_parameter
 from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import (
     RESPONSE_BITS,

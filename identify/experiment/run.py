@@ -13,7 +13,8 @@ from cmmsim.uncertainty.drift_watch import DriftWatch
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.arrays import Array
-from identify.estimation.prior import measured_anchor, starting_guess, store_anchor
+from identify.estimation.prior import starting_guess
+from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, by_images, prepared
 from identify.experiment.plant import Plant, PlatformLoad, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop

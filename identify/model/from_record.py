@@ -7,10 +7,10 @@ import numpy as np
 import xarray as xr
 
 from identify.errors import EstimationError
+from identify.model.common_error_prior import with_recorded_errors
 from identify.model.from_timed_record import timed_model
 from identify.model.loop_model import LoopModel
 from identify.model.model_side import ModelSide
-from identify.model.recorded_errors import with_recorded_errors
 from identify.model.torque_model import torque_model
 from identify.record.checks import (
     check_channels,

@@ -11,9 +11,9 @@ from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import filtered_derivatives, interpolated
+from identify.model.common_error_prior import with_recorded_errors
 from identify.model.likely_delay import likely_delay
 from identify.model.model_side import ModelSide
-from identify.model.recorded_errors import with_recorded_errors
 from identify.model.stretch import Stretch, begun_stretch
 from identify.model.timed_model import TimedModel, grid_times
 from identify.record.checks import (

@@ -30,9 +30,9 @@ from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
 from identify.model.body_errors import body_errors, fed_forward
+from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
-from identify.model.loop_errors import lowest_errors, settings_with_errors
 from identify.record.checks import long_gap_warnings
 from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Marginal
 

@@ -32,9 +32,9 @@ from dynamics.closed_loop import (
 from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.filtering import interpolated
+from identify.model.common_error_prior import lowest_errors
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
-from identify.model.loop_errors import lowest_errors
 from identify.model.loop_model import LoopModel
 from identify.model.stretch import Stretch
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE

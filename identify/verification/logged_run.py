@@ -19,13 +19,8 @@ from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.estimation.identifiability import group_rows, identifiability
-from identify.estimation.prior import (
-    MEASURING,
-    default_std,
-    friction,
-    measured_parameter,
-    model_guess,
-)
+from identify.estimation.prior import friction, model_guess
+from identify.estimation.scale_anchor import MEASURING, default_std, measured_parameter
 from identify.model.model_side import ModelSide, model_side
 from identify.record.conditions import COMMAND_TIME
 from identify.record.motion_lag import MotionLag

@@ -1,4 +1,6 @@
-"""Figures (PNG) of a sensor's acceptance tests, of its calibration and of its detectors."""
+"""Figures (PNG) of a sensor's acceptance tests, calibration and detectors, and of a teaching from
+photographs.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from cmmsim import PhotographedTeaching
 from cmmsim.acceptance import (
     BarTest,
     LatencyTest,
@@ -331,3 +334,37 @@ def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
     axes.set_xticks(100.0 * np.array(noise), [f"{100.0 * n:.2g}" for n in noise])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.grid(alpha=0.3, which="both")
+
+
+def teaching_residuals(found: PhotographedTeaching) -> Figure:
+    """Draw the residuals, measured minus adjusted centres, as arrows at the centres."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    panels = figure.subplots(1, 2)
+    seen = found.observations
+    sigma = max(found.rms_px, 1e-9)
+    figure.suptitle(f"residuals of stickers, rms {found.rms_px:.3g} px")
+    for side, axes in enumerate(panels):
+        camera = found.bundle.state.rig.cameras[side]
+        for moves, colour, body in ((False, "tab:orange", "base"), (True, "tab:blue", "platform")):
+            own = seen.moves == moves
+            axes.quiver(
+                *seen.pixels[side, own].T,
+                *found.bundle.residuals[side, own].T,
+                angles="xy",
+                scale_units="xy",
+                width=0.0015,
+                color=colour,
+                label=body,
+                scale=3.0 * sigma / (ARROW_SHARE * camera.width),
+            )
+        rms = np.sqrt(np.mean(found.bundle.residuals[side] ** 2))
+        axes.set(
+            xlim=(0, camera.width),
+            ylim=(camera.height, 0),
+            xlabel="x [px]",
+            ylabel="y [px]",
+            aspect="equal",
+        )
+        axes.set_title(f"{SIDES[side]}: rms {rms:.3g} px", loc="left", fontsize="medium")
+    panels[0].legend(loc="upper right", fontsize="small")
+    return figure

@@ -386,7 +386,11 @@ REFUSED = {
         (equilibrium, {"pose": np.full(6, 9.0)}, r"leg 1 cannot reach pose \[9.")
     ],
     RobotFileError: [
-        (misplaced, {"std": 0.2}, r"with joints off by 0.2 m: leg \d cannot reach the home pose")
+        (
+            misplaced,
+            {"std": 0.2},
+            r"with errors of 0.2 m of the joints, 0 m .*: leg \d cannot reach the home pose",
+        )
     ],
     TravelError: [(check_motion, {"travel_margin": -0.1}, "travel_margin is -0.1.*must be")],
     ParameterError: [

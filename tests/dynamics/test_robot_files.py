@@ -278,7 +278,10 @@ def test_machines_with_more_or_fewer_freedoms_than_actuators_are_counted_and_nam
             ("rss6", slice(5)),
             r"under-actuated: 5 actuated legs for 6 freedoms .*\(x, y, z, alpha, beta, gamma\)",
         ),
-        (("ups6", slice(6), [legs["pss6"][0]]), "over-constrained: 7 actuated legs for 6 freedoms"),
+        (
+            ("ups6", slice(6), [legs["pss6"][0]]),
+            "redundantly actuated: 7 actuated legs for 6 freedoms",
+        ),
         (
             ("rss6", slice(6), [legs["delta3"][0]]),
             r"leg 7 is of a kind \(ParallelogramLeg\) .* `translation`, not",

@@ -11,7 +11,7 @@ from dynamics.closed_loop import (
     Reference,
     simulate_commands,
 )
-from identify.estimation.prior import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.record.from_telemetry import record_of
 from identify.record.recording import poses, recorded_reference
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry

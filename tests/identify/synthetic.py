@@ -11,7 +11,8 @@ import numpy as np
 
 from dynamics import Robot, load_robot
 from identify.estimation.identification import output_error_problem
-from identify.estimation.prior import ScaleAnchor, StartingGuess, store_anchor
+from identify.estimation.prior import StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.files.run_folder import RunFolder

@@ -11,7 +11,7 @@ import pytest
 
 from identify.errors import RecordError
 from identify.estimation.identification import identify
-from identify.estimation.prior import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes, record_of
 from identify.record.recording import is_timed

@@ -21,7 +21,7 @@ from identify.errors import ScenarioError
 from identify.estimation.identification import identify
 from identify.experiment.joint_instruments import measure_joints
 from identify.experiment.true_robot import true_deviations, true_zeros
-from identify.model.loop_errors import lowest_errors, settings_with_errors
+from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.record.known_geometry import KnownGeometry
 from identify.record.stored_common_errors import LATENCY, SCALE, kind_of
 from tests.identify.synthetic import (

@@ -19,7 +19,7 @@ from identify.estimation.base_parameters import structure
 from identify.estimation.conditioning import POOR
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
 from identify.estimation.identification import identify
-from identify.estimation.prior import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import drawn_load
 from identify.loop_parameters import choose_parameters

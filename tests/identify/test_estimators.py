@@ -362,6 +362,16 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
     assert np.allclose(found, positive[:size] - np.append(np.zeros(67), positive[size:]), atol=1e-6)
 
 
+def test_least_squares_finds_a_centre_of_mass_on_either_side():
+    """The first moments, of a full platform, may be negative where masses and friction may not."""
+    centre = {"platform.mcx": -0.3, "platform.mcy": 0.2}
+    scenario = quick(**{"plant.values": centre, "model.inertia": {"platform": "full"}})
+    seen = evidence(1, noise=0.05, instruments=PERFECT, scenario=scenario)
+    names = seen.problem.guess.layout.names
+    found = dict(zip(names, weighted_least_squares(seen).parameters.tolist(), strict=True))
+    assert {name: found[name] for name in centre} == pytest.approx(centre, abs=0.02)
+
+
 def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_where_noise_is_small():
     """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %, and
     Coulomb friction; no anchor is told: the torque carries the scale. Angles that no pose has tell

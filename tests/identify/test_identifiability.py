@@ -28,13 +28,8 @@ from identify.estimation.identifiability import (
     identifiability,
 )
 from identify.estimation.identification import identify
-from identify.estimation.prior import (
-    ScaleAnchor,
-    holding_torque,
-    read_anchor,
-    starting_guess,
-    store_anchor,
-)
+from identify.estimation.prior import holding_torque, starting_guess
+from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
 from identify.reporting.parameter_tables import ON_GUESS, parameter_table
 from tests.identify.commands import command
 from tests.identify.synthetic import (

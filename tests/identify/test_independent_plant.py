@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 import identify
 from dynamics.engines.mjcf import mjcf_text
-from identify.estimation.prior import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.record.recording import build_record
 from tests.identify.synthetic import SIGMA, build_plant, quick, rss6, trajectory, truth
 from tests.identify.test_real_bodies import CENTRE, PRODUCTS, uneven

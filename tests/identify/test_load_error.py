@@ -14,7 +14,7 @@ from identify.errors import EstimationError, RecordError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify
 from identify.estimation.output_error_search import search
-from identify.estimation.prior import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.experiment.plant import drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses

@@ -13,7 +13,8 @@ from dynamics.parameter_set import ParameterSet
 from identify.diagnosis.diagnose import diagnosis_from
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.estimation.identification import identify
-from identify.estimation.prior import measured_anchor, measured_parameter, model_guess
+from identify.estimation.prior import model_guess
+from identify.estimation.scale_anchor import measured_anchor, measured_parameter
 from identify.estimation.warm_start import joint_balance
 from identify.estimators.estimator import Evidence
 from identify.estimators.output_error_routes import known_pid

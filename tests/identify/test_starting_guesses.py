@@ -42,7 +42,8 @@ from identify.estimation.output_error_search import (
     search,
     shoot,
 )
-from identify.estimation.prior import ScaleAnchor, holding_torque, store_anchor, typical_sizes
+from identify.estimation.prior import holding_torque, typical_sizes
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario

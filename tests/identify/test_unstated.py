@@ -8,11 +8,11 @@ from scipy.stats import binom
 
 import dynamics
 import identify
+from dynamics.parameter_set import EXACT, Unstated
 from dynamics.pseudo_inertia import full_body
 from dynamics.robot_file import built_in_robots, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import FULL_INERTIAL
-from dynamics.unstated import EXACT, Unstated
 from identify.commands.new import _of_a_workshop
 from identify.model.body_errors import body_error_stds, body_errors
 from tests.identify.synthetic import changed_robot_file, problem_of, quick, rss6, run_plant, truth
@@ -34,6 +34,7 @@ def test_built_in_robots_are_exact_and_a_file_without_a_word_is_of_a_workshop(tm
     other = dynamics.load_robot(changed_robot_file(tmp_path / "a.toml", stated, ""))
     assert other.geometry.unstated == Unstated(product_std=0.0, passive_viscous_std=0.0)
     assert other.geometry.unstated.centre_std == 0.03
+    assert other.geometry != dynamics.load_robot("rss6").geometry
     description = dynamics.robot_file.read_robot_file(tmp_path / "a.toml")
     again = parsed_robot(robot_text(description), "again")
     assert again.geometry.unstated == other.geometry.unstated

@@ -1,0 +1,119 @@
+"""Prior of the common errors that are estimated beside the parameters, and their place in a loop.
+
+Errors of the poses and of the geometry come from the record. Errors of the latency, of the zeros
+and of the scale of commands, and of the bodies have standard deviations in the model's side of a
+scenario. All of them are the same for all poses of a record.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import xarray as xr
+
+from dynamics import Robot
+from dynamics.closed_loop import LoopSettings
+from identify.arrays import Array
+from identify.loop_parameters import of_actuators
+from identify.model.body_errors import body_error_stds
+from identify.model.model_side import ModelSide
+from identify.record.conditions import takes_torques
+from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
+from identify.record.stored_common_errors import LATENCY, SCALE, ZERO, read_common_errors
+from identify.scenario import Model
+
+if TYPE_CHECKING:
+    from identify.model.loop_model import LoopModel
+
+Run = TypeVar("Run", bound="LoopModel")
+
+LEAST_SCALE = 0.1
+"""Smallest scale of the commands that a model can contain."""
+
+
+def with_recorded_errors(
+    run: Run,
+    record: xr.Dataset,
+    side: ModelSide,
+    motion: Array,
+    own: Mapping[str, float] = MappingProxyType({}),
+) -> Run:
+    """Return a model with the common errors that are estimated beside the parameters.
+
+    Parameters
+    ----------
+    run : LoopModel
+        Model without common errors, which need its whitener.
+    record : xarray.Dataset
+        Record of the run, with the errors of its poses and of the geometry.
+    side : ModelSide
+        Kinds of errors, and the standard deviations of those of loop and bodies.
+    motion : ndarray, shape (N, 6)
+        Poses of the run, which show the errors of the geometry.
+    own : mapping of str to float
+        Standard deviations of further errors in the loop, by name.
+
+    Raises
+    ------
+    RecordError
+        The record states errors that are not valid.
+    """
+    kinds = side.nuisances
+    geometry = None
+    covariance = read_geometry_covariance(record, run.robot) if "geometry" in kinds else None
+    if covariance is not None:
+        geometry = GeometryErrors(run.robot, covariance, motion, run.whitener)
+    stds = loop_error_stds(run.robot, side.model, side.timing.latency_std_s, kinds)
+    if takes_torques(record):
+        # no zero and no scale of joint commands acts under torques
+        stds = {name: std for name, std in stds.items() if name == LATENCY}
+    common = replace(
+        read_common_errors(record, kinds),
+        loop_std=stds | dict(own),
+        geometry=geometry,
+        body_std=body_error_stds(run.robot, side.model, kinds),
+        whitener=run.whitener,
+    )
+    return replace(run, common=common)
+
+
+def loop_error_stds(
+    robot: Robot, model: Model, latency_std_s: float, kinds: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the standard deviations of the errors in the loop by name, of some kinds.
+
+    Errors that are assumed to be zero are left out. latency_std_s: of the mean latency. Raises the
+    ScenarioError of `of_actuators`.
+    """
+    found = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
+    zero = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
+    layout = robot.layout
+    found |= {zero_name(joint, layout.joint_unit): zero for joint in range(layout.joints)}
+    found[SCALE] = model.command_scale_std if "scale" in kinds else 0.0
+    return {name: std for name, std in found.items() if std}
+
+
+def zero_name(joint: int, unit: str) -> str:
+    """Return the name of the error of the zero of a joint, which is counted from 0."""
+    return f"{ZERO}{joint + 1}_{unit}"
+
+
+def lowest_errors(stds: Mapping[str, float], mean_latency: float) -> Array:
+    """Return the smallest errors (k,) that a loop can contain, in their standard deviations.
+
+    No latency is negative, and the scale of the commands stays above zero.
+    """
+    least = {LATENCY: -mean_latency, SCALE: LEAST_SCALE - 1.0}
+    return np.array([least.get(name, -np.inf) / std for name, std in stds.items()])
+
+
+def settings_with_errors(settings: LoopSettings, errors: Mapping[str, float]) -> LoopSettings:
+    """Return the settings of a loop whose drives have some errors of zeros and scale."""
+    zeros = tuple(value for name, value in errors.items() if name.startswith(ZERO))
+    scale = 1.0 + errors.get(SCALE, 0.0)
+    if scale == 1.0 and not any(zeros):
+        return settings
+    drives = replace(settings.drives, joint_zeros=zeros, command_scale=scale)
+    return replace(settings, drives=drives)
