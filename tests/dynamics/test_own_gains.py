@@ -260,7 +260,7 @@ def test_the_law_of_one_set_of_gains_is_that_of_all_joints_with_it():
 
 
 SHARED = "joint_pid = { lp = 10.0, li = 12.0, ld = 0.1 }"
-"""Line of the initial set in the file of the reference robot."""
+"""Line of the set `guess` in the file of the reference robot."""
 
 
 def test_a_robot_file_states_one_value_a_leg_and_is_written_again(load_changed):
@@ -281,7 +281,7 @@ def test_a_robot_file_states_one_value_a_leg_and_is_written_again(load_changed):
 
 
 def test_a_list_of_a_wrong_length_is_refused(load_changed):
-    words = r"parameters\.initial\.joint_pid\.li needs one value or 6 values, got 2"
+    words = r"parameters\.guess\.joint_pid\.li needs one value or 6 values, got 2"
     with pytest.raises(RobotFileError, match=words):
         load_changed({SHARED: "joint_pid = { lp = 10, li = [1.0, 2.0], ld = 0.1 }"})
 

@@ -130,7 +130,7 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         (
             "mass = 24.0, ",
             "mass = 24.0, weight = 1, ",
-            "initial.platform: .*unknown key weight; valid: mass",
+            "guess.platform: .*unknown key weight; valid: mass",
         ),
         ('family = "rss6"', 'family = "delta"', "family: unknown `delta`; valid: rss6, "),
         ("crank_length = 0.06", 'type = "rpr"', "leg 1: its type is 'rpr'; valid: rss, rus, ups, "),

@@ -365,7 +365,8 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
 def test_least_squares_finds_a_centre_of_mass_on_either_side():
     """The first moments, of a full platform, may be negative where masses and friction may not."""
     centre = {"platform.mcx": -0.3, "platform.mcy": 0.2}
-    scenario = quick(**{"plant.values": centre, "model.inertia": {"platform": "full"}})
+    moments = {"platform.Ixx": 0.18, "platform.Iyy": 0.17, "platform.Izz": 0.33}
+    scenario = quick(**{"plant.values": centre | moments, "model.inertia": {"platform": "full"}})
     seen = evidence(1, noise=0.05, instruments=PERFECT, scenario=scenario)
     names = seen.problem.guess.layout.names
     found = dict(zip(names, weighted_least_squares(seen).parameters.tolist(), strict=True))
