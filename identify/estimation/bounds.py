@@ -31,11 +31,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from dynamics.inertia import SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
 from dynamics.pseudo_inertia import (
+    body_fault,
     from_log_cholesky,
     log_cholesky,
     log_cholesky_slope,
@@ -109,6 +110,17 @@ class ParameterBounds:
                 second = allowed[own][4:7].sum() / 2
                 allowed[own] = nearest_body(allowed[own], INSIDE * second)
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
+
+    def outside(self, parameters: Array) -> NDArray[np.bool_]:
+        """Return which parameters (p,) are beyond a bound, or moments of a body that cannot exist.
+
+        All moments of such a body are marked, because each of them can be the cause.
+        """
+        beyond = self.linear_coordinates(parameters) < self.lower
+        marked = np.asarray((self.matrix != 0) | np.eye(len(beyond), dtype=bool)) @ beyond
+        for own in self._log_cholesky:
+            marked[own] = bool(body_fault(parameters[own]))
+        return np.asarray(marked, dtype=bool)
 
     def coordinates(self, parameters: Array) -> Array:
         """Return the coordinates (p,) of parameters (p,) within the bounds."""
@@ -223,6 +235,18 @@ class BoundedEstimate:
         centres = np.stack([rows @ self.estimate, rows @ self.unheld])
         low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
         return np.stack([low, centres.max(axis=0) + half], axis=1)
+
+    def probabilities(self, rows: Array, values: Array) -> Array:
+        """Return the probabilities (n,) that the quantities rows (n, p) @ parameters are smaller.
+
+        values (n,): values with which the quantities are compared. The stated distribution of a
+        quantity is normal about its unheld estimate, truncated at its smallest allowed value.
+        """
+        std = combined_std(rows, self.covariance)
+        centre = rows @ self.unheld
+        # Upper tails keep their digits where the unheld estimate is far below the bound.
+        above = ndtr((centre - values) / std) / ndtr((centre - self.bounds.least(rows)) / std)
+        return np.asarray(np.clip(1.0 - above, 0.0, 1.0))
 
     @property
     def active_bounds(self) -> tuple[str, ...]:

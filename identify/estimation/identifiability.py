@@ -42,7 +42,7 @@ from identify.estimation.base_parameters import (
     structure,
 )
 from identify.estimation.bounded_least_squares import Solution
-from identify.estimation.bounds import bounded_estimate, combined_std
+from identify.estimation.bounds import BoundedEstimate, bounded_estimate, combined_std
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
@@ -233,6 +233,8 @@ class Judgement:
         95 % intervals of parameters and groups, truncated at the bounds.
     groups : GroupEstimates
         Estimates of the base parameters.
+    bounded : BoundedEstimate
+        Estimate within bounds, which states the distribution of every quantity.
     conditioning : Conditioning
         Conditioning of the estimate.
     base_rank : int
@@ -249,6 +251,7 @@ class Judgement:
     intervals: Array
     groups: GroupEstimates
     group_intervals: Array
+    bounded: BoundedEstimate
     conditioning: Conditioning
     base_rank: int
     active_bounds: tuple[str, ...]
@@ -308,6 +311,7 @@ def judge(
         intervals=bounded.intervals(each),
         groups=groups,
         group_intervals=bounded.intervals(group_rows(base, robot.layout)),
+        bounded=bounded,
         conditioning=conditioned,
         base_rank=rank_by_threshold(np.concatenate(excited), qr_threshold),
         active_bounds=bounded.active_bounds,

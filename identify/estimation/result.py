@@ -22,6 +22,7 @@ from dynamics.closed_loop.drives import READS, cascade_gains
 from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.bounds import BoundedEstimate
 from identify.estimation.common_error_estimates import CommonErrorEstimates
 from identify.estimation.conditioning import Conditioning
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
@@ -68,6 +69,8 @@ class IdentificationResult:
         Share of the variance due to each kind of error that all poses have in common.
     groups, group_intervals
         Estimates of the base parameters, and their 95 % intervals.
+    bounded : BoundedEstimate
+        Estimate within bounds, which states the distribution of every quantity.
     base_rank : int
         Number of independent groups that the trajectory excites by the paper's rule.
     iterations, evaluations : int
@@ -103,6 +106,7 @@ class IdentificationResult:
     common_share: dict[str, Array]
     groups: GroupEstimates
     group_intervals: Array
+    bounded: BoundedEstimate
     conditioning: Conditioning
     scale_anchor: ScaleAnchor
     common_errors: CommonErrorEstimates

@@ -25,6 +25,7 @@ from identify.studies.study_file import Law, Study
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, rows_with_figures
+from identify.studies.uniformity import Uniformity, uniformity_figure
 
 PANEL = (3.4, 2.8)
 """Width and height of a panel, inches. The width fits a column of a journal."""
@@ -81,12 +82,17 @@ Others = Sequence[tuple[str, pd.DataFrame]]
 
 
 def draw(
-    folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
+    folder: Path,
+    study: Study,
+    done: pd.DataFrame,
+    shown: list[str],
+    verdicts: list[Verdict],
+    tests: list[Uniformity],
 ) -> None:
     """Write the plots of a study's finished rows. `shown` names the figures to plot."""
     if not len(done) or not shown:
         return
-    _write(folder, _figures(study, done, shown, verdicts))
+    _write(folder, _figures(study, done, shown, verdicts, tests))
 
 
 def draw_side_by_side(
@@ -119,9 +125,15 @@ def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:
 
 
 def _figures(
-    study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
+    study: Study,
+    done: pd.DataFrame,
+    shown: list[str],
+    verdicts: list[Verdict],
+    tests: list[Uniformity],
 ) -> Iterator[tuple[str, Figure]]:
     """Yield all plots of a study with the names of their files."""
+    if tests:
+        yield "uniformity", uniformity_figure(done, tests)
     for path in study.factors:
         yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]

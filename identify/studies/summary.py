@@ -13,13 +13,15 @@ import pandas as pd
 from identify.errors import StudyError
 from identify.files.run_folder import save_files
 from identify.files.versions import versions
-from identify.studies import theory
+from identify.studies import theory, uniformity
 from identify.studies.figures import Others, draw, draw_side_by_side
 from identify.studies.labels import labelled, unit_of
 from identify.studies.rows import KINDS
+from identify.studies.rows.kind import PROBABILITY
 from identify.studies.study_file import Study
 from identify.studies.table import figure_names
 from identify.studies.theory import Statistics, Verdict, check_laws
+from identify.studies.uniformity import Uniformity
 
 JSON = "summary.json"
 MARKDOWN = "summary.md"
@@ -66,8 +68,11 @@ def write(
     names = [
         name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])
     ]
+    # Single probabilities have no rms that says anything, so they are tested together.
+    names = [name for name in names if not name.startswith(PROBABILITY)]
     points = _points(study, done, names)
     verdicts = check_laws(study, frame)
+    tests = uniformity.judge_uniformity(done)
     entry = {
         "name": study.name,
         "title": study.title,
@@ -87,16 +92,17 @@ def write(
             name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))
         },
         "theory": [verdict.entry for verdict in verdicts],
+        "uniformity": [asdict(one) | {"fails": one.fails} for one in tests],
         "points": [
             {"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
             for factors, figures in points
         ],
     }
     shown = main_figures(study, names)
-    text = _markdown(study, entry, verdicts, points, shown)
+    text = _markdown(study, entry, verdicts, points, shown, tests)
     save_files(folder, {JSON: entry, MARKDOWN: text})
     if figures:
-        draw(folder / "figures", study, done, shown, verdicts)
+        draw(folder / "figures", study, done, shown, verdicts, tests)
     if others and len(done):
         draw_side_by_side(folder / "figures", study, done, shown, others)
     return entry
@@ -161,7 +167,12 @@ def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
 
 
 def _markdown(
-    study: Study, entry: dict[str, Any], verdicts: list[Verdict], points: Points, shown: list[str]
+    study: Study,
+    entry: dict[str, Any],
+    verdicts: list[Verdict],
+    points: Points,
+    shown: list[str],
+    tests: list[Uniformity],
 ) -> str:
     rows = entry["rows"]
     lines = [
@@ -182,6 +193,16 @@ def _markdown(
             "|---|---|---|---|---|",
         ]
         lines += [_law_row(verdict) for verdict in verdicts]
+    if tests:
+        lines += [
+            "",
+            "## Uniformity",
+            "",
+            "Stated probability of values below the truth, over the rows. It is uniform where the "
+            "stated distributions are right.",
+            "",
+            *uniformity.table(tests),
+        ]
     if rows["failed"]:
         lines += ["", "## Failed rows", "", "The figures below exclude them."]
         lines += [f"- {count} x {reason}" for reason, count in entry["failures"]["reasons"].items()]

@@ -13,6 +13,7 @@ from typing import Any
 
 from identify.errors import StudyError
 from identify.own_parts import is_plugin_name, own_function
+from identify.studies.rows.calibrated import CALIBRATION
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.estimators import ESTIMATION
 from identify.studies.rows.gauntlet.row import GAUNTLET
@@ -32,6 +33,7 @@ KINDS: dict[str, Kind] = {
         CLOSED_LOOP,
         TRACKING,
         GAUNTLET,
+        CALIBRATION,
     )
 }
 

@@ -126,12 +126,17 @@ COLUMNS = {
 }
 
 
-class RecordOptions(Section):
-    """Options of the record."""
+class SensorOptions(Section):
+    """Options of the sensor."""
 
     sensor: Literal["drawn", "images"] = Field(
         "drawn", description="drawn: noise of the stated covariance; images: rendered images"
     )
+
+
+class RecordOptions(SensorOptions):
+    """Options of the record."""
+
     trajectory_seed: int = Field(
         0, ge=0, description="seed of the exciting and the validation trajectories"
     )
@@ -208,19 +213,22 @@ def row_setup(settings: Scenario, number: int) -> Setup:
     return Setup(settings.with_overrides(UNWATCHED), number, robot_named(settings.robot))
 
 
+def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
+    """Return the sensor of a row. A sensor with images is taught. Raises its exceptions."""
+    if options.sensor == "drawn":
+        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
+        return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
+    teach(setup.sensor, SilentProgress())
+    return setup.sensor
+
+
 def recorded(setup: Setup, options: RecordOptions) -> Recorded:
     """Run the plant of a row with its sensor. Raises the exceptions of experiment and sensor."""
     number = setup.seed
     settings = setup.scenario.excitation
     plant = setup.plant
     trajectories = designed_trajectories(setup, options.trajectory_seed)
-    sensor: PoseSensor
-    if options.sensor == "drawn":
-        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
-        sensor = DrawnSensor(covariance, plant.runs.timing.dropout)
-    else:
-        sensor = setup.sensor
-        teach(sensor, SilentProgress())
+    sensor = row_pose_sensor(setup, options)
     how = (plant, sensor, trajectories.excitation, settings, number)
     experiment = excitation_run(*how)
     records = [experiment.record]

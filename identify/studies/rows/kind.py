@@ -248,6 +248,13 @@ UNWATCHED = {"rig.watch": "none"}
 """Setting of all rows: no drift watch of the cameras, because no figure depends on it."""
 
 
+PROBABILITY = "below: "
+"""Beginning of the names of figures that are probabilities of values below the truth.
+
+They are uniform over the rows if the stated distributions are right, see `studies.uniformity`.
+"""
+
+
 @dataclass(frozen=True)
 class Column:
     """Figure of a row.

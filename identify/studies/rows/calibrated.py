@@ -1,0 +1,273 @@
+"""Rows of kind `calibration_of_intervals`: simulation-based calibration of an identification.
+
+The true parameters of each row are drawn from the prior that the estimator states, and the exciting
+trajectory and the noise are drawn anew. The row holds the probability that the estimator's stated
+distribution gives to values below the truth. If the stated distributions are right, these
+probabilities are uniform between 0 and 1 over the rows, whatever the truth (Talts et al. 2018,
+"Validating Bayesian inference algorithms with simulation-based calibration").
+
+A truth that cannot be run is drawn again, and counted: its bodies cannot exist, a parameter is
+below its bound, or its loop is unstable.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from dynamics.closed_loop import LoopFailure
+from identify.arrays import Array
+from identify.errors import StudyError
+from identify.estimation.bounds import ParameterBounds, parameter_bounds
+from identify.estimation.identification import identify as identify_record
+from identify.estimation.prior import StartingGuess, model_guess
+from identify.estimation.result import IdentificationResult
+from identify.excitation.design import admissible_trajectories
+from identify.experiment.plant import Plant
+from identify.experiment.run import Experiment, run_plant
+from identify.experiment.sensor_in_loop import PoseSensor
+from identify.experiment.truth import true_poses
+from identify.files.dataset import POSE
+from identify.model.model_side import model_side
+from identify.progress import SilentProgress
+from identify.random_streams import child, stream_seed
+from identify.scenario import Scenario
+from identify.setup import Setup
+from identify.studies.rows.coverage import intervals_hold
+from identify.studies.rows.identified import (
+    EXPERIMENT,
+    READS,
+    SensorOptions,
+    memory,
+    row_pose_sensor,
+    row_setup,
+)
+from identify.studies.rows.kind import PROBABILITY, Column, KeysRead, Kind, Row
+from identify.validation.unseen import PosePrediction, predicted_runs
+
+TRUTH = 1
+TRAJECTORIES = 2
+FRAME = 3
+"""Children of the seed of a row, beside `identified.EXPERIMENT`."""
+
+MOST_TRUTHS = 50
+"""Largest number of truths that are drawn for a row."""
+
+INNER = 0.683
+"""Probability of the shorter intervals, one standard deviation to both sides."""
+
+COLUMNS = {
+    "intervals": Column(
+        "1", "quantities that the record identifies: parameters, and groups of several"
+    ),
+    "covered_percent": Column("%", "share of their 95 % intervals with the truth", main=True),
+    "inner_covered_percent": Column(
+        "%", "share of their 68.3 % intervals with the truth", main=True
+    ),
+    "poses_covered_percent": Column(
+        "%", "share of the coordinates of an unseen pose in the predicted 95 % interval", main=True
+    ),
+    "poses_inner_covered_percent": Column("%", "the same for predicted 68.3 % intervals"),
+    "noise_ratio": Column(
+        "1", "mean squared residual over the variance of the noise; 1 if only noise remains"
+    ),
+    "redrawn_truths": Column("1", "truths that were drawn again because their loop is unstable"),
+    "redrawn_values": Column(
+        "1", "numbers of the truth that were drawn again because no body or drive can have them"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class DrawnTruth:
+    """True parameters (p,), and the count of numbers that were drawn again to be possible."""
+
+    values: Array
+    redrawn: int
+
+
+def drawn_truth(
+    guess: StartingGuess, bounds: ParameterBounds, rng: np.random.Generator
+) -> DrawnTruth:
+    """Draw true parameters from an estimator's prior within its bounds.
+
+    Parameters of their own, and bodies as a whole, are drawn again until they are within the
+    bounds. The result has the distribution of the prior truncated at the bounds.
+    """
+    values = guess.values.copy()
+    missing = np.ones(len(values), dtype=bool)
+    redrawn = -len(values)
+    while missing.any():
+        redrawn += int(missing.sum())
+        drawn = guess.values + guess.std * rng.standard_normal(len(values))
+        values[missing] = drawn[missing]
+        missing = bounds.outside(values)
+    return DrawnTruth(values, redrawn)
+
+
+@dataclass(frozen=True)
+class StableExperiments:
+    """Runs of a plant with a drawn truth.
+
+    record: run of the exciting trajectory. unseen: run of another trajectory. unstable: truths that
+    were drawn before and have an unstable loop. redrawn: numbers of all truths that were drawn
+    again to be possible.
+    """
+
+    plant: Plant
+    record: Experiment
+    unseen: Experiment
+    unstable: int
+    redrawn: int
+
+
+def stable_experiments(
+    setup: Setup,
+    sensor: PoseSensor,
+    guess: StartingGuess,
+    bounds: ParameterBounds,
+    seed: np.random.SeedSequence,
+) -> StableExperiments:
+    """Draw a truth and random trajectories until the loop is stable, and return the runs.
+
+    Raises StudyError if none of MOST_TRUTHS has a stable loop.
+    """
+    rng = np.random.default_rng(child(seed, TRUTH))
+    redrawn = 0
+    reason = ""
+    for unstable in range(MOST_TRUTHS):
+        truth = drawn_truth(guess, bounds, rng)
+        redrawn += truth.redrawn
+        plant = replace(setup.plant, parameters=truth.values)
+        try:
+            record, unseen = (
+                random_run(
+                    setup, plant, sensor, number, child(seed, TRAJECTORIES, unstable, number)
+                )
+                for number in (0, 1)
+            )
+        except LoopFailure as error:
+            reason = str(error)
+            continue
+        return StableExperiments(plant, record, unseen, unstable, redrawn)
+    raise StudyError(f"none of {MOST_TRUTHS} drawn truths has a stable loop; the last: {reason}")
+
+
+def random_run(
+    setup: Setup, plant: Plant, sensor: PoseSensor, number: int, seed: np.random.SeedSequence
+) -> Experiment:
+    """Run a plant along a random trajectory, as long as the excitation or a validation."""
+    design = setup.design
+    scenario = setup.scenario
+    duration_s = (scenario.validation if number else scenario.excitation).duration_s
+    trajectory = admissible_trajectories(
+        design.robot, design.settings, duration_s, 1, seed, design.check
+    )[0]
+    return run_plant(plant, sensor, trajectory, duration_s, setup.seed, number)
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: SensorOptions) -> Row:
+    """Compute one row.
+
+    Raises StudyError if plant and model have other parameters, or if no drawn truth has a stable
+    loop. Raises EstimationError, and the exceptions of experiment and sensor.
+    """
+    setup = row_setup(scenario, stream_seed(seed, EXPERIMENT))
+    settings = scenario.identification
+    plant = setup.plant
+    side = model_side(setup.robot, scenario)
+    if plant.robot.layout.names != side.robot.layout.names:
+        raise StudyError(
+            "the truth is drawn from the prior of the model, so plant and model need the same "
+            f"parameters: the plant has {len(plant.robot.layout.names)}, the model "
+            f"{len(side.robot.layout.names)}; set inertia, gains and passive_friction alike"
+        )
+    guess = model_guess(side.robot, side.model, settings)
+    bounds = parameter_bounds(guess, settings.physical_consistency)
+    sensor = row_pose_sensor(setup, options)
+    experiments = stable_experiments(setup, sensor, guess, bounds, seed)
+    record, unseen = experiments.record, experiments.unseen
+    result = identify_record(record.record, side.robot, scenario)
+    (predicted,) = predicted_runs(
+        side.with_drive(result.drive.law),
+        [unseen.record],
+        result.estimate,
+        result.whole_covariance,
+        setup.seed,
+        SilentProgress(),
+        result.common_errors.learned,
+    )
+    frame = int(np.random.default_rng(child(seed, FRAME)).integers(len(predicted.poses)))
+    return {
+        "noise_ratio": result.noise_ratio,
+        "redrawn_truths": experiments.unstable,
+        "redrawn_values": experiments.redrawn,
+        **parameter_figures(result, experiments.plant),
+        **pose_figures(predicted, unseen, frame),
+    }
+
+
+def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
+    """Return the probabilities below the truth of the identified quantities, and their coverage."""
+    truth = plant.parameters_of(result.layout)
+    groups = result.groups
+    gains = len(result.names) - groups.combinations.shape[1]
+    combined = np.pad(groups.combinations, ((0, 0), (0, gains)))
+    several = np.count_nonzero(groups.combinations, axis=1) > 1
+    rows = np.concatenate(
+        [np.eye(len(truth))[result.identifiable], combined[groups.identifiable & several]]
+    )
+    names = [
+        *np.array(result.names)[result.identifiable],
+        *np.array(groups.expressions)[groups.identifiable & several],
+    ]
+    if not names:
+        return {"intervals": 0}
+    below = result.bounded.probabilities(rows, rows @ truth)
+    return {
+        "intervals": len(names),
+        "covered_percent": 100.0 * float(np.mean(intervals_hold(result, plant))),
+        "inner_covered_percent": 100.0 * float(np.mean(inner(below, INNER))),
+        **{f"{PROBABILITY}{name}": float(one) for name, one in zip(names, below, strict=True)},
+    }
+
+
+def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> Row:
+    """Return the probabilities below the true coordinates of a frame, and their coverage.
+
+    The coordinates are those in which the platform moves.
+    """
+    free = predicted.chart.basis
+    error = (true_poses(unseen.truth)[frame] - predicted.poses[frame]) @ free
+    std = np.sqrt(np.diag(free.T @ predicted.covariance[frame] @ free))
+    below = ndtr(error / std)
+    names = [POSE[int(np.argmax(np.abs(axis)))] for axis in free.T]
+    return {
+        "poses_covered_percent": 100.0 * float(np.mean(inner(below, 0.95))),
+        "poses_inner_covered_percent": 100.0 * float(np.mean(inner(below, INNER))),
+        **{f"{PROBABILITY}pose {name}": float(one) for name, one in zip(names, below, strict=True)},
+    }
+
+
+def inner(below: Array, probability: float) -> Array:
+    """Return whether truths are in the central intervals of a probability.
+
+    below (n,): probabilities below the truths.
+    """
+    return np.asarray(np.abs(below - 0.5) < probability / 2)
+
+
+CALIBRATION = Kind(
+    "calibration_of_intervals",
+    compute,
+    "a truth drawn from the estimator's prior, identified from its record, and the probability "
+    "that the stated distributions give to values below the truth",
+    COLUMNS,
+    SensorOptions,
+    KeysRead(
+        READS.keys,
+        (*READS.excluding, "scenario.plant.parameters", "scenario.plant.values"),
+        READS.ineffective,
+    ),
+    memory=memory,
+)

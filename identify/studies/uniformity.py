@@ -1,0 +1,139 @@
+"""Uniformity of the probabilities that rows give to values below the truth.
+
+A figure of a row whose name begins with `PROBABILITY` is the probability that a stated distribution
+gives to values below the truth. If the distribution is right, the figure is uniform between 0 and 1
+over the rows. Each figure is tested by Kolmogorov and Smirnov, with a correction for the number of
+figures. The plot shows the distance of its cumulative distribution from the uniform one. In the
+middle of the plot, a curve like a hill belongs to estimates that are too large, a curve that falls
+and rises to intervals that are too narrow. The band contains the whole curve of a right
+distribution with 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test for discrete
+uniformity and its applications in goodness-of-fit evaluation and multiple sample comparison").
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import binom, kstest
+
+from identify.arrays import Array
+from identify.studies.rows.kind import PROBABILITY
+
+FEWEST = 20
+"""Smallest number of rows with a figure for which it is tested."""
+
+LEVEL = 0.01
+"""Corrected p value below which a figure counts as not uniform."""
+
+BAND = 0.95
+"""Probability that the whole curve of a right distribution is in the band."""
+
+POINTS = 200
+"""Number of points at which the band is computed."""
+
+SIMULATED = 4000
+"""Number of simulated curves, which determine the probability of the band to 0.4 %."""
+
+
+@dataclass(frozen=True)
+class Uniformity:
+    """Test of one figure.
+
+    name: figure without `PROBABILITY`. rows: number of rows that have it. mean: its mean, 0.5 if
+    the estimates are right on average. p_value: Kolmogorov and Smirnov's. corrected: p value
+    multiplied by the number of tested figures (Bonferroni).
+    """
+
+    name: str
+    rows: int
+    mean: float
+    p_value: float
+    corrected: float
+
+    @property
+    def fails(self) -> bool:
+        """True if the figure is not uniform."""
+        return self.corrected < LEVEL
+
+
+def judge_uniformity(done: pd.DataFrame) -> list[Uniformity]:
+    """Return the test of each probability in a table of finished rows, the worst first."""
+    figures = {
+        name: values
+        for name in done.columns
+        if name.startswith(PROBABILITY) and len(values := done[name].dropna()) >= FEWEST
+    }
+    found = []
+    for name, values in figures.items():
+        p_value = float(kstest(values, "uniform").pvalue)
+        found.append(
+            Uniformity(
+                name.removeprefix(PROBABILITY),
+                len(values),
+                float(values.mean()),
+                p_value,
+                min(1.0, p_value * len(figures)),
+            )
+        )
+    return sorted(found, key=lambda one: one.p_value)
+
+
+@lru_cache(maxsize=4)
+def simultaneous_band(rows: int) -> tuple[Array, Array, Array]:
+    """Return the band of the cumulative distribution of uniform numbers, minus its mean.
+
+    The results are the points (k,) and the lower and upper ends (k,) of the band. At each point the
+    ends are quantiles of the binomial distribution, and one level of these quantiles holds for the
+    whole curve with probability BAND. The level is found by simulation with a fixed seed.
+    """
+    points = np.arange(1, POINTS) / POINTS
+    drawn = np.random.default_rng(0).random((SIMULATED, rows))
+    counts = np.array([(drawn <= point).sum(axis=1) for point in points]).T
+    lower_tail = binom.cdf(counts, rows, points)
+    upper_tail = binom.sf(counts - 1, rows, points)
+    level = np.quantile(2 * np.minimum(lower_tail, upper_tail).min(axis=1), 1 - BAND)
+    low, high = binom.ppf([[level / 2], [1 - level / 2]], rows, points)
+    return points, low / rows - points, high / rows - points
+
+
+def uniformity_figure(done: pd.DataFrame, found: list[Uniformity]) -> Figure:
+    """Plot the curve of each tested figure, times the root of its number of rows, and the band.
+
+    Figures that fail have a name and a colour.
+    """
+    rows = int(np.median([one.rows for one in found]))
+    points, low, high = simultaneous_band(rows)
+    figure = Figure(figsize=(5.2, 3.4), layout="constrained")
+    axes = figure.subplots()
+    root = np.sqrt(rows)
+    axes.fill_between(
+        points, root * low, root * high, color="0.85", label=f"band of right ones, {BAND:.0%}"
+    )
+    for one in reversed(found):
+        values = np.sort(done[PROBABILITY + one.name].dropna())
+        curve = np.searchsorted(values, points, side="right") / one.rows - points
+        style: dict[str, Any] = (
+            {"label": one.name, "lw": 1.2} if one.fails else {"color": "0.4", "lw": 0.5}
+        )
+        axes.plot(points, np.sqrt(one.rows) * curve, **style)
+    axes.set_xlabel("stated probability of values below the truth")
+    axes.set_ylabel("(share of rows − probability) · √rows")
+    axes.set_title(f"{len(found)} quantities, {sum(one.fails for one in found)} not uniform")
+    axes.legend(fontsize="x-small", loc="upper right")
+    return figure
+
+
+def table(found: list[Uniformity]) -> list[str]:
+    """Return the lines of a Markdown table of the tests, the worst first."""
+    lines = [
+        "| quantity | rows | mean | p value | corrected | verdict |",
+        "|---|---|---|---|---|---|",
+    ]
+    return lines + [
+        f"| {one.name} | {one.rows} | {one.mean:.3f} | {one.p_value:.2g} | {one.corrected:.2g} | "
+        f"{'not uniform' if one.fails else 'uniform'} |"
+        for one in found
+    ]

@@ -1,0 +1,83 @@
+"""Simulation-based calibration: truths follow the prior, and right distributions pass the tests
+that wrong ones fail.
+"""
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import kstest, truncnorm
+
+from dynamics import load_robot
+from identify.estimation.bounds import bounded_estimate, parameter_bounds
+from identify.estimation.prior import starting_guess
+from identify.studies.rows.calibrated import drawn_truth
+from identify.studies.rows.kind import PROBABILITY
+from identify.studies.uniformity import (
+    BAND,
+    judge_uniformity,
+    simultaneous_band,
+    uniformity_figure,
+)
+
+
+@pytest.fixture(scope="module")
+def guess():
+    return starting_guess(load_robot("rss6"), "initial", 0.5)
+
+
+def test_drawn_truths_follow_the_prior_within_the_bounds(guess):
+    bounds = parameter_bounds(guess, physical=True)
+    rng = np.random.default_rng(0)
+    truths = np.array([drawn_truth(guess, bounds, rng).values for _ in range(400)])
+    assert not any(bounds.outside(one).any() for one in truths)
+    for name in ("joint1.coulomb", "joint_pid.lp", "platform.mass"):
+        place = guess.layout.names.index(name)
+        mean, std = guess.values[place], guess.std[place]
+        expected = truncnorm((bounds.lower[place] - mean) / std, np.inf, mean, std)
+        assert kstest(truths[:, place], expected.cdf).pvalue > 1e-3, name
+    moments = truths[:, [guess.layout.names.index(f"platform.I{axis}{axis}") for axis in "xyz"]]
+    assert np.all(2 * moments.max(axis=1) <= moments.sum(axis=1)), "no rigid body has these moments"
+
+
+def test_stated_probabilities_are_those_of_the_normal_distribution_cut_at_the_bounds(guess):
+    bounds = parameter_bounds(guess, physical=False)
+    size = len(guess.values)
+    at_bound = np.zeros(size, dtype=bool)
+    std = np.where(np.arange(size) % 2, 0.3, 1.0) * np.maximum(guess.values, 1e-3)
+    found = bounded_estimate(
+        guess.values, at_bound, np.zeros(size), np.eye(size), np.diag(std**2), bounds
+    )
+    truth = guess.values + 0.7 * std
+    least = np.maximum(bounds.lower, 0)
+    free = guess.values > 0
+    expected = truncnorm((least - guess.values) / std, np.inf, guess.values, std).cdf(truth)
+    below = found.probabilities(np.eye(size), truth)
+    assert below[free] == pytest.approx(expected[free], abs=1e-12)
+
+
+def probabilities(**figures):
+    return pd.DataFrame({PROBABILITY + name: values for name, values in figures.items()})
+
+
+def test_right_distributions_pass_and_wrong_ones_are_named():
+    rng = np.random.default_rng(3)
+    right = {f"right{k}": rng.random(300) for k in range(40)}
+    narrow = np.clip(0.5 + 1.5 * (rng.random(300) - 0.5), 0, 1)
+    high = rng.random(300) ** 1.5
+    done = probabilities(**right, narrow=narrow, high=high)
+    found = judge_uniformity(done)
+    assert {one.name for one in found if one.fails} == {"narrow", "high"}
+    assert len(found) == 42
+    labels = uniformity_figure(done, found).axes[0].get_legend().get_texts()
+    assert {text.get_text() for text in labels[1:]} == {"narrow", "high"}
+    assert judge_uniformity(done.head(10)) == [], "too few rows for a test"
+
+
+@pytest.mark.parametrize("rows", [25, 300])
+def test_the_band_contains_the_whole_curve_of_uniform_numbers_as_often_as_it_says(rows):
+    points, low, high = simultaneous_band(rows)
+    drawn = np.sort(np.random.default_rng(11).random((2000, rows)))
+    curves = np.array([np.searchsorted(one, points, side="right") for one in drawn]) / rows - points
+    inside = np.mean(np.all((low <= curves) & (curves <= high), axis=1))
+    # Counts are whole numbers, so the band of few rows holds a little more.
+    assert BAND - 0.015 < inside < BAND + 0.03
