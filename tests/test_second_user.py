@@ -91,7 +91,7 @@ def test_results_are_for_all_or_private_as_their_owner_says_by_the_umask_and_the
     assert readable(commons / "closed") == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_command_leaves_nothing_that_another_user_can_read_under_a_private_umask(commons):
     factors = "[factors]\nsensor.camera.dark_noise = [13.0, 26.0]"
     (commons / "mine.toml").write_text(
@@ -110,7 +110,7 @@ def test_a_command_leaves_nothing_that_another_user_can_read_under_a_private_uma
     assert set(readable(commons)) == before
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_locks_and_pipes_of_another_user_in_places_that_all_share_keep_no_study_waiting(
     commons, monkeypatch
 ):

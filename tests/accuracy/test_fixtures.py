@@ -225,7 +225,7 @@ def test_options_are_checked_though_no_test_uses_them(project):
         done.stderr.fnmatch_lines([f"ERROR: {option}: {says}"])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.rendering
 def test_the_sensor_is_taught_once_and_its_noise_is_that_of_the_test(project):
     body = """

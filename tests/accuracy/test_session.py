@@ -213,7 +213,7 @@ def test_it_lives_beside_pytest_benchmark(project, pytester):
     assert (pytester.path / ".accuracy" / "now.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
     body = FIGURES + (
         "\n@pytest.mark.xdist_group('one')\n"

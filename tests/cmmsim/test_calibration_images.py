@@ -366,7 +366,7 @@ def as_photograph(image, rng):
     ("board", "renderer", "count"),
     [
         pytest.param(ASYMMETRIC, ANALYTIC, 8, marks=pytest.mark.slow),
-        pytest.param(CHESSBOARD, PYRENDER, 5, marks=pytest.mark.slow),
+        pytest.param(CHESSBOARD, PYRENDER, 5, marks=pytest.mark.thorough),
         pytest.param(DOTS, ANALYTIC, 16, marks=pytest.mark.thorough),
         pytest.param(ASYMMETRIC, ANALYTIC, 16, marks=pytest.mark.thorough),
         pytest.param(CHESSBOARD, PYRENDER, 16, marks=pytest.mark.thorough),

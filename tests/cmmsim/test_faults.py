@@ -89,7 +89,13 @@ PYRENDER = [pytest.mark.slow, pytest.mark.rendering]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=PYRENDER)])
+@pytest.mark.parametrize(
+    "renderer",
+    [
+        pytest.param("analytic", marks=pytest.mark.thorough),
+        pytest.param("pyrender", marks=PYRENDER),
+    ],
+)
 def test_no_wrong_pose_in_eighty_faults_and_what_spoils_little_is_measured(renderer):
     seed = {"analytic": 1, "pyrender": 5}[renderer]
     outcomes = run_faults(before_boxes(renderer=renderer), SPOILING, 80, seed, untracked=0.0)

@@ -140,7 +140,13 @@ def test_feedforward_of_the_true_model_leaves_a_fiftieth_of_what_the_servo_alone
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("timing", [FAST, SLOW], ids=["60 Hz", "29 Hz"])
+@pytest.mark.parametrize(
+    "timing",
+    [
+        pytest.param(FAST, id="60 Hz", marks=pytest.mark.thorough),
+        pytest.param(SLOW, id="29 Hz"),
+    ],
+)
 def test_computed_torque_with_an_observer_leaves_an_eighth_of_what_the_servo_alone_does(
     robot, timing
 ):

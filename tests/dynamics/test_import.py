@@ -91,7 +91,13 @@ def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_p
     np.testing.assert_array_equal(other.parameter_sets["guess"].joint_pid, gains)
 
 
-@pytest.mark.parametrize("name", ["rus6", pytest.param("delta3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("rus6", marks=pytest.mark.thorough),
+        pytest.param("delta3", marks=pytest.mark.slow),
+    ],
+)
 def test_full_bodies_of_legs_exported_and_imported_have_the_same_dynamics(name, tmp_path):
     """By MJCF, and by URDF in its own writer; a link that can spin is remarked on."""
     pytest.importorskip("mujoco")

@@ -53,6 +53,7 @@ def motion(robot, frames=40):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_moved_robot_is_the_robot_with_these_numbers(name):
     robot, moved, own = both(name)
@@ -102,6 +103,7 @@ def test_rods_are_where_the_frames_of_their_parts_are_and_nowhere_out_of_reach(n
             parts.rods(own, own.home_pose + np.array([0, 0, 0, 0, 1e-6, 0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_its_closed_loop_is_that_of_code_of_its_own_whatever_the_servo_knows(name):
     robot, moved, own = both(name)

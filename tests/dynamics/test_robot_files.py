@@ -192,6 +192,7 @@ def test_robot_files_that_make_no_robot(load_changed, old, new, message):
         load_changed({old: new})
 
 
+@pytest.mark.slow
 def test_directions_may_be_rounded_to_six_decimals(load_changed, robot):
     """The legs close as they do with all digits: at home, and at a pose found again from its own
     joint angles.
@@ -245,6 +246,7 @@ def _gaps(pose, theta, geometry):
     return np.linalg.norm(legs.joint - legs.tip, axis=1) - of_legs(geometry, "link_length")
 
 
+@pytest.mark.thorough
 def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot):
     """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by
     about the error.

@@ -144,6 +144,7 @@ def test_a_bad_motion_is_refused_with_time_leg_value_and_limit(
         )
 
 
+@pytest.mark.thorough
 def test_a_platform_that_moves_with_locked_cranks_is_found_and_refused(robot, load_changed):
     """Links in the plane of the platform carry no vertical force: the condition of J_a2 says so,
     leverage does not. M is regular there, so that eq. 40 still holds: the platform falls freely,

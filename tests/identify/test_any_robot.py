@@ -62,7 +62,8 @@ FORBIDDEN = {"delta3": (3, 4, 5), "rrr3": (2, 3, 4)}
     params=[
         "delta3",
         "rrr3",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("ups6", "mixed")),
+        pytest.param("ups6", marks=pytest.mark.slow),
+        pytest.param("mixed", marks=pytest.mark.thorough),
     ],
 )
 def robot(request, tmp_path_factory) -> Robot:
@@ -205,6 +206,7 @@ def test_segments_from_the_true_states_make_up_the_run(robot):
     assert np.all(error[:, : len(chart.freedoms)] < 5 * chart.coordinates(SIGMA))
 
 
+@pytest.mark.slow
 def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_predicted(robot):
     """From poses with drawn noise, among them what the platform cannot change; chi-square of what
     is estimated.

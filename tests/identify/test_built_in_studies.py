@@ -33,7 +33,7 @@ REPEATS = (
 REPEATS |= {"frame_rate": 2, "hold_time": 2, "pose_method": 4}
 """Rows at each point of the studies that the README names, where they are few."""
 SLOW = [
-    pytest.param(name, marks=pytest.mark.slow if name in IDENTIFYING else ())
+    pytest.param(name, marks=pytest.mark.thorough if name in IDENTIFYING else ())
     for name in sorted(REPEATS)
 ]
 

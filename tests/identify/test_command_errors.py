@@ -95,6 +95,7 @@ def replace_frames(reference, frames):
     return type(reference)(reference.poses[:frames], reference.rates[:frames])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiled", [True, False])
 def test_sensitivities_of_the_servo_follow_the_scale(compiled):
     """Against differences of runs, compiled and plain."""
@@ -247,6 +248,7 @@ def test_bad_values_are_refused(changes, said):
         quick(**changes)
 
 
+@pytest.mark.thorough
 def test_the_zeros_of_a_plant_whose_geometry_is_calibrated_are_in_its_geometry():
     """Where the calibration finds them, and not a second time in the drives."""
     asked = {"plant.joint_zero_error_rad": ZEROS, "geometry.encoder_offset_rad": 0.0}

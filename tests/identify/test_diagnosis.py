@@ -185,7 +185,7 @@ def test_of_two_causes_both_are_named(monkeypatch):
 
 @pytest.mark.slow
 def test_a_right_model_is_accused_of_nothing_but_by_chance():
-    count = 20
+    count = 12
     accused = [seed for seed in range(count) if diagnosed(record_of(100 + seed)).findings]
     assert len(accused) <= binom.ppf(0.999, count, CHANCE)
 

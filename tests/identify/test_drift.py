@@ -25,7 +25,7 @@ def recorded(**changes):
     return excitation_run(setup.plant, sensor, trajectory(0), scenario.excitation, 0).record
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_with_a_drift_says_when_and_how_and_one_without_says_nothing():
     finding = read_finding(recorded(**{DRIFT_KEY: {"right.cx_px": 0.3}}))
     assert 0.0 < finding["noticed_s"] < 1.0

@@ -80,7 +80,7 @@ def judge(entry, errors, normalised):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_geometry_is_found_through_images(tmp_path):
     settings = {"poses": 15, "frames_per_pose": 3, "candidates": 60, "unseen": 30}
     chosen = [

@@ -105,7 +105,7 @@ def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
     assert angle_to_singular_vectors(matrix, one_less) == pytest.approx(np.pi / 2)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_gravity_across_the_crank_axes_separates_mass_from_inertia(base, tmp_path):
     """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
     level, leaning = "gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"

@@ -93,6 +93,7 @@ def held(result):
     return ((lower <= values) & (values <= upper))[result.identifiable]
 
 
+@pytest.mark.thorough
 def test_mujoco_moves_the_robot_as_our_loop_does():
     """Two thirds of a second with sticking and slipping joints, under noise: to a nanometre."""
     theirs, ours = mujoco_run(3, 40 / 60)[2], own_run(3, 40 / 60)[2]

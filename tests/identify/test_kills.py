@@ -423,7 +423,7 @@ def test_a_study_killed_at_each_operation_on_a_file_keeps_each_row_and_ends_with
     assert killer.kills >= 14, "with 170 of the other tests, and 16 of the stages, these are 200"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_a_stage_and_a_study_killed_by_two_signals_each_go_on_to_the_same_numbers(
     study, serial, tmp_path
 ):

@@ -231,7 +231,7 @@ def test_the_report_names_the_gain_that_the_anchor_leaves_open():
     assert "80 % of the variance of joint1.lp" in scale_sentence(entry)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_with_gains_of_each_joint_is_written_and_reported(tmp_path):
     """From the design of trajectories to the report."""
     changes = ["renderer=statistical", "plant.gains=each", "model.gains=each"]

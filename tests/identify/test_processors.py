@@ -134,6 +134,7 @@ def test_ipopt_is_given_the_same_problem_to_the_last_bit(given, processor):
     assert on(processor, GIVEN) == given
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("processor", [OFTEN, *SELDOM, long_proof("Haswell")])
 def test_built_in_scenarios_have_the_same_trajectories(processor):
     """Those of `paper` end a search of a thousand steps that would carry a last bit to the second

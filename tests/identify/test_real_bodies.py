@@ -43,6 +43,7 @@ def recorded(values, seed=0):
     return setup, setup.run()
 
 
+@pytest.mark.slow
 def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
     """Torques as changes of the commands, against the derivatives of a model with full bodies."""
     _, record = recorded({})
@@ -71,6 +72,7 @@ def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
         assert off < (0.06 if name[0] == "I" else 0.03), (name, off)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [0.001, 0.005, 0.030])
 def test_a_centre_of_mass_off_the_joint_plane_is_named_with_its_height(height):
     _, record = recorded(uneven((0.0, 0.0, height)))
@@ -82,6 +84,7 @@ def test_a_centre_of_mass_off_the_joint_plane_is_named_with_its_height(height):
     assert not found.none_of_these
 
 
+@pytest.mark.slow
 def test_with_its_full_body_the_platform_is_identified_and_predicted():
     setup, record = recorded(uneven(CENTRE, PRODUCTS))
     settings = {"model.inertia": {"platform": "full"}}
@@ -98,6 +101,7 @@ def test_with_its_full_body_the_platform_is_identified_and_predicted():
     assert unseen[3:].max() < 10.0
 
 
+@pytest.mark.thorough
 def test_possible_bodies_are_found_in_log_cholesky_coordinates():
     """The estimate without bounds is possible here, and so the one that must be possible is it."""
     setup, record = recorded(uneven(CENTRE, PRODUCTS))
@@ -127,6 +131,7 @@ LOAD = {
 }
 
 
+@pytest.mark.slow
 def test_a_load_on_the_top_plane_fixes_the_scale():
     """8 kg, 0.13 m above the joint plane: the gains, which poses know up to the scale, to 0.5 %."""
     scenario = identify.load_scenario(

@@ -393,6 +393,7 @@ def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record,
         check_trajectory(record, trajectory(0), quick().timing, quick().excitation.duration_s)
 
 
+@pytest.mark.thorough
 def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geometry_by_its_name(
     record, tmp_path
 ):

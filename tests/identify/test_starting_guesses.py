@@ -166,7 +166,7 @@ def test_every_base_parameter_and_gain_is_recovered_to_a_millionth():
     assert (after / before).max() < 1e-9, "share of the starting guess in an estimate"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_integration_limits_what_a_finer_plant_lets_recover():
     """Steps of a sixteenth and of a quarter of a frame differ by more than 1e-6: that, not the
     estimator, is then left. With both four times finer, the fourth-order integrator's difference is

@@ -530,7 +530,7 @@ print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_small_file_of_which_mujoco_makes_a_huge_model_is_one_line(tmp_path):
     pytest.importorskip("mujoco")
     for name, inside in enumerate(HUGE_MODELS):

@@ -166,7 +166,7 @@ def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_on
     assert len(caught) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path, serial):
     with (
         cluster(tmp_path, workers=1) as (address, scheduler, _),
@@ -184,7 +184,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path,
     same_numbers(outcome.frame, serial)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_worker_with_another_version_of_the_product_is_refused_at_the_start_and_later(tmp_path):
     there, here = other_versions(tmp_path / "there", cmmsim="9.8.7"), versions()["cmmsim"]
     refusal = rf"^worker tcp://\S+ has cmmsim 9\.8\.7, here is {here}; install \S[^\n]*$"

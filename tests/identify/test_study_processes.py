@@ -49,6 +49,7 @@ def children():
     return [one for one in here if "spawn_main" in " ".join(one.cmdline())]
 
 
+@pytest.mark.slow
 def test_rows_that_end_their_process_or_take_its_memory_are_errors_and_no_other_row_is(
     tmp_path, serial, monkeypatch
 ):
@@ -64,6 +65,7 @@ def test_rows_that_end_their_process_or_take_its_memory_are_errors_and_no_other_
     same_numbers(frame.drop(index=[3, 5, 7]), serial.drop(index=[3, 5, 7]))
 
 
+@pytest.mark.slow
 def test_killed_processes_are_replaced_cost_their_batch_alone_and_change_no_number(
     tmp_path, serial
 ):
@@ -181,7 +183,7 @@ def interrupted(running, folder):
     return kept
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(command, serial):
     running, folder, log = command(workers=2)
     running.kill()

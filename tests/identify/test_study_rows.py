@@ -296,7 +296,7 @@ def test_identification_from_images_is_as_good_as_from_drawn_noise(duration_s, w
         assert images[figure] == pytest.approx(drawn[figure], rel=within)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_intervals_that_know_of_inexact_cameras_hold_where_those_that_do_not_do_not():
     """Two rows of the study `inexact`, with short records."""
     inexact = {
