@@ -72,7 +72,7 @@ def write(
     names = [name for name in names if not name.startswith(PROBABILITY)]
     points = _points(study, done, names)
     verdicts = check_laws(study, frame)
-    tests = uniformity.judge_uniformity(done)
+    tests = uniformity.judge_uniformity(done, list(study.factors))
     entry = {
         "name": study.name,
         "title": study.title,

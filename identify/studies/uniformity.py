@@ -10,6 +10,7 @@ distribution with 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test f
 uniformity and its applications in goodness-of-fit evaluation and multiple sample comparison").
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -42,12 +43,13 @@ SIMULATED = 4000
 class Uniformity:
     """Test of one figure.
 
-    name: figure without `PROBABILITY`. rows: number of rows that have it. mean: its mean, 0.5 if
-    the estimates are right on average. p_value: Kolmogorov and Smirnov's. corrected: p value
-    multiplied by the number of tested figures (Bonferroni).
+    name: figure without `PROBABILITY`. point: values of the factors. rows: number of rows of the
+    point that have the figure. mean: its mean, 0.5 if the estimates are right on average. p_value:
+    Kolmogorov and Smirnov's. corrected: p value multiplied by the number of tests (Bonferroni).
     """
 
     name: str
+    point: tuple[str, ...]
     rows: int
     mean: float
     p_value: float
@@ -58,27 +60,42 @@ class Uniformity:
         """True if the figure is not uniform."""
         return self.corrected < LEVEL
 
+    @property
+    def label(self) -> str:
+        """Name of the figure, after the values of the factors."""
+        return " ".join((*self.point, self.name))
 
-def judge_uniformity(done: pd.DataFrame) -> list[Uniformity]:
-    """Return the test of each probability in a table of finished rows, the worst first."""
-    figures = {
-        name: values
-        for name in done.columns
-        if name.startswith(PROBABILITY) and len(values := done[name].dropna()) >= FEWEST
-    }
+
+def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniformity]:
+    """Return the tests of all probabilities in a table of finished rows, the worst first.
+
+    Each figure is tested at each point of the factors.
+    """
+    figures = probabilities_at_points(done, factors)
     found = []
-    for name, values in figures.items():
+    for (point, name), values in figures.items():
         p_value = float(kstest(values, "uniform").pvalue)
-        found.append(
-            Uniformity(
-                name.removeprefix(PROBABILITY),
-                len(values),
-                float(values.mean()),
-                p_value,
-                min(1.0, p_value * len(figures)),
-            )
-        )
+        corrected = min(1.0, p_value * len(figures))
+        found.append(Uniformity(name, point, len(values), float(values.mean()), p_value, corrected))
     return sorted(found, key=lambda one: one.p_value)
+
+
+def probabilities_at_points(
+    done: pd.DataFrame, factors: Sequence[str]
+) -> dict[tuple[tuple[str, ...], str], Array]:
+    """Return the probabilities by point and name of the figure, where enough rows have them."""
+    points = (
+        [(tuple(map(str, key)), rows) for key, rows in done.groupby(list(factors))]
+        if factors
+        else [((), done)]
+    )
+    return {
+        (point, name.removeprefix(PROBABILITY)): values
+        for point, rows in points
+        for name in done.columns
+        if name.startswith(PROBABILITY)
+        and len(values := rows[name].dropna().to_numpy(dtype=float)) >= FEWEST
+    }
 
 
 @lru_cache(maxsize=4)
@@ -99,7 +116,9 @@ def simultaneous_band(rows: int) -> tuple[Array, Array, Array]:
     return points, low / rows - points, high / rows - points
 
 
-def uniformity_figure(done: pd.DataFrame, found: list[Uniformity]) -> Figure:
+def uniformity_figure(
+    done: pd.DataFrame, factors: Sequence[str], found: list[Uniformity]
+) -> Figure:
     """Plot the curve of each tested figure, times the root of its number of rows, and the band.
 
     Figures that fail have a name and a colour.
@@ -109,14 +128,15 @@ def uniformity_figure(done: pd.DataFrame, found: list[Uniformity]) -> Figure:
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     axes = figure.subplots()
     root = np.sqrt(rows)
+    figures = probabilities_at_points(done, factors)
     axes.fill_between(
         points, root * low, root * high, color="0.85", label=f"band of right ones, {BAND:.0%}"
     )
     for one in reversed(found):
-        values = np.sort(done[PROBABILITY + one.name].dropna())
+        values = np.sort(figures[one.point, one.name])
         curve = np.searchsorted(values, points, side="right") / one.rows - points
         style: dict[str, Any] = (
-            {"label": one.name, "lw": 1.2} if one.fails else {"color": "0.4", "lw": 0.5}
+            {"label": one.label, "lw": 1.2} if one.fails else {"color": "0.4", "lw": 0.5}
         )
         axes.plot(points, np.sqrt(one.rows) * curve, **style)
     axes.set_xlabel("stated probability of values below the truth")
@@ -133,7 +153,7 @@ def table(found: list[Uniformity]) -> list[str]:
         "|---|---|---|---|---|---|",
     ]
     return lines + [
-        f"| {one.name} | {one.rows} | {one.mean:.3f} | {one.p_value:.2g} | {one.corrected:.2g} | "
+        f"| {one.label} | {one.rows} | {one.mean:.3f} | {one.p_value:.2g} | {one.corrected:.2g} | "
         f"{'not uniform' if one.fails else 'uniform'} |"
         for one in found
     ]

@@ -22,7 +22,7 @@ from identify.studies.uniformity import (
 
 @pytest.fixture(scope="module")
 def guess():
-    return starting_guess(load_robot("rss6"), "initial", 0.5)
+    return starting_guess(load_robot("rss6"), "guess", 0.5)
 
 
 def test_drawn_truths_follow_the_prior_within_the_bounds(guess):
@@ -65,12 +65,22 @@ def test_right_distributions_pass_and_wrong_ones_are_named():
     narrow = np.clip(0.5 + 1.5 * (rng.random(300) - 0.5), 0, 1)
     high = rng.random(300) ** 1.5
     done = probabilities(**right, narrow=narrow, high=high)
-    found = judge_uniformity(done)
+    found = judge_uniformity(done, [])
     assert {one.name for one in found if one.fails} == {"narrow", "high"}
     assert len(found) == 42
-    labels = uniformity_figure(done, found).axes[0].get_legend().get_texts()
+    labels = uniformity_figure(done, [], found).axes[0].get_legend().get_texts()
     assert {text.get_text() for text in labels[1:]} == {"narrow", "high"}
-    assert judge_uniformity(done.head(10)) == [], "too few rows for a test"
+    assert judge_uniformity(done.head(10), []) == [], "too few rows for a test"
+
+
+def test_points_of_a_study_are_judged_apart():
+    rng = np.random.default_rng(4)
+    opposite = np.concatenate([0.5 * rng.random(200), 0.5 + 0.5 * rng.random(200)])
+    done = probabilities(mass=opposite).assign(robot=["rss6"] * 200 + ["rrr3"] * 200)
+    assert not judge_uniformity(done, [])[0].fails
+    apart = judge_uniformity(done, ["robot"])
+    assert {one.label for one in apart} == {"rss6 mass", "rrr3 mass"}
+    assert all(one.fails for one in apart)
 
 
 @pytest.mark.parametrize("rows", [25, 300])

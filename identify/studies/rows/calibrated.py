@@ -37,12 +37,11 @@ from identify.studies.rows.coverage import intervals_hold
 from identify.studies.rows.identified import (
     EXPERIMENT,
     READS,
-    SensorOptions,
     memory,
-    row_pose_sensor,
     row_setup,
 )
 from identify.studies.rows.kind import PROBABILITY, Column, KeysRead, Kind, Row
+from identify.studies.rows.row_sensor import SensorOptions, row_pose_sensor
 from identify.validation.unseen import PosePrediction, predicted_runs
 
 TRUTH = 1

@@ -8,7 +8,6 @@ trajectories, from `trajectory_seed`. Rows thus differ only by their factors and
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -20,7 +19,6 @@ from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, excitation_run, run_plant
-from identify.experiment.sensor_in_loop import PoseSensor, teach
 from identify.experiment.truth import true_poses
 from identify.model.model_side import ModelSide, model_side
 from identify.progress import SilentProgress
@@ -29,7 +27,6 @@ from identify.record.conditions import logged_latencies
 from identify.record.recording import recorded_reference
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
-from identify.scenario.section import Section
 from identify.scenario.sections import Geometry, Rig
 from identify.setup import Setup
 from identify.studies.rows.coverage import coverage
@@ -46,7 +43,7 @@ from identify.studies.rows.kind import (
     robot_named,
     timing,
 )
-from identify.studies.rows.row_sensor import DrawnSensor, rms_um, stated_um
+from identify.studies.rows.row_sensor import SensorOptions, rms_um, row_pose_sensor, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import PosePrediction, model_on_record, predicted_runs
 
@@ -126,14 +123,6 @@ COLUMNS = {
 }
 
 
-class SensorOptions(Section):
-    """Options of the sensor."""
-
-    sensor: Literal["drawn", "images"] = Field(
-        "drawn", description="drawn: noise of the stated covariance; images: rendered images"
-    )
-
-
 class RecordOptions(SensorOptions):
     """Options of the record."""
 
@@ -211,15 +200,6 @@ class Recorded:
 def row_setup(settings: Scenario, number: int) -> Setup:
     """Return the setup of a row with a seed. Rows with the same robot share the loaded robot."""
     return Setup(settings.with_overrides(UNWATCHED), number, robot_named(settings.robot))
-
-
-def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
-    """Return the sensor of a row. A sensor with images is taught. Raises its exceptions."""
-    if options.sensor == "drawn":
-        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
-        return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
-    teach(setup.sensor, SilentProgress())
-    return setup.sensor
 
 
 def recorded(setup: Setup, options: RecordOptions) -> Recorded:

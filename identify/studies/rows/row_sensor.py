@@ -13,13 +13,17 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 import cmmsim
 from cmmsim.files import SensorFile
 from cmmsim.measuring.measurement import lost_measurement, measurement_without_stickers
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
-from identify.experiment.sensor_in_loop import SensorPlan
+from identify.experiment.sensor_in_loop import PoseSensor, SensorPlan, teach
+from identify.progress import SilentProgress
+from identify.scenario.section import Section
+from identify.setup import Setup
 from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
@@ -31,6 +35,14 @@ Teaching = Literal["exact", "sensor"]
 ``exact``: frames and sticker places have no error, so rows show observation noise alone.
 ``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s per row).
 """
+
+
+class SensorOptions(Section):
+    """Options of the sensor."""
+
+    sensor: Literal["drawn", "images"] = Field(
+        "drawn", description="drawn: noise of the stated covariance; images: rendered images"
+    )
 
 
 @dataclass(frozen=True)
@@ -153,3 +165,12 @@ def pose_figures(errors: Array, covariances: Array) -> Row:
     """
     figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
     return dict(zip(POSE_COLUMNS, figures, strict=True))
+
+
+def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
+    """Return the sensor of a row. A sensor with images is taught. Raises its exceptions."""
+    if options.sensor == "drawn":
+        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
+        return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
+    teach(setup.sensor, SilentProgress())
+    return setup.sensor
