@@ -44,7 +44,10 @@ The first range is used in which the robot reaches all poses.
 """
 
 TURN = 0.05
-"""Range of random angles about home, rad, for the first of these shares."""
+"""Range of random angles about home, rad, for the first of REACH_SHARES.
+
+It shrinks with the share.
+"""
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,9 @@ class BaseParameters:
     def rigid_groups(self) -> RigidGroups:
         """Groups of the inertial parameters.
 
-        Friction is left out, because friction parameters are in no group with other parameters.
+        Friction of actuated joints is left out, because it is in no group with other parameters.
         """
-        # these parameters come first
+        # inertial parameters and friction of passive joints come first in the layout
         inertial = np.flatnonzero(
             [
                 entry in FULL_INERTIAL or joint.endswith(PASSIVE_JOINT.format(""))
@@ -208,8 +211,8 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
 
     It is the number of diagonal entries of R above `threshold`, in the pivoted QR of the unscaled
     H. The entries have the regressor's units (N or N m per unit of a parameter) and grow with the
-    root of the number of samples, so the count depends on both. A count above the rank means that
-    the threshold is below the rounding errors.
+    root of the number of samples, so the count depends on units and samples. A count above the rank
+    means that the threshold is below the rounding errors.
     """
     # The triangular factor has the same R, and far fewer rows.
     entries = np.diag(qr(triangular_factor(matrix), mode="r", pivoting=True)[0])
@@ -227,23 +230,23 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
     """Return the indices of independent columns, and the remainders on both sides of the limit."""
-    left = columns.copy()
+    remainder = columns.copy()
     smallest = 1.0
     chosen: list[int] = []
     while True:
-        lengths = np.linalg.norm(left, axis=0)
+        lengths = np.linalg.norm(remainder, axis=0)
         longest = float(lengths.max())
         if longest <= DEPENDENT:
             return np.array(chosen), (longest, smallest)
-        able = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
+        allowed = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
         # The longest column would depend on the motion, so a fixed order is used.
-        pivot = int(able[np.argmin(preference[able])])
+        pivot = int(allowed[np.argmin(preference[allowed])])
         smallest = min(smallest, float(lengths[pivot]))
         chosen.append(pivot)
-        direction = left[:, pivot] / lengths[pivot]
+        direction = remainder[:, pivot] / lengths[pivot]
         for _ in range(2):  # the second pass removes rounding errors of the first
-            left -= np.outer(direction, direction @ left)
-        left[:, chosen] = 0.0
+            remainder -= np.outer(direction, direction @ remainder)
+        remainder[:, chosen] = 0.0
 
 
 def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:

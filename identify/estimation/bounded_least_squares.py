@@ -17,7 +17,7 @@ from scipy.optimize import lsq_linear
 from dynamics import DynamicsError
 from identify.arrays import Array
 
-# Factors of the trust region's radius.
+# Factors by which the radius of the trust region shrinks and grows.
 SHRINK = 0.25
 GROW = 2.0
 
@@ -122,11 +122,11 @@ def minimise(
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         trusted = ratio > POOR
         largest = float(np.abs(step / scale).max())
-        tried = radius
+        before = radius
         radius = _new_radius(radius, ratio, largest)
         if ratio > 0:
             # A step limited by the trust region is no evidence of convergence.
-            if largest < 0.9 * tried:
+            if largest < 0.9 * before:
                 change = _relative_change(step, parameters, scale)
                 reason = _converged(cost, new_cost, change, criteria)
             if not reason and len(costs) >= criteria.max_iterations:
@@ -164,6 +164,7 @@ def _box_step(
     """Return the minimiser of the linearised cost in the box, and the gain that it predicts."""
     low = np.maximum((lower - parameters) / scale, -radius)
     scaled = factor * scale
+    # The box always contains the step zero.
     box = (np.minimum(low, -1e-15), np.full(len(scale), radius))
     solved = lsq_linear(scaled, -residual, bounds=box, method="bvls")
     gain = residual @ residual - np.sum((residual + scaled @ solved.x) ** 2)

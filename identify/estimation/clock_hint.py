@@ -1,6 +1,6 @@
-"""Hint at a clock of the commands that a record needs and does not state.
+"""Hint at a separate clock of the commands, which a record needs but does not state.
 
-Where the model misses a record at any times, it is identified again with a clock of its own.
+If the model misses a record at any times, the record is identified again with such a clock.
 """
 
 from dataclasses import replace
@@ -67,6 +67,6 @@ def _lacks_clock(run: LoopModel) -> bool:
 
 
 def _with_clock(run: LoopModel) -> LoopModel:
-    """Return a run with a clock of its own."""
+    """Return a run whose commands have a separate clock."""
     common = replace(run.common, loop_std=run.common.loop_std | {CLOCK_OFFSET: TRIED_S})
     return replace(run, common=common, drawn=None, marginal=None)

@@ -1,10 +1,11 @@
 """Conditioning of an estimate.
 
-Conditioning describes how differently well a record determines the parameters. The information is
-in units of the prior: an eigenvalue of one is a direction that the record determines as well as the
-initial guess does. The information with the prior covers all parameters. The information of the
-poses alone covers only the base parameters and the gains, because single parameters have none. The
-direction of the common factor is excluded, because poses never determine it (`prior`).
+Conditioning tells how much better a record determines some parameters than others. The information
+is in units of the prior: an eigenvalue of one belongs to a direction that the record determines as
+well as the initial guess does. The information with the prior covers all parameters. The
+information of the poses alone covers only the base parameters and the gains, because single
+parameters have none. The direction of the common factor is excluded, because poses never determine
+it (`scale_anchor`).
 """
 
 from dataclasses import dataclass
@@ -81,7 +82,7 @@ def conditioning(
     group_std = np.sqrt(base.combinations**2 @ guess.std[:count] ** 2)
     size = np.concatenate([group_std, guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # A base parameter acts like its pivot, so it has the information of the pivot.
+    # A base parameter has the information of its pivot, because it acts in the same way.
     scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
     # The direction of the common factor is the direction of the values. It is removed.
     free = null_space((values / size)[None])

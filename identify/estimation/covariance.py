@@ -124,10 +124,12 @@ def estimate_uncertainty(
     size = len(parameters)
     linear = _linearised(runs, parameters)
     pairs = list(zip(runs, linear, strict=True))
-    found = [(run.without_common(one.missed), run.without_common(one.slopes)) for run, one in pairs]
+    whitened = [
+        (run.without_common(one.missed), run.without_common(one.slopes)) for run, one in pairs
+    ]
     known, known_rows = problem.known(parameters)
-    gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
-    information = np.asarray(sum(_information(j) for _, j in found))
+    gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in whitened)
+    information = np.asarray(sum(_information(j) for _, j in whitened))
     whole = linear[0].rows.shape[2]
     firsts, drawn = shared_draws(runs)
     all_known = block_diag(known_rows, np.eye(whole - size))
@@ -147,7 +149,7 @@ def estimate_uncertainty(
     beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
     covariance = units @ (scores + beforehand) @ units.T
     return Uncertainty(
-        # This removes asymmetry by rounding.
+        # This removes asymmetry due to rounding.
         (covariance + covariance.T) / 2,
         _information(problem.guess.rows @ units[:size] @ units[:size].T),
         covariance_by_kind(firsts, units[:size] @ units[size:].T @ drawn),
@@ -197,7 +199,7 @@ def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:
 
 
 def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array]) -> Array:
-    """Return the covariance (q, q) of the scores T^T J^T r by the loads' standard deviations.
+    """Return the covariance (q, q) of the scores T^T J^T r due to errors of the loads.
 
     It is of first order. information: T^T J^T J (q, p) of each run's residuals. Runs that state the
     same load with the same standard deviations share its error. Errors of different loads are
@@ -218,7 +220,7 @@ def _units(rows: list[Array]) -> Array:
     """Return a matrix T (p, p) with T^T W T = 1, and so W^-1 = T T^T.
 
     W is the information of all rows (n, p) together. T is computed from the rows by QR, because W
-    has the square of their condition number. If a record contradicts the model, W could not be
+    has the square of their condition number. If a record contradicts the model, W cannot be
     inverted accurately.
     """
     triangle = triangular_factor(np.vstack(rows))
@@ -238,11 +240,11 @@ def _noise(
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, Misfit, int]:
-    """Return the covariance (q, q) of the scores by noise, the misfit, and the number of failures.
+    """Return the covariance (q, q) of the scores due to noise, the misfit, and the failures.
 
-    found: linearisation of each run, with rows in the units of the scores. A failure is an unstable
-    repetition. No experiment is repeated if the model's error makes most of the residuals, or if
-    the residuals are white.
+    found: linearisation of each run, with rows in the units of the scores. The failures are the
+    unstable repetitions. No experiment is repeated if the model's error makes most of the
+    residuals, or if the residuals are white.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))

@@ -9,8 +9,8 @@ stationary residuals with the autocorrelation R_k have the covariance
     sum over frames i, j of J_i^T R_(i-j) J_j
 
 (Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J.
-Guidance, Control, and Dynamics 20(1), 1997), with R_k estimated from the residuals. The part of
-the model's error is added to the part of the noise. An error that is compensated by wrong
+Guidance, Control, and Dynamics 20(1), 1997), with R_k estimated from the residuals. The covariance
+due to the model's error is added to that due to noise. An error that is compensated by wrong
 parameters does not appear in the residuals. If the model's error makes most of the residual, no
 interval can be trusted, and nothing counts as identified.
 
@@ -36,10 +36,10 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(ndtri(0.999))
-"""Excess of the residual, in standard deviations, above which the model has an error."""
+"""Standard deviations above the expected residual from which the model has an error."""
 
 MISFIT_STDS = 5.0
-"""Deficit of the residual, in standard deviations, above which the stated covariance is wrong."""
+"""Standard deviations below the expected residual from which the stated covariance is wrong."""
 
 NOISE_DECIDES = 3.0
 """Ratio of the residual to its expected value above which the model's error dominates."""
@@ -119,8 +119,8 @@ def misfit_of_white(residuals: Array) -> Misfit:
 def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
     """Return the covariance (p, p) of J^T r for residuals with their estimated autocorrelation.
 
-    residuals (n, 6) and jacobian (n, 6, p) are of the good frames, `ok` (N,). Lost frames have no
-    residual, and add nothing.
+    residuals (n, 6), jacobian (n, 6, p): rows of the good frames. ok (N,): marks of the good
+    frames. Lost frames have no residual, and add nothing.
     """
     return score_covariance(spectral_density(residuals, ok), jacobian, ok)
 
@@ -280,9 +280,9 @@ def by_frames(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return residuals (N, 6) of several records one after the other, and the good frames (N,).
 
-    residuals (n, 6) of each record are those of its good frames, and frames say which these are.
-    Residuals of lost poses are NaN. Between two records there is a gap as long as the largest lag
-    of the test for whiteness.
+    residuals: those (n, 6) of each record at its good frames. frames: marks of these frames. In the
+    result, residuals of lost poses are NaN. Between two records there is a gap as long as the
+    largest lag of the test for whiteness.
     """
     gap = np.full((LAGS, 6), np.nan)
     parts = []

@@ -1,4 +1,4 @@
-"""Warnings of full bodies that a record does not show, or with a centre of mass outside of them."""
+"""Warnings of full bodies: numbers that a record does not show, and centres of mass outside."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
 
 OUTSIDE_STDS = 3.0
-"""Distance of a centre of mass outside of its body above which it is noticed, in its deviations."""
+"""Distance of a centre of mass from its body, in standard deviations, that gives a warning."""
 
 
 def full_body_warnings(
@@ -17,14 +17,14 @@ def full_body_warnings(
 ) -> tuple[str, ...]:
     """Return the warnings of the full bodies of a robot with estimates (p,).
 
-    covariance (p, p): that of the estimates. shown (p,): True for each parameter that is identified
-    or a part of an identified group.
+    covariance (p, p): covariance of the estimates. shown (p,): True for each parameter that is
+    identified or a part of an identified group.
     """
     return (*_outside(robot, estimate, covariance), *_unseen(robot.layout, shown))
 
 
 def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return a warning of the numbers of full bodies of which a record shows nothing."""
+    """Return a warning of the numbers of full bodies that a record does not show at all."""
     unseen: dict[str, list[str]] = {}
     for kind, full, rows in zip(layout.kinds, layout.full, layout.body_slices, strict=True):
         if full and not shown[rows].all():

@@ -6,25 +6,25 @@ A quantity counts as identified if the record
 - leaves a standard deviation of less than half of its size.
 
 The size follows from the initial guess and not from the noisy estimate. A criterion with the
-estimate would select quantities that chance made large, and their intervals would miss the truth
-too often. The size of a parameter is its initial guess. For friction with a guess of zero, the size
-is a tenth of the torque that the joints hold at home. For a first moment or a product of inertia
-with a guess of zero, it is a tenth of what a very uneven body has. The size of a group is the root
-of the sum of squares of the contributions of its members. A difference of large masses thus has the
-size of these masses, even if the guess of the difference is zero.
+estimate would select quantities whose estimates are large by chance, and their intervals would miss
+the truth too often. The size of a parameter is its initial guess. For friction with a guess of
+zero, the size is a tenth of the torque that the joints hold at home. For a first moment or a
+product of inertia with a guess of zero, it is a tenth of what a very uneven body has. The size of a
+group is the root of the sum of squares of the contributions of its members. A difference of large
+masses thus has the size of these masses, even if the guess of the difference is zero.
 
 Groups are the base parameters, the combinations that a record can identify. The uncertainty of a
 group follows from its members by linear propagation. A group is often known well although none of
-its members is. Poses identify the groups and the gains up to a common factor, and the scale anchor
-identifies the measured quantity. Another parameter can still have a small standard deviation, if
-the guess of the other members of its group is accurate. For example, a mass that acts only in
-link4.Ixx - 0.0227 link4.mass depends on the guess of link4.Ixx. If errors of the guess make more
-than half of the variance of an estimate, the estimate rests on the prior. Its interval then
+its members is known. Poses identify the groups and the gains up to a common factor, and the scale
+anchor identifies the measured quantity. Another parameter can still have a small standard
+deviation, if the guess of the other members of its group is accurate. For example, a mass that acts
+only in link4.Ixx - 0.0227 link4.mass depends on the guess of link4.Ixx. If errors of the guess make
+more than half of the variance of an estimate, the estimate rests on the prior. Its interval then
 contains the truth only if the interval of the guess does, and further records do not help.
 
-The common factor can also rest on the prior. If poses show the platform's mass only in a sum with
-other heavy bodies, weighing the platform does not fix the factor. The gains reveal this, because
-poses determine them up to the common factor.
+The common factor of all parameters can also rest on the prior. If poses show the platform's mass
+only in a sum with other heavy bodies, weighing the platform does not fix the factor. The gains
+reveal this, because poses determine them up to the common factor.
 """
 
 from dataclasses import dataclass
@@ -95,10 +95,10 @@ class Identifiability:
 
         covariance (p, p): covariance of the estimate.
         """
-        left = combined_std(rows, covariance)
+        after = combined_std(rows, covariance)
         before = np.sqrt(rows**2 @ self.std**2)
         size = np.sqrt(rows**2 @ self.sizes**2)
-        return self.model_holds & (left < IDENTIFIABLE_SHARE * np.minimum(before, size))
+        return self.model_holds & (after < IDENTIFIABLE_SHARE * np.minimum(before, size))
 
 
 def identifiability(
@@ -110,12 +110,12 @@ def identifiability(
     the size 1.
     """
     layout = robot.layout
-    held = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
-    unsaid = np.where(friction(layout), held, 1.0)
+    usual_friction = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
+    ordinary = np.where(friction(layout), usual_friction, 1.0)
     uneven = ASYMMETRY_SHARE * asymmetry(robot, guess.values)
-    unsaid[layout.inertial] = np.where(layout.signed[layout.inertial], uneven, 1.0)
-    unsaid[layout.passive] = passive_torque(robot, held)
-    sizes = np.where(guess.values != 0, np.abs(guess.values), unsaid)
+    ordinary[layout.inertial] = np.where(layout.signed[layout.inertial], uneven, 1.0)
+    ordinary[layout.passive] = passive_torque(robot, usual_friction)
+    sizes = np.where(guess.values != 0, np.abs(guess.values), ordinary)
     return Identifiability(guess.std, sizes, model_holds)
 
 
@@ -191,9 +191,9 @@ def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
 
 
 SCALE_KNOWN = 0.015
-"""Largest relative standard deviation of the common factor due to the initial guess.
+"""Relative standard deviation of the common factor due to the initial guess that needs no warning.
 
-It is allowed without a warning if an instrument was used to fix the factor.
+The warning is given only if an instrument was used to fix the factor.
 """
 
 

@@ -1,6 +1,6 @@
-"""Identification of one record: linear warm start, output error, uncertainty, identifiability.
+"""Identification from records: linear warm start, output error, uncertainty, identifiability.
 
-Its input is the record, the robot's geometry and initial guess, and the scenario's model side. It
+Its input is the records, the robot's geometry and initial guess, and the scenario's model side. It
 has no access to the sensor, the plant's settings or the truth.
 """
 
@@ -127,7 +127,7 @@ def identify(
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
     errors = common_error_estimates(judged, solution.parameters, uncertainty.whole)
-    told = (
+    notes = (
         *reading_notes(records),
         *clock_notes(errors),
         *(() if explained.model_holds else clock_hints(problem, warm, explained.misfit.found)),
@@ -163,7 +163,7 @@ def identify(
             "search": searched - warmed,
             "uncertainty": ended - searched,
         },
-        **vars(judgement) | {"warnings": (*told, *drive.warnings(), *judgement.warnings)},
+        **vars(judgement) | {"warnings": (*notes, *drive.warnings(), *judgement.warnings)},
     )
 
 
@@ -179,7 +179,7 @@ class Asked:
 def asked_of(
     record: xr.Dataset | Sequence[xr.Dataset], robot: Robot | None, scenario: Scenario | None
 ) -> Asked:
-    """Return the checked inputs of `identify`. Takes its arguments and raises its errors."""
+    """Return the checked inputs of `identify`, with its arguments and errors."""
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     if not records:
         raise EstimationError("no record to identify from")
@@ -215,8 +215,8 @@ def output_error_problem(
         There is no parameter set for the initial guess, or the guess is not valid for the model.
     """
     robot = side.robot
-    groups = structure(robot).rigid_groups
     # The motion depends only on the groups, so only their sensitivities are integrated.
+    groups = structure(robot).rigid_groups
     # Further records can be of other days, with another timing or servo.
     sides = [side, *(side_of_record(side, record) for record in records[1:])]
     runs = tuple(

@@ -67,7 +67,7 @@ class OutputErrorProblem:
         """Return whether the model of each run contains these common errors (k,).
 
         A difference of up to `within` standard deviations is allowed. Errors that a model cannot
-        contain are limited first.
+        contain are first limited to those that it can.
         """
         pairs = zip(self.runs, errors, strict=True)
         return all(

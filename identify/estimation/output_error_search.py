@@ -33,10 +33,10 @@ SETTLED = 0.02
 """Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
 STEPS = 1
-"""Number of steps between two linearisations in common errors with a wide prior."""
+"""Steps of the parameters between two linearisations in common errors with a wide prior."""
 
 MOST = 15
-"""Largest number of these linearisations."""
+"""Largest number of linearisations in common errors with a wide prior."""
 
 HALVINGS = 10
 """Largest number of halvings of a step of the common errors."""
@@ -45,13 +45,16 @@ MISSED = 1.2
 """Mean squared residual above which the search is repeated from another start."""
 
 WORSE = 1.01
-"""Largest ratio of the costs after and before such a step."""
+"""Largest ratio of the costs after and before a step of the common errors."""
 
 NEAR = 1.0
-"""Change of such errors, in the standard deviations that decide, at which they count as near."""
+"""Change of common errors with a wide prior at which they count as near their optimum.
+
+It is in the standard deviations of `LoopModel.in_deciding_stds`.
+"""
 
 CLOSE_ENOUGH = 1e-2
-"""Relative change of the cost at which multiple shooting ends. Other searches follow it."""
+"""Relative change of the cost at which multiple shooting ends. Finer searches follow it."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,11 @@ def output_error_searches(
     if start is None:
         found["multiple_shooting"] = Search(driven, shoot(driven, warm, progress))
         start = found["multiple_shooting"].solution.parameters
-    told = any(run.common.all_names for run in problem.runs)
-    most = (1 + closed_loop + told) * problem.stop.max_iterations
+    has_common = any(run.common.all_names for run in problem.runs)
+    most = (1 + closed_loop + has_common) * problem.stop.max_iterations
     with progress.stage("identify", most) as advance:
-        starts = [start, problem.guess.values] if told else [start]
-        if told and not all(run.begins_in_motion for run in problem.runs):
+        starts = [start, problem.guess.values] if has_common else [start]
+        if has_common and not all(run.begins_in_motion for run in problem.runs):
             found["noise_alone"] = Search(driven, search(driven, start, advance))
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
         found["command_driven"] = searched = search_with_common_errors(driven, starts, advance)
@@ -285,9 +288,9 @@ def _with_common_errors(
     inside = [
         start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))
     ]
-    told = problem.with_common_errors(inside[0])
-    best = min(inside, key=told.cost)
-    return (told if best is inside[0] else problem.with_common_errors(best)), best
+    whitened = problem.with_common_errors(inside[0])
+    best = min(inside, key=whitened.cost)
+    return (whitened if best is inside[0] else problem.with_common_errors(best)), best
 
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:

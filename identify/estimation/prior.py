@@ -36,7 +36,7 @@ class StartingGuess:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """Gains (p,) that the law of the drives does not read."""
+        """Marks (p,) of the gains that the law of the drives does not read."""
         names = self.layout.names
         return np.isin(names, self.layout.joint_pid_names) & ~np.isin(
             names, gains_among(self.layout, READS[self.drive])
@@ -59,7 +59,7 @@ def gains_among(layout: ParameterLayout, kinds: Collection[str]) -> list[str]:
 
 
 FIXED = 1e-9
-"""Factor of the standard deviation of a gain that the law of the drives does not read."""
+"""Factor that makes the standard deviation of a gain negligible if no law reads it."""
 
 
 def starting_guess(

@@ -87,9 +87,9 @@ class IdentificationResult:
     whiteness : Whiteness
         Test of the residuals of the model that is driven by the logged commands.
     driven_estimate : ndarray, shape (p,)
-        Estimate by that model, which is the final one if it was the last to be searched.
+        Estimate with that model. It equals `estimate` if no closed-loop search followed.
     driven_misfit : Misfit
-        Its misfit.
+        Misfit of that model.
     """
 
     layout: ParameterLayout
@@ -148,7 +148,7 @@ class IdentificationResult:
 
     @property
     def explained(self) -> bool:
-        """True if noise explains all that the model leaves of the record."""
+        """True if noise explains the residuals of the model."""
         missed = self.misfit.significant or self.driven_misfit.significant
         return not (missed or self.whiteness.suspicious)
 
@@ -271,9 +271,9 @@ class IdentificationResult:
         }
 
     def _assumptions(self) -> dict[str, dict[str, Any]]:
-        """Return what each assumption on bodies and passive joints costs, by kind.
+        """Return how much each kind of assumption on bodies and passive joints widens intervals.
 
-        It is the identified parameter whose interval it widens most, and the factor.
+        Each entry has the identified parameter whose interval is widened most, and the factor.
         """
         shown = np.flatnonzero(self.identifiable)
         found = {}

@@ -16,11 +16,10 @@ This equation is for the PID. In other laws of the drives the torque is also pro
 gains. It is therefore the sum of its derivatives with respect to the gains, times the gains. The
 derivatives of a cascade depend on ratios of the gains, which are taken from the previous fit.
 
-A common error of the poses or of the geometry shifts theta by e for one standard deviation. An
-error of the latency shifts U by its motion in that time, and errors of zeros and scale shift U. In
-the equation these shifts are
-multiplied by lp, and their integrals by li. With the gains of the initial guess, the errors of the
-rows are lp0 e and li0 integral(e). They last for the whole run, and are marginalised
+One standard deviation of a common error of the poses or of the geometry shifts theta by e. An error
+of the latency, of the zeros or of the scale shifts U instead. In the equation, shifts are
+multiplied by lp and their integrals by li. With the gains lp0 and li0 of the initial guess, the
+errors of the rows are lp0 e and li0 integral(e). They last for the whole run, and are marginalised
 (`record.stored_common_errors`).
 """
 
@@ -77,8 +76,8 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
         if common.shape[1]:
             whitened = Marginal.of(common / noise).whiten(whitened)
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
-        left = whitened @ np.append(solution, -1.0)
-        noise = max(noise * float(np.sqrt(np.sum(left**2) / len(right))), 1e-9)
+        residual = whitened @ np.append(solution, -1.0)
+        noise = max(noise * float(np.sqrt(np.sum(residual**2) / len(right))), 1e-9)
         if law.lx.any():  # the columns of a cascade depend on the gains
             found = np.maximum(solution[:count], SMALLEST_SHARE * guess.values)
             law = drives.joint_law(layout.split(found)[3])
@@ -114,8 +113,8 @@ def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, 
             # Commanded torques do not depend on gains, so they are on the right side.
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
-            felt, _, _ = effective_command(run, problem.low_pass)
-            right.append(felt[slipping] - columns[:, :count] @ run.payload)
+            torque, _, _ = effective_command(run, problem.low_pass)
+            right.append(torque[slipping] - columns[:, :count] @ run.payload)
             common.append(np.zeros((len(columns), 0)))
             continue
         matrix = np.zeros((len(columns), count + joints * len(runs)))
@@ -236,15 +235,15 @@ def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, A
     spline = make_interp_spline(times, smooth, k=5)
     # Mean lag of the acting command, over the period that follows a command.
     lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
-    felt = spline(np.clip(times - lag, 0.0, None))
+    acting = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
-    return felt, rate, running_integral(felt, rate_hz)
+    return acting, rate, running_integral(acting, rate_hz)
 
 
 def _acted(
     commands: Array, timing: FrameTiming, low_pass: Filter, latencies: Array
 ) -> tuple[Array, Array, Array]:
-    """Return `effective_command` for commands with individual latencies.
+    """Return the same as `effective_command`, for commands with individual latencies.
 
     The acting command is integrated from arrival to arrival, and the filtered rates of the
     integrals are returned.
@@ -256,7 +255,9 @@ def _acted(
     newest = np.maximum(np.searchsorted(arrivals, times, side="right") - 1, 0)
     differences = np.diff(commands, axis=0, prepend=commands[:1])
 
-    def felt(values: Array, ramped: float) -> Array:
+    def acting(values: Array, ramped: float) -> Array:
+        """Return the mean command in each frame. ramped: 1 for ramps, 0 for jumps."""
+
         def since(which: NDArray[np.intp] | slice, duration: Array) -> Array:
             """Return the integral of the acting command, over a duration since its arrival."""
             # During the first frame, a ramp lags behind the command.
@@ -273,8 +274,8 @@ def _acted(
         held = make_interp_spline(times, integral, k=5).derivative()(times)
         return zero_phase_filter(held, rate_hz, low_pass.cutoff_hz, low_pass.order)
 
-    command = felt(commands, float(timing.hold == "linear"))
-    return command, felt(differences * rate_hz, 0.0), running_integral(command, rate_hz)
+    command = acting(commands, float(timing.hold == "linear"))
+    return command, acting(differences * rate_hz, 0.0), running_integral(command, rate_hz)
 
 
 def first_order(samples: Array, time_constant: float, rate_hz: float) -> Array:
