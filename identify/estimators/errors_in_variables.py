@@ -9,15 +9,15 @@ generic instrumental variable approach for industrial robot identification", IEE
 The model closes its own loop, because logged commands would bring the sensor's noise into the
 instruments.
 
-Plain total least squares assumes equal and independent errors of all columns. Here the errors come
-from the same poses through derivatives. Therefore their second moments are sampled: the poses are
-disturbed by random sensor noise, and the columns are computed again. The estimate x~ = (x, -1)
+Plain total least squares assumes equal and independent errors of all columns. Here all columns are
+computed from the same poses. Therefore the second moments of their errors are sampled: the poses
+are disturbed by random sensor noise, and the columns are computed again. The estimate x~ = (x, -1)
 minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the sampled errors of A. With A = Q R, it is
 R^-1 times the first right singular vector of E R^-1 (generalised total least squares, Van Huffel
 and Vandewalle, "The total least squares problem", SIAM 1991, chapter 10).
 
 Directions that the motion does not determine better than the initial guess are fixed at the guess
-first (truncation), because noise would dominate them. All this removes the bias, but not the
+first (truncation), because noise would dominate them. Both methods remove the bias, but not the
 scatter. If the errors are large, the difference of the normal matrix and the matrix of the errors
 is nearly singular, and the standard deviations are large.
 """
@@ -65,16 +65,16 @@ def instrumental_variables(evidence: Evidence) -> Estimate:
     unknowns, noise = fit_equations(equations, guess, weighted=True)
     count = len(guess.values)
     runs = 0
-    moved = np.array([np.inf])
-    while moved.max() > STEP_TOLERANCE and runs < MAX_ITERATIONS:
+    change = np.array([np.inf])
+    while change.max() > STEP_TOLERANCE and runs < MAX_ITERATIONS:
         instruments = _simulated_matrix(evidence, equations, unknowns[:count])
         new, covariance = iv_fit(equations, instruments, noise, guess)
-        moved = np.abs(new - unknowns)[:count] / standard_deviations(covariance, count)
+        change = np.abs(new - unknowns)[:count] / standard_deviations(covariance, count)
         unknowns = new
         noise = row_noise(equations, new, equations.kind)
         runs = runs + 1
     seconds = time.perf_counter() - began
-    note = f"last step {moved.max():.2g} standard deviations"
+    note = f"last step {change.max():.2g} standard deviations"
     std = standard_deviations(covariance, count)
     return Estimate(unknowns[:count], std, seconds, REWEIGHTINGS + runs, runs, note)
 
@@ -84,7 +84,7 @@ def iv_fit(
 ) -> tuple[Array, Array]:
     """Solve Z^T (W x - tau) = 0 in whitened rows, with the initial guess as a prior.
 
-    instruments: Z (2 n, u). noise (2 n,): standard deviations of the rows, N m or N. Returns the
+    instruments: Z (2 m, u). noise (2 m,): standard deviations of the rows, N m or N. Returns the
     unknowns x (u,) and their covariance (u, u).
     """
     values, std = prior_of(guess)
@@ -102,7 +102,7 @@ def iv_fit(
 
 
 def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters: Array) -> Array:
-    """Return the regression matrix (2 n, u) of the simulated closed loop, for the same rows."""
+    """Return the regression matrix (2 m, u) of the simulated closed loop, for the same rows."""
     try:
         simulated = evidence.run.simulate(parameters)
     except DynamicsError as error:
@@ -133,7 +133,7 @@ It is relative to the largest entry of the vector.
 def total_least_squares(evidence: Evidence) -> Estimate:
     """Estimate by total least squares with drawn errors of the columns.
 
-    Raises EstimationError if the solution is not generic, without a part of the torque column.
+    Raises EstimationError if the solution is not generic: the torque column has no part in it.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -189,8 +189,8 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Ar
     drawn = np.concatenate([np.column_stack([one[:, :-1] @ shown.T, one[:, -1]]) for one in errors])
     drawn /= np.sqrt(len(errors))
     triangle = np.asarray(np.linalg.qr(joined, mode="r"))
-    turned = np.linalg.solve(triangle.T, drawn.T).T
-    _, largest, vectors = np.linalg.svd(turned, full_matrices=False)
+    relative = np.linalg.solve(triangle.T, drawn.T).T
+    _, largest, vectors = np.linalg.svd(relative, full_matrices=False)
     vector = np.linalg.solve(triangle, vectors[0])
     if abs(vector[-1]) < NOT_GENERIC * np.abs(vector).max():
         raise EstimationError(
@@ -229,11 +229,11 @@ def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) 
     poses = run.without_gaps()
     drawn = []
     for _ in range(DRAWS):
-        moved = poses + rng.standard_normal(poses.shape) @ factor.T
-        read = channels.torque + channels.torque_std * rng.standard_normal(channels.torque.shape)
-        other = torque_equations(evidence.problem, run, moved, read, equations.slipping)
+        disturbed = poses + rng.standard_normal(poses.shape) @ factor.T
+        torque = channels.torque + channels.torque_std * rng.standard_normal(channels.torque.shape)
+        again = torque_equations(evidence.problem, run, disturbed, torque, equations.slipping)
         differences = np.column_stack(
-            [other.matrix - equations.matrix, other.right - equations.right]
+            [again.matrix - equations.matrix, again.right - equations.right]
         )
         drawn.append(differences / noise[:, None])
     return np.stack(drawn)

@@ -79,7 +79,7 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """Estimating function with a title and a text of its inputs beside the commands.
+    """Estimating function with a title, and a text that names its inputs beside the commands.
 
     It is called like the function.
     """
@@ -126,9 +126,11 @@ def _found(name: str) -> Estimator:
 def _own(name: str, function: Callable[..., Any]) -> Estimator:
     """Return a user's own estimator. All its failures become an EstimationError in one line."""
     known = (EstimationError, DynamicsError)
-    told = PluginFunction(f"estimator {name!r}", function, EstimationError, known, _check_estimate)
+    checked = PluginFunction(
+        f"estimator {name!r}", function, EstimationError, known, _check_estimate
+    )
     title = getattr(function, "title", name)
-    return Estimator(title, getattr(function, "uses", ""), told)
+    return Estimator(title, getattr(function, "uses", ""), checked)
 
 
 def _check_estimate(part: str, found: object, evidence: Evidence) -> None:

@@ -45,20 +45,20 @@ UNKNOWN_FORCE = 1e6
 class TorqueEquations:
     """Linear equations matrix @ unknowns = right, in N m or N.
 
-    The first n rows are equations of the dynamics, and the other n rows of the controller.
+    The first m rows are equations of the dynamics, and the other m rows of the controller.
 
     Attributes
     ----------
     layout : ParameterLayout
         Layout of the parameters, the first of the u unknowns. The torques of the joints at the
         start follow.
-    matrix, right : ndarray, shapes (2 n, u) and (2 n,)
+    matrix, right : ndarray, shapes (2 m, u) and (2 m,)
         Coefficients and right side.
-    kind : ndarray of int, shape (2 n,)
+    kind : ndarray of int, shape (2 m,)
         Index of the joint. In rows of the controller the number of joints is added.
     correlation : float
-        Number of samples per independent sample. After a low-pass filter with cutoff f there are
-        2 f independent samples per second.
+        Samples that count as one independent sample. After a low-pass filter with cutoff f there
+        are 2 f independent samples per second.
     slipping : ndarray of bool, shape (N, joints)
         True for the frames and joints of the rows.
     """
@@ -71,11 +71,11 @@ class TorqueEquations:
     slipping: NDArray[np.bool_]
 
     def residual(self, unknowns: Array) -> Array:
-        """Return the residual torques (2 n,) of the equations."""
+        """Return the residual torques (2 m,) of the equations."""
         return np.asarray(self.matrix @ unknowns - self.right, dtype=float)
 
     def whitened(self, noise: Array) -> "TorqueEquations":
-        """Return the equations with rows divided by their standard deviations (2 n,)."""
+        """Return the equations with rows divided by their standard deviations (2 m,)."""
         return replace(self, matrix=self.matrix / noise[:, None], right=self.right / noise)
 
 
@@ -86,29 +86,29 @@ def torque_equations(
     torque: Array,
     slipping: NDArray[np.bool_] | None = None,
 ) -> TorqueEquations:
-    """Return the equations of poses (N, 6) and torques (N, n) of a run with its logged commands.
+    """Return the equations of a run for some poses (N, 6) and joint torques (N, n), N m or N.
 
-    The torques are in N m or N. problem: provides the filter, and the gains of a cascade about
-    which its torque is linearised. slipping (N, n): frames and joints of the rows, by default all
-    frames in which a joint slips.
+    The commands are those that were logged. problem: provides the filter, and the gains of a
+    cascade about which its torque is linearised. slipping (N, n): frames and joints of the rows, by
+    default all frames in which a joint slips.
     """
     low_pass = problem.low_pass
     rate_hz = run.settings.timing.frame_rate_hz
     layout = run.robot.layout
     law = run.settings.drives.joint_law(layout.split(problem.guess.values)[3])
-    balance, found = joint_balance(run, poses, low_pass, law)
-    rows = found if slipping is None else slipping
+    balance, slips = joint_balance(run, poses, low_pass, law)
+    rows = slips if slipping is None else slipping
     columns = balance[rows]
-    felt = zero_phase_filter(torque, rate_hz, low_pass.cutoff_hz, low_pass.order)[rows]
+    filtered = zero_phase_filter(torque, rate_hz, low_pass.cutoff_hz, low_pass.order)[rows]
     dynamic = layout.dynamic
-    others = slice(layout.dynamic.stop, None)
+    after_dynamic = slice(layout.dynamic.stop, None)
     matrix = np.zeros((2 * len(columns), columns.shape[1]))
     matrix[: len(columns), dynamic] = columns[:, dynamic]
     # The balance has the controller's torque with the opposite sign.
-    matrix[len(columns) :, others] = -columns[:, others]
+    matrix[len(columns) :, after_dynamic] = -columns[:, after_dynamic]
     joint = np.nonzero(rows)[1]
     # The torque of a known payload is on the right side.
-    right = np.concatenate([felt - columns[:, dynamic] @ run.payload[dynamic], felt])
+    right = np.concatenate([filtered - columns[:, dynamic] @ run.payload[dynamic], filtered])
     correlation = max(1.0, rate_hz / (2 * low_pass.cutoff_hz))
     kind = np.concatenate([joint, joint + layout.joints])
     return TorqueEquations(layout, matrix, right, kind, correlation, rows)
@@ -206,17 +206,17 @@ def measured_equations(evidence: Evidence, poses: Array | None = None) -> Torque
     """
     run = evidence.run
     torque = evidence.joint_channels().torque
-    moved = run.without_gaps() if poses is None else poses
-    return torque_equations(evidence.problem, run, moved, torque)
+    poses = run.without_gaps() if poses is None else poses
+    return torque_equations(evidence.problem, run, poses, torque)
 
 
 def fit_equations(
     equations: TorqueEquations, guess: StartingGuess, weighted: bool
 ) -> tuple[Array, Array]:
-    """Return the unknowns (u,) of the equations, and the standard deviations (2 n,) of the rows.
+    """Return the unknowns (u,) of the equations, and the standard deviations (2 m,) of the rows.
 
     The standard deviations, N m or N, come from the residuals of each joint, if weighted, or else
-    of all joints together. They account for the correlation by the filter.
+    of all joints together. They account for the correlation due to the filter.
     """
     # Without weights there are only two groups, the rows of dynamics and of controllers.
     groups = equations.kind if weighted else equations.kind // equations.layout.joints
@@ -232,9 +232,10 @@ def fit_equations(
 
 
 def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.intp]) -> Array:
-    """Return standard deviations (2 n,) with which rows can be treated as independent.
+    """Return standard deviations (2 m,) with which rows can be treated as independent.
 
-    They are the RMS residual of each row's group, times the square root of `correlation`.
+    They are the RMS residual of the rows of each group, times the square root of `correlation`.
+    groups (2 m,): index of the group of each row.
     """
     squares = equations.residual(unknowns) ** 2
     rms = np.sqrt(np.bincount(groups, squares) / np.maximum(np.bincount(groups), 1))
