@@ -66,7 +66,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Entries of all methods, and the time for preparing their common candidates, in s."""
+    """Results of all methods, and the time that their common candidates took, in s."""
 
     criterion: str
     seed: int
@@ -76,7 +76,7 @@ class Comparison:
 
 
 def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progress) -> Comparison:
-    """Run the search of every method, and judge the results by their information.
+    """Run the search of every method, and compute the information of each result.
 
     Raises the errors of `design_trajectories`.
     """
@@ -102,9 +102,9 @@ def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progr
     entries = []
     for method, search in SEARCHES.items():
         began = time.perf_counter()
-        found = search(problem, child(seed, SEARCH), progress)
+        result = search(problem, child(seed, SEARCH), progress)
         seconds = time.perf_counter() - began
-        trajectory = found.trajectory(problem)
+        trajectory = result.trajectory(problem)
         try:
             information = float(np.exp(log_information(robot, known, trajectory)))
         except TrajectoryError:
@@ -112,14 +112,14 @@ def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progr
         entry = Entry(
             method=method,
             trajectory=trajectory,
-            value=float(np.exp(found.log_value)),
-            observability=observability_index(index, found.z),
+            value=float(np.exp(result.log_value)),
+            observability=observability_index(index, result.z),
             information=information,
             seconds=seconds,
-            evaluations=found.evaluations,
-            gradients=found.gradients,
-            iterations=found.iterations,
-            reason=found.reason,
+            evaluations=result.evaluations,
+            gradients=result.gradients,
+            iterations=result.iterations,
+            reason=result.reason,
             worst=tuple(problem.constraints.worst(trajectory, times)),
         )
         entries.append(entry)
@@ -142,11 +142,11 @@ def comparison_figure(robot: Robot, settings: Excitation, comparison: Comparison
     boxes = (1e3 * settings.position_amplitude_m, 1e3 * settings.orientation_amplitude_rad)
     for column, entry in enumerate(comparison.entries):
         poses = entry.trajectory.pose(time)
-        away = 1e3 * (poses - robot.home_pose)
+        offset = 1e3 * (poses - robot.home_pose)
         angles = robot.inverse_kinematics(poses)
         rows = [
-            (away[:, :3], COMPONENTS[:3], boxes[0]),
-            (away[:, 3:], COMPONENTS[3:], boxes[1]),
+            (offset[:, :3], COMPONENTS[:3], boxes[0]),
+            (offset[:, 3:], COMPONENTS[3:], boxes[1]),
             (angles, robot.joint_names, travel),
         ]
         for axes, (values, names, limit) in zip(panels[:, column], rows, strict=True):

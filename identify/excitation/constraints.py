@@ -55,30 +55,30 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
     Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
     plane.
     """
-    uses = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
+    shares = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
         -1, 2, 3
     )
-    worst = np.abs(uses).max(axis=(1, 2))
+    worst = np.abs(shares).max(axis=(1, 2))
     visible = sight.visible(home)
     chosen: list[int] = []
     for index, plane in enumerate(PLANES):
         on_plane = sight.platform.plane_index == index
-        able = np.flatnonzero(visible & on_plane)
+        seen = np.flatnonzero(visible & on_plane)
         needed = min(STICKERS_A_PLANE, int(on_plane.sum()))
-        if len(able) < needed:
+        if len(seen) < needed:
             raise TrajectoryError(
-                f"visibility: {len(able)} stickers of plane {plane} are visible to both cameras at "
+                f"visibility: {len(seen)} stickers of plane {plane} are visible to both cameras at "
                 f"the home pose, {needed} are needed"
             )
         # With a stable sort, the choice among equally good stickers is the same on all machines.
-        chosen += able[np.argsort(worst[able], kind="stable")][:needed].tolist()
+        chosen += seen[np.argsort(worst[seen], kind="stable")][:needed].tolist()
     return chosen
 
 
 def visibility_shares(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca.SX:
     """Return the used shares of the limits of visibility for stickers at a pose.
 
-    Each sticker has six rows, three for each camera: grazing incidence, and the horizontal and
+    Each sticker has six rows, three for each camera: angle of incidence, and the horizontal and
     vertical place in the image. Beyond +-1 the sticker is not visible to the camera. Lens
     distortion is neglected.
     """
@@ -100,34 +100,36 @@ def visibility_shares(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca
 def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, box: Array) -> bool:
     """Return whether the stickers are proved visible in a whole box (6,) [m, rad] about home.
 
-    The proof uses bounds of the motion and rotation of each sticker. False means that these bounds
-    do not suffice, and not that a sticker is invisible.
+    The proof uses bounds of the motion and rotation of each sticker. False means that these
+    bounds do not suffice, and not that a sticker is invisible.
     """
     turn = float(box[3:].sum())
-    uses = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
+    shares = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
     places = apply(pose_to_transform(home), sight.platform.nominal[stickers])
     shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(
         sight.platform.nominal[stickers], axis=1
     )
     for camera, move, use in zip(
-        sight.rig.cameras, sight.cameras_from_base, uses.swapaxes(0, 1), strict=True
+        sight.rig.cameras, sight.cameras_from_base, shares.swapaxes(0, 1), strict=True
     ):
         seen = apply(move, places)
         # Smallest possible depth of the sticker, at which a shift moves its image most.
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
             return False
-        # A shift changes the direction of sight, like a rotation of the sticker.
+        # A shift changes the direction of sight as a rotation of the sticker would.
         turned = turn + np.arcsin(np.minimum(1.0, shifts / np.linalg.norm(seen, axis=1)))
         # Angle of incidence at home, from the used share of its limit.
         angle = np.arccos(1 - use[:, 0] * (1 - GRAZING)) + turned
-        moved = (
+        image_shift = (
             (shifts / nearest)[:, None]
             * (1 + np.abs(seen[:, :2] / seen[:, 2:]))
             * camera.focal_lengths
         )
         half = np.array([camera.width - 1, camera.height - 1]) / 2 - EDGE_PX
-        if (angle >= np.arccos(GRAZING)).any() or (np.abs(use[:, 1:]) + moved / half >= 1).any():
+        if (angle >= np.arccos(GRAZING)).any() or (
+            np.abs(use[:, 1:]) + image_shift / half >= 1
+        ).any():
             return False
     return True
 
@@ -256,14 +258,14 @@ class MotionConstraints:
         joints = joint_coordinates(geometry, self._pose)
         velocities = pose_jacobian(geometry, self._pose) @ self._rate
         legs = tuple(f"leg {k}" for k in range(1, len(geometry.legs) + 1))
-        away = self._pose - geometry.home_pose
+        offset = self._pose - geometry.home_pose
         least = settings.least_leverage
         most = settings.most_condition
         count = len(legs)
         self.limits = [
             Limit(
                 "box",
-                away[list(chart.freedoms)] / self.box,
+                offset[list(chart.freedoms)] / self.box,
                 tuple(self.box),
                 "",
                 chart.coordinate_names,
@@ -282,9 +284,9 @@ class MotionConstraints:
                 for side in ("left", "right")
                 for what in ("incidence", "across", "up")
             ]
-            uses = visibility_shares(sight, stickers, self._pose)
+            shares = visibility_shares(sight, stickers, self._pose)
             limit = (1.0,) * len(names)
-            self.limits.append(Limit("visibility", uses, limit, " of the limit", tuple(names)))
+            self.limits.append(Limit("visibility", shares, limit, " of the limit", tuple(names)))
 
     @cached_property
     def shares(self) -> ca.Function:
@@ -353,7 +355,7 @@ def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
 def check_periods(settings: Excitation) -> None:
     """Raise TrajectoryError if a run is not a whole number of periods.
 
-    Such a run would not end at home and at rest.
+    Another run would not end at home and at rest.
     """
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz

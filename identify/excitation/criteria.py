@@ -4,13 +4,13 @@ A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, nam
 `identify.own_parts` or given as ``module:function``. `typical` is the z of a trajectory that
 excites all parameters. It can be used to scale the criterion.
 
-Let H be the stacked regressor of m samples, with one column for each of the p parameters. The
-observability index is the geometric mean of the singular values of H over sqrt(m). Only the columns
+Let H be the stacked regressor of N samples, with one column for each of the p parameters. The
+observability index is the geometric mean of the singular values of H over sqrt(N). Only the columns
 of the base parameters are linearly independent: H = H_1 C with the pivot columns H_1 and the base
 combinations C (rank, p). The product of the nonzero singular values is therefore
 sqrt(det(H_1^T H_1) det(C C^T)), for any choice of pivots, and
 
-    ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
+    ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(N) / 2.
 
 The rank (zeta in the paper) depends on the robot and not on the trajectory, so all trajectories are
 judged on the same subspace. As in the paper, the columns of H are not scaled, and the gains of the
@@ -21,8 +21,8 @@ trajectory `typical`. This removes the units of the parameters and makes H_1^T H
 The inverse of R is rounded to numbers on which all processors agree. The logarithm of the
 determinant of this rounded inverse is then subtracted, so that the index does not change.
 
-A run of whole periods is sampled over one period, because the index does not depend on their
-number. Any other run is sampled from start to end.
+A run of whole periods is sampled over one period, because the index does not depend on the number
+of periods. Any other run is sampled from start to end.
 """
 
 from collections.abc import Callable
@@ -85,17 +85,17 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
     if is_plugin_name(name):
         known = (ScenarioError, TrajectoryError)
         part = f"excitation.criterion {name!r}"
-        make = PluginFunction(part, make, ScenarioError, known, _check_made)
-        made: Criterion = make(robot, scenario, unknowns, typical)
-        judge = made.judge and PluginFunction(
-            f"judge of {part}", made.judge, ScenarioError, known, _judged
+        make = PluginFunction(part, make, ScenarioError, known, _check_criterion)
+        criterion: Criterion = make(robot, scenario, unknowns, typical)
+        judge = criterion.judge and PluginFunction(
+            f"judge of {part}", criterion.judge, ScenarioError, known, _check_judgement
         )
-        return replace(made, judge=judge)
+        return replace(criterion, judge=judge)
     return cast(Criterion, make(robot, scenario, unknowns, typical))
 
 
-def _check_made(part: str, made: object, *given: Any) -> None:
-    """Raise ScenarioError if the object made by a user's own function is not a criterion of z.
+def _check_criterion(part: str, made: object, *given: Any) -> None:
+    """Raise ScenarioError if the object that a user's own function made is no criterion of z.
 
     given: arguments of the function, which are robot, scenario, unknowns and typical z.
     """
@@ -116,7 +116,7 @@ def _check_made(part: str, made: object, *given: Any) -> None:
         raise ScenarioError(f"{part} must have a function for judge, or None")
 
 
-def _judged(part: str, value: object, trajectory: FourierTrajectory) -> None:
+def _check_judgement(part: str, value: object, trajectory: FourierTrajectory) -> None:
     """Raise ScenarioError if the value of a user's own judge is not a finite number."""
     if not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
         raise ScenarioError(f"{part} must return a finite number, returned {value!r}")

@@ -46,11 +46,10 @@ def admissible_trajectories(
     seed: np.random.SeedSequence,
     check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
-    """Draw random trajectories within the travel and without singularities that pass `check`.
+    """Draw random trajectories that pass `check`, within the travel and without singularities.
 
-    The travel is the robot's travel minus the scenario's margin.
-
-    Raises TrajectoryError, with the last reason, if too few trajectories are admissible.
+    The travel is the robot's travel minus the scenario's margin. Raises TrajectoryError, with the
+    last reason, if too few trajectories are admissible.
     """
     rng = np.random.default_rng(seed)
     # The samples are denser than in a search, because limits can be violated between them.
@@ -138,7 +137,7 @@ class Design:
         for z in pool:
             values.append(-float(criterion.value(z)))
             advance()
-        # A stable order keeps the result the same where values are equal.
+        # With a stable sort, the order of equal values is the same on all machines.
         best_first = [pool[k] for k in np.argsort(values, kind="stable")]
         return SearchProblem(self.settings, free, self.limits, criterion, best_first)
 
@@ -148,7 +147,7 @@ def design_trajectories(
 ) -> TrajectorySet:
     """Design the exciting trajectory and the validation trajectories.
 
-    Each kind has its own stream of the seed.
+    Excitation and validation have separate random streams.
 
     Raises ScenarioError if there is no such criterion. Raises TrajectoryError if no random
     trajectory of this amplitude is within the limits, if a search needs a whole number of periods
@@ -178,10 +177,10 @@ def design_trajectories(
 
 def unseen_trajectories(design: Design, seed: int) -> tuple[FourierTrajectory, ...]:
     """Return the validation trajectories. They are random, without a search."""
-    drawn = child(seed, UNSEEN)
+    stream = child(seed, UNSEEN)
     unseen = design.unseen
     return tuple(
         admissible_trajectories(
-            design.robot, design.settings, unseen.duration_s, unseen.count, drawn, design.check
+            design.robot, design.settings, unseen.duration_s, unseen.count, stream, design.check
         )
     )

@@ -5,21 +5,21 @@ Sigma the covariance that the sensor states. With the prior (initial guess, the 
 single parameters, scale anchor),
 
     W = sum over frames J^T Sigma^-1 J + prior,
-    D = (det(S W S))^(1 / (2 p)),    S = diag(prior deviations).
+    D = (det(P W P))^(1 / (2 p)),    P = diag(prior standard deviations).
 
 D is the factor by which the experiment reduces the prior standard deviations, as a geometric mean
-over all directions of the parameter space. It has no unit. Motion due to the sensor's noise in the
-servo is neglected.
+over all directions of the parameter space. It has no unit. The motion that the sensor's noise
+causes through the servo is neglected.
 
-The simulation gives D of a trajectory, but no exact derivative with respect to it. Searches
-therefore use D in the loop linearised about rest at home. Let s = i omega, C = kp + kd s + ki / s
-the servo, L = lp + ld s + li / s the joint PID, and t_d the latency plus half a frame of hold. The
-pose x follows a torque error d (joints) as
+The simulation gives D of a trajectory, but no exact derivative of D with respect to the trajectory.
+Searches therefore use D in the loop linearised about rest at home. Let s = i omega, C = kp + kd s +
+ki / s the servo, L = lp + ld s + li / s the joint PID, and t_d the latency plus half a frame of
+hold. An error d of the joint torques moves the pose x by
 
     x = -S d,
     S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
 
-where E maps pose rates to twists. It follows a reference x_d as
+where E maps pose rates to twists. The pose follows a reference x_d as
 
     x = T x_d,    T = S L J_theta C exp(-s t_d).
 
@@ -171,7 +171,7 @@ def torque_response(
 ) -> ComplexArray:
     """Return S (K, m, n), coordinates per torque or force, at s = i omega (K,) [1/s].
 
-    The parameters have shape (p,). No s must be zero.
+    The parameters have shape (p,). No entry of s may be zero.
     """
     home = robot.home_pose
     xi = parameters[robot.layout.dynamic]
@@ -257,8 +257,8 @@ def sensitivity_spectrum(
     s = harmonics(unknowns)
     response = torque_response(robot, parameters, settings, s)
     tracking = tracking_response(robot, parameters, settings, s[: unknowns.harmonics])
-    moved = tracked_motion(unknowns, z, times, tracking)
-    sampled = regressor(robot, smoothing, "torque").map(len(times))(*moved)
+    followed = tracked_motion(unknowns, z, times, tracking)
+    sampled = regressor(robot, smoothing, "torque").map(len(times))(*followed)
     waves = np.exp(-np.outer(times, s)) * 2 / len(times)
     transform = np.stack([waves.real, waves.imag], axis=-1).reshape(len(times), -1)
     dynamic = parameters[robot.layout.dynamic]
@@ -268,12 +268,12 @@ def sensitivity_spectrum(
     spectrum = ca.reshape(waved, count, 2 * joints * len(s))
     error = 1 / pid_response(robot, parameters, s)
     torque = ca.DM(dynamic).T @ spectrum
-    kinds = [response * f[:, None, :] for f in (error, error / s[:, None], error * s[:, None])]
+    by_gain = [response * f[:, None, :] for f in (error, error / s[:, None], error * s[:, None])]
     # the gain of one joint acts on the error of this joint alone
     parts = (
-        [kind * own for own in np.eye(joints) for kind in kinds]
+        [response_of * own for own in np.eye(joints) for response_of in by_gain]
         if robot.layout.own_gains
-        else kinds
+        else by_gain
     )
     gains = [torque @ _real_filter(part) for part in parts]
     return ca.vertcat(-spectrum @ _real_filter(response), *gains)

@@ -118,7 +118,7 @@ SAMPLES_PER_HARMONIC = 20
 def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> Array:
     """Return instants (N,) [s] over one period of the fundamental.
 
-    They exclude the ends of the period, at which the robot rests.
+    They exclude both ends of the period, where the robot rests.
     """
     count = refinement * SAMPLES_PER_HARMONIC * harmonics
     return np.asarray((np.arange(count) + 0.5) / (count * fundamental_hz), dtype=float)
@@ -182,11 +182,11 @@ def tracked_motion(
         amplitude = np.exp(s * times)[:, None, None] * np.kron(followed @ box, coefficient)
         for derivative, total in enumerate(maps):
             total += (s**derivative * amplitude).real
-    moved = []
+    arrays = []
     for total in maps:
         lifted = agreed(unknowns.chart.lifted(total, axis=1), RESPONSE_BITS)
-        moved.append(ca.reshape(ca.DM(lifted.reshape(-1, unknowns.size)) @ z, 6, len(times)))
-    offset, rate, acceleration = moved
+        arrays.append(ca.reshape(ca.DM(lifted.reshape(-1, unknowns.size)) @ z, 6, len(times)))
+    offset, rate, acceleration = arrays
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
@@ -213,10 +213,10 @@ def regressor(
     along = jacobian @ free
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
     if of == "torque":
-        whole = ca.horzcat(ca.solve(along.T, rigid), friction)
+        columns = ca.horzcat(ca.solve(along.T, rigid), friction)
     else:
-        whole = ca.horzcat(rigid, along.T @ friction)
-    return ca.Function("regressor", [pose, rate, acceleration], ca.cse([ca.densify(whole.T)]))
+        columns = ca.horzcat(rigid, along.T @ friction)
+    return ca.Function("regressor", [pose, rate, acceleration], ca.cse([ca.densify(columns.T)]))
 
 
 @lru_cache(maxsize=4)

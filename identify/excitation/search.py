@@ -60,14 +60,14 @@ class SearchProblem:
         return sample_times(self.unknowns.fundamental_hz, self.unknowns.harmonics, CHECK_REFINEMENT)
 
     def worst(self, z: Array) -> list[WorstCase]:
-        """Return the instants of the check at which z comes nearest to each limit."""
+        """Return, for each limit, the instant of the check at which z comes nearest to it."""
         return self.constraints.worst(self.unknowns.trajectory(z), self.check_times)
 
     def is_admissible(self, z: Array) -> bool:
         """Return whether z is within all limits, with the clearance."""
         return all(w.share <= 1 - CLEARANCE for w in self.worst(z))
 
-    def drawn_in(self, z: Array) -> Array:
+    def shrunk_inside(self, z: Array) -> Array:
         """Return the largest admissible multiple of z with a factor of at most one.
 
         A smaller factor shrinks the motion towards the home pose, which is admissible. Raises
@@ -169,12 +169,12 @@ def evolve(
             f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least "
             f"{FEWEST_MEMBERS}"
         )
-    filling = _ScaledPopulation(problem)
+    population = _ScaledPopulation(problem)
     with progress.stage("evolutionary search", generations) as advance:
         found = differential_evolution(
-            filling.cost,
+            population.cost,
             bounds=[(-1.0, 1.0)] * problem.unknowns.size,
-            init=np.array([filling.member(z) for z in candidates[:MOST_MEMBERS]]),
+            init=np.array([population.member(z) for z in candidates[:MOST_MEMBERS]]),
             maxiter=generations,
             tol=STALLED,
             # SciPy's polish needs gradients, but this cost has a jump at every limit.
@@ -183,7 +183,7 @@ def evolve(
             rng=np.random.default_rng(seed),
             callback=lambda intermediate_result: advance(),
         )
-    z = problem.drawn_in(filling.fill(found.x))
+    z = problem.shrunk_inside(population.fill(found.x))
     reason = "values no longer spread" if found.success else f"{found.nit} generations"
     return SearchResult(z, problem.value(z), found.nfev, 0, found.nit, reason)
 
@@ -239,7 +239,7 @@ FAR = 0.5
 """Used share of a limit below which the limit is ignored at first."""
 
 ALWAYS = "box"
-"""Limit that is always included. Without it a criterion would be unbounded."""
+"""Limit that is always included, because a criterion is unbounded without it."""
 
 
 STARTS = 3
@@ -270,7 +270,7 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
     reasons = []
     with progress.stage("gradient search", len(starts)) as advance:
         for start in starts:
-            result = _climb_from(problem, INTERIOR * problem.drawn_in(agreed(start)))
+            result = _climb_from(problem, INTERIOR * problem.shrunk_inside(agreed(start)))
             reasons.append(result.reason)
             if np.isfinite(result.log_value):
                 found.append(result)
@@ -286,26 +286,26 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
 
 def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
     """Return the result of IPOPT from one start. Its value is -inf if IPOPT failed."""
-    counted = {ALWAYS} | _used(problem, z, FAR)
+    included = {ALWAYS} | _used(problem, z, FAR)
     values = gradients = iterations = 0
     while True:
-        solver = _solver(problem, counted)
-        done, stats = _solve(solver, z)
+        solver = _solver(problem, included)
+        answer, stats = _solve(solver, z)
         values += int(stats["n_call_nlp_f"])
         gradients += int(stats["n_call_nlp_grad_f"])
         iterations += int(stats["iter_count"])
         reason = str(stats["return_status"])
-        found = np.array(done["x"]).ravel()
-        if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
+        found = np.array(answer["x"]).ravel()
+        if not np.isfinite(found).all() or not np.isfinite(float(answer["f"])):
             return SearchResult(z, -np.inf, values, gradients, iterations, reason)
-        broken = _used(problem, found, 1.0) - counted
-        admissible = problem.drawn_in(found)
+        broken = _used(problem, found, 1.0) - included
+        admissible = problem.shrunk_inside(found)
         if not broken:
             return SearchResult(
                 admissible, problem.value(admissible), values, gradients, iterations, reason
             )
         # Continue from a point inside all limits, and include the violated limits.
-        counted = counted | broken
+        included = included | broken
         z = INTERIOR * admissible
 
 
@@ -322,11 +322,11 @@ def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:
     return {worst.name for worst in problem.worst(z) if not worst.share <= share}
 
 
-def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
-    """Return an IPOPT solver with the used shares of the limits `counted` between -1 and 1."""
+def _solver(problem: SearchProblem, included: set[str]) -> ca.Function:
+    """Return an IPOPT solver with the used shares of the limits `included` between -1 and 1."""
     z = ca.MX.sym("z", problem.unknowns.size)
     poses, rates, _ = motion(problem.unknowns, z, problem.times)
-    shares = problem.constraints.shares_of(counted).map(len(problem.times))(poses, rates)
+    shares = problem.constraints.shares_of(included).map(len(problem.times))(poses, rates)
     options: dict[str, Any] = {
         "print_time": False,
         "ipopt": {
