@@ -15,12 +15,16 @@ def diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
     if entry is None:
         return ()
     remedies = [text for one in entry["findings"] for text in one["remedies"]]
-    asked = (
+    introduction = (
         "The residuals of the model were examined for their cause. Each possible cause is judged "
         "by the share of the misfit that it explains in addition to the parameters. Causes that "
         "are not explained by chance are fitted, one after the other."
     )
-    return (asked, f"Diagnosis: {entry['says']}.", *(f"Remedy: {text}." for text in remedies))
+    return (
+        introduction,
+        f"Diagnosis: {entry['says']}.",
+        *(f"Remedy: {text}." for text in remedies),
+    )
 
 
 def diagnosis_table(result: dict[str, Any]) -> Table:

@@ -67,17 +67,19 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
 
     It does if the residuals are no larger than noise alone makes them, and are white.
     """
-    found = result.get("identification", {})
+    identification = result.get("identification", {})
     goals = []
-    if "noise_ratio_std" in found:
-        ratio, expected, std = (math.nan if found[key] is None else found[key] for key in MISFIT)
+    if "noise_ratio_std" in identification:
+        ratio, expected, std = (
+            math.nan if identification[key] is None else identification[key] for key in MISFIT
+        )
         text = (
             "mean square of measured minus identified pose, in units of the noise that the cameras "
-            f"state; noise alone leaves {expected:.3f} ± {std:.3f}"
+            f"state; noise alone gives {expected:.3f} ± {std:.3f}"
         )
         goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "× noise", text))
-    if "whiteness" in found:
-        chance = found["whiteness"]["p_value"]
+    if "whiteness" in identification:
+        chance = identification["whiteness"]["p_value"]
         percent = math.nan if chance is None else 100 * chance
         text = "probability that noise alone gives residuals with such a dependence between frames"
         goals.append(Goal(CHANCE, percent, ">=", 100 * SUSPICIOUS, "%", text))

@@ -43,15 +43,15 @@ def interval(low: float, high: float) -> str:
     return _to_the_second_digit((low, high), width, " to ")
 
 
-def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -> str:
-    """Format two values to the second digit of the number ``of``.
+def _to_the_second_digit(values: tuple[float, float], leading: float, between: str) -> str:
+    """Format two values to the second digit of the number ``leading``.
 
     Small or large values get a common power of ten.
     """
     power = math.floor(math.log10(max(map(abs, values))))
     # Numbers of everyday size are written without a power.
     power = 0 if -4 < power < LONG else power
-    places = max(0, 1 - math.floor(math.log10(of)) + power)
+    places = max(0, 1 - math.floor(math.log10(leading)) + power)
     # Adding zero turns a negative zero into a positive one.
     texts = [f"{value / 10**power + 0.0:.{places}f}" for value in values]
     text = between.join(texts).replace("-", "−")

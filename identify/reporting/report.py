@@ -87,7 +87,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
 
     ``drawings`` holds the pictures as HTML elements, by their names.
     """
-    said = verdict(data.result, data.cameras_consistent)
+    judgement = verdict(data.result, data.cameras_consistent)
     goals = check_goals(data.result)
     return (
         page_environment()
@@ -95,7 +95,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
         .render(
             title=f"Identification of {data.robot}",
             subtitle=_subtitle(data.result),
-            verdict=said,
+            verdict=judgement,
             numbers=key_numbers(data.result),
             goals=goals_table(data.result),
             missed=sum(not goal.passed for goal in goals),
@@ -144,10 +144,10 @@ def image_element(png: bytes) -> str:
     """Return an <img> element with a PNG image, reduced to the size for a page."""
     stream = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
-        whole = image.convert("RGB")
-        whole.thumbnail((WIDEST_PX, WIDEST_PX))
-        whole.save(stream, "webp", quality=QUALITY)
-    width, height = whole.size
+        reduced = image.convert("RGB")
+        reduced.thumbnail((WIDEST_PX, WIDEST_PX))
+        reduced.save(stream, "webp", quality=QUALITY)
+    width, height = reduced.size
     data = base64.b64encode(stream.getvalue()).decode()
     return f'<img alt="" width="{width}" height="{height}" src="data:image/webp;base64,{data}">'
 

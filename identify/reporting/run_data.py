@@ -131,10 +131,8 @@ class RunData:
 
         It is the true pose if that is known, and the reference otherwise.
         """
-        measured = (
-            intended_motion(self.experiment) if self.truth is None else true_poses(self.truth)
-        )
-        return measured[len(measured) // 2]
+        motion = intended_motion(self.experiment) if self.truth is None else true_poses(self.truth)
+        return motion[len(motion) // 2]
 
     @cached_property
     def excitation_fit(self) -> Fit:

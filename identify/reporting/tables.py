@@ -39,7 +39,7 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Flags of the columns with words instead of numbers."""
+        """Marks of the columns that hold words instead of numbers."""
         # Signs and dashes are typographic, as written by `number`.
         numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
         columns = zip(*self.rows, strict=True)
@@ -283,10 +283,10 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
     """
     identification = result["identification"]
     kinds = {"parameters": "parameters", "groups": "sums of them that the motion depends on"}
-    entries = {said: identification.get(kind, {}).values() for kind, said in kinds.items()}
+    entries = {words: identification.get(kind, {}).values() for kind, words in kinds.items()}
     counts = [
-        f"{sum(bool(one['identifiable']) for one in of)} of {len(of)} {said}"
-        for said, of in entries.items()
+        f"{sum(bool(one['identifiable']) for one in found)} of {len(found)} {words}"
+        for words, found in entries.items()
     ]
     typer.echo(
         f"identified: {' and '.join(counts)}, in {number(result['seconds'].get('identify'))} s"

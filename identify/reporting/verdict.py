@@ -77,9 +77,9 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     ``consistent`` is the result of `cameras_consistent`: true if the cameras cannot be the cause of
     the residuals.
     """
-    every = check_goals(result)
+    judged = check_goals(result)
     unseen = bool(result.get("validation"))
-    missed = [goal for goal in every if not goal.passed]
+    missed = [goal for goal in judged if not goal.passed]
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, consistent)]
     if unseen:
@@ -98,7 +98,7 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
         return Verdict(True, "The identified model moves as the true robot does.", tuple(sentences))
     if not explained:
         return Verdict(False, _disagreement(consistent, result), tuple(sentences))
-    counted = f"{len(missed)} of {len(every)} goals {'is' if len(missed) == 1 else 'are'} not met."
+    counted = f"{len(missed)} of {len(judged)} goals {'is' if len(missed) == 1 else 'are'} not met."
     return Verdict(False, f"The model explains the record, but {counted}", tuple(sentences))
 
 
@@ -129,37 +129,37 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
         if known
         else "parameters are identified."
     )
-    shown = KeyNumber(f"{known}", f"of {len(parameters)}", meaning)
+    identified = KeyNumber(f"{known}", f"of {len(parameters)}", meaning)
     if validation:
         rows = np.array([rms_row(run["true"])[:3] for run in validation])
-        worst = KeyNumber(
+        predicted = KeyNumber(
             number(float(rows.max()), 2),
             "µm",
             "error of the identified model on validation trajectories, against the true robot.",
         )
         measured = max(rms_row(result["sensor"])[:3])
-        seen = KeyNumber(
+        measurement = KeyNumber(
             number(measured, 2), "µm", "error of one measured pose, against the true pose."
         )
-        return [worst, seen, shown]
+        return [predicted, measurement, identified]
     before = max(rms_row(result.get("before"))[:3])
     after = max(rms_row(result.get("after"))[:3])
-    left = KeyNumber(
+    fitted = KeyNumber(
         number(after, 2), "µm", "between the identified model and the measured poses of the record."
     )
     if np.isfinite(before):
         meaning = "between the initial model and the same poses."
-        began = KeyNumber(number(before, 2), "µm", meaning)
+        initial = KeyNumber(number(before, 2), "µm", meaning)
     else:
-        began = KeyNumber("–", "", "The initial model is unstable.")
-    return [left, began, shown]
+        initial = KeyNumber("–", "", "The initial model is unstable.")
+    return [fitted, initial, identified]
 
 
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     """State the errors of both models against the true robot on validation trajectories."""
     runs = result["validation"]
     identified = np.array([rms_row(run.get("true")) for run in runs])
-    started = np.array([rms_row(run.get("initial_true")) for run in runs])
+    initial = np.array([rms_row(run.get("initial_true")) for run in runs])
     turns = bool((identified[:, 3:] != 0).any())
     text = f"On {len(runs)} validation trajectories, the identified model "
     if np.isfinite(identified).all():
@@ -170,8 +170,8 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
         text += "is unstable"
     if not all("initial_true" in run for run in runs):
         return f"{text}."
-    if np.isfinite(started).all():
-        return f"{text}; the initial model is off by {_distance(started, turns)}."
+    if np.isfinite(initial).all():
+        return f"{text}; the initial model is off by {_distance(initial, turns)}."
     return f"{text}; the initial model is unstable."
 
 

@@ -65,7 +65,7 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
     said = (
         "identified: 4 of 5 parameters and 1 of 1 sums of them that the motion depends on",
         "residuals of the model: 1.356 × noise: mean square of",
-        "noise alone leaves 1.100 ± 0.040",
+        "noise alone gives 1.100 ± 0.040",
         "the model does NOT explain the record: the model is wrong, or the errors of the cameras "
         "exceed their stated noise",
         str(run_folder.result),

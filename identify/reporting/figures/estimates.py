@@ -120,10 +120,10 @@ def group_figure(
             n: weight * (parameters[n]["initial"] or 0.0)
             for n, weight in group["coefficients"].items()
         }
-        whole = sum(abs(part) for part in parts.values()) or 1.0
+        total = sum(abs(part) for part in parts.values()) or 1.0
         # The share is signed; the dot is filled or open accordingly.
         for name, part in parts.items():
-            shares[row, columns.index(name)] = part / whole
+            shares[row, columns.index(name)] = part / total
     # Parameters with an initial guess of zero have no share in any sum.
     used = [k for k in range(len(columns)) if shares[:, k].any()]
     labels = [
@@ -192,7 +192,7 @@ def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
     }
 
 
-def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
+def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> None:
     """Draw a legend of the dots above the panel."""
     # Empty plots put entries into the legend without drawing anything.
     for size in sizes:
@@ -202,6 +202,6 @@ def _key(axes: Axes, sizes: Sequence[float], of: str, negative: str) -> None:
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
         ncols=len(sizes) + 1,
-        title=f"{of}:",
+        title=f"{meaning}:",
         alignment="left",
     )

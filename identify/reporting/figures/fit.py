@@ -150,19 +150,21 @@ class Fit:
         not known, they are the errors of the models against the measurement.
         """
         if self.truth is None:
-            goal = self.measured
-            whose = ", against the measurement"
+            reference = self.measured
+            suffix = ", against the measurement"
         else:
-            goal = self.truth
-            whose = ""
+            reference = self.truth
+            suffix = ""
         poses: dict[str, tuple[Array | None, dict[str, Any]]] = {
-            f"initial model{whose}": (self.initial, STARTING),
-            f"identified model{whose}": (self.identified, IDENTIFIED),
+            f"initial model{suffix}": (self.initial, STARTING),
+            f"identified model{suffix}": (self.identified, IDENTIFIED),
         }
         if self.truth is not None:
             poses = {"measured poses": (self.measured, NOISE)} | poses
         return [
-            Curve(name, 1e6 * np.linalg.norm((model - goal)[:, first : first + 3], axis=1), drawn)
+            Curve(
+                name, 1e6 * np.linalg.norm((model - reference)[:, first : first + 3], axis=1), drawn
+            )
             for name, (model, drawn) in poses.items()
             if model is not None
         ]
@@ -287,14 +289,14 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
                 **look,
             )
             # Marks of all three components look the same, and need only one entry in the legend.
-            said = i == first
+            labelled = i == first
             axes.plot(
                 places,
                 measured,
                 "_",
                 color=INK,
                 markersize=9,
-                label="against the measurement" if said else None,
+                label="against the measurement" if labelled else None,
             )
             axes.plot(
                 places,
@@ -302,7 +304,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
                 "D",
                 color=INK,
                 fillstyle="none",
-                label="predicted" if said else None,
+                label="predicted" if labelled else None,
             )
         axes.axhline(
             limit,
