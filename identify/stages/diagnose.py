@@ -48,7 +48,7 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
 
 
 def with_diagnosis(result: dict[str, Any], found: Diagnosis) -> dict[str, Any]:
-    """Return a result with a diagnosis, and its warning in place of an earlier one's."""
+    """Return a result with a diagnosis, whose warnings replace those of an earlier diagnosis."""
     identification = result["identification"]
     earlier = (result.get(ENTRY) or {}).get("warnings", [])
     kept = [text for text in identification["warnings"] if text not in earlier]

@@ -100,14 +100,15 @@ def identify_own(
 
 
 LITTLE = 0.1
-"""Excess of the residual under the logged commands, as a share of the noise, that is not asked.
+"""Largest excess of the residual for which no causes are asked, as a share of the noise.
 
-Errors of teaching that count as exact leave as much.
+The residual is that under the logged commands. Errors of teaching that count as exact cause as
+much.
 """
 
 
 def _is_missed(result: IdentificationResult) -> bool:
-    """Return whether the model misses its records by so much that causes are asked."""
+    """Return whether the residuals exceed the noise by so much that causes are asked for."""
     excess = result.driven_misfit.found - (1 + LITTLE) * result.driven_misfit.expected
     return result.misfit.significant or result.whiteness.suspicious or excess > 0
 
@@ -129,21 +130,21 @@ def _identified_files(
     robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     diagnosis = None
-    # Causes are asked of joint commands, one per frame.
+    # Causes are known only for records with joint commands, one per frame.
     in_frames = result.drive.in_loop and not any(map(recording.is_timed, records.values()))
     if in_frames and _is_missed(result):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnose(list(records.values()), result, robot, scenario)
             advance()
-    seen = next(iter(records.values()))
+    first = next(iter(records.values()))
     # The models run with the identified drive law.
     side = model_side(robot, scenario).with_drive(result.drive.law)
     before, after = (
-        model_on_record(side, values, seen) for values in (result.initial, result.estimate)
+        model_on_record(side, values, first) for values in (result.initial, result.estimate)
     )
     ended = time.perf_counter()
-    measured = recording.poses(seen, "measured")
-    ok = seen["measured_ok"].values.astype(bool)
+    measured = recording.poses(first, "measured")
+    ok = first["measured_ok"].values.astype(bool)
     covariance = result.whole_covariance
     # Later stages check by these digests whether the result belongs to its files.
     made_of = {name: digest(one) for name, one in records.items()} | {
@@ -151,7 +152,7 @@ def _identified_files(
     }
     files = {}
     if seed is None:
-        runs = model_groups(build_model_run(seen["time"].values, before, after))
+        runs = model_groups(build_model_run(first["time"].values, before, after))
         files[run_folder.model] = netcdf(runs)
         made_of["model.nc"] = digest(runs)
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
@@ -161,15 +162,15 @@ def _identified_files(
         "scenario": scenario.name,
         "seed": seed,
         "settings": scenario.estimator_settings(),
-        "date": str(seen.attrs.get("created", ""))[:10] or None,
+        "date": str(first.attrs.get("created", ""))[:10] or None,
         "versions": versions(),
         ENTRY: made_of,
         "seconds": {
-            "record": seen.attrs.get("record_seconds"),
+            "record": first.attrs.get("record_seconds"),
             "identify": ended - began,
             **seconds,
         },
-        DRIFT: read_finding(seen),
+        DRIFT: read_finding(first),
         "identification": result.to_dict(),
         "before": rms_figures(before - measured, ok),
         "after": rms_figures(after - measured, ok),

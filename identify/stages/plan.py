@@ -53,8 +53,9 @@ def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[s
     began = time.perf_counter()
     calibration, setup = _calibrated(setup, progress)
     calibrated_at = time.perf_counter()
+    # Errors of plant, sensor and OpenGL are raised before the search for a trajectory, which takes
+    # long.
     _ = setup.plant, setup.sensor
-    # Missing OpenGL is reported before the search for a trajectory, which takes long.
     if setup.scenario.renderer in ("pyrender", "scene"):
         cmmsim.require_opengl()
     trajectories = _designed(setup, progress)

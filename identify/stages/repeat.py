@@ -24,8 +24,8 @@ def designed_runs(
     Raises the errors of the stages `excite` and `record`.
     """
     # Separate seeds make these runs independent of the experiment's runs.
-    own = stream_seed(setup.seed, DESIGN)
-    seeds = [stream_seed(own, number) for number in range(count)]
+    stream = stream_seed(setup.seed, DESIGN)
+    seeds = [stream_seed(stream, number) for number in range(count)]
     trajectories = []
     with (
         progress.stage("design the runs", count) as advance,
@@ -36,12 +36,12 @@ def designed_runs(
             advance()
     duration_s = setup.scenario.excitation.duration_s
     # These runs replace the validation runs, so the records state their duration as such.
-    lasting = setup.scenario.with_overrides({"validation.duration_s": duration_s})
-    setup = replace(setup, scenario=lasting, seed=own)
+    scenario = setup.scenario.with_overrides({"validation.duration_s": duration_s})
+    setup = replace(setup, scenario=scenario, seed=stream)
     plan = setup.sensor_plan
-    taught = plan.taught(setup.robot, own, progress).taught
+    taught = plan.taught(setup.robot, stream, progress).taught
     paths = tuple(trajectories)
-    return run_unseen(setup.plant, plan, taught, paths, duration_s, own, workers, progress)
+    return run_unseen(setup.plant, plan, taught, paths, duration_s, stream, workers, progress)
 
 
 def _designed(setup: Setup, seed: int) -> FourierTrajectory:

@@ -76,16 +76,18 @@ def validate(
         setup.plant, plan, taught, trajectories.validation, duration_s, seed, workers, progress
     )
     records = [files.experiment, *(run.record for run in runs)]
-    model_poses = [[model_on_record(side, values, seen) for values in models] for seen in records]
-    found = result["identification"].get("nuisance_estimates", {})
-    predictions = predicted_runs(side, records[1:], models[1], covariance, seed, progress, found)
+    model_poses = [
+        [model_on_record(side, values, record) for values in models] for record in records
+    ]
+    learned = result["identification"].get("nuisance_estimates", {})
+    predictions = predicted_runs(side, records[1:], models[1], covariance, seed, progress, learned)
     # The exciting run was used for the fit, so there is no prediction for it.
     deviations = [None, *(prediction.std for prediction in predictions)]
-    drawn = [
-        build_model_run(seen["time"].values, initial, identified, std)
-        for seen, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
+    of_models = [
+        build_model_run(record["time"].values, initial, identified, std)
+        for record, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
     ]
-    model_runs = model_groups(drawn[0], drawn[1:])
+    model_runs = model_groups(of_models[0], of_models[1:])
     pairs = [(files.experiment, excitation_truth), *((run.record, run.truth) for run in runs)]
     result["sensor"] = sensor_entry(pairs)
     result["validation"] = [

@@ -26,13 +26,13 @@ def check_memory(study: Study, shared: Shared, workers: int) -> None:
     case = Case(0, 0, longest)
     options = kind.checked(shared.row_options(case))
     needed = PROCESS + kind.memory(Setup(shared.row_scenario(case)), options)
-    there = psutil.virtual_memory().total
-    if workers * needed > there:
-        fit = int(there // needed)
+    available = psutil.virtual_memory().total
+    if workers * needed > available:
+        fit = int(available // needed)
         raise StudyError(
             f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in "
             f"{workers} processes "
-            f"{workers * needed / GB:.3g} GB, and this machine has {there / GB:.3g} GB: "
+            f"{workers * needed / GB:.3g} GB, and this machine has {available / GB:.3g} GB: "
             + (f"--workers {fit} fits" if fit else "shorten its rows")
         )
 

@@ -174,12 +174,12 @@ def _compute_pending(
     workers: Workers,
     shown: Callable[[], None],
 ) -> None:
-    left = len(design) - int(journal.finished.sum())
-    if not left:
+    missing = len(design) - int(journal.finished.sum())
+    if not missing:
         return
-    batches = Batches((design.case(number) for number in journal.pending()), left)
+    batches = Batches((design.case(number) for number in journal.pending()), missing)
     raise_interrupt()
-    with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
+    with workers() as execute, progress.stage(f"rows of {name}", missing) as advance:
         for finished in execute(shared, batches):
             journal.append(finished)
             advance(len(finished))

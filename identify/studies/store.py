@@ -98,9 +98,9 @@ class Journal:
         with written(self.path, safe):
             try:
                 os.lseek(self._file, self._end, os.SEEK_SET)
-                left = text
-                while left:  # one call may write only a part
-                    left = left[os.write(self._file, left) :]
+                unwritten = text
+                while unwritten:  # one call may write only a part
+                    unwritten = unwritten[os.write(self._file, unwritten) :]
                 os.fsync(self._file)
             except OSError:
                 os.ftruncate(self._file, self._end)

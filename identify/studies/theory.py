@@ -3,16 +3,16 @@
 A log-linear regression estimates how the mean square of a positive figure y depends on other
 quantities. The mean square is modelled as exp(X beta). The estimate solves X^T (y^2 / mean - 1) =
 0, the score equation of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989,
-section 8.3). The result is the scaling of the mean square itself, whatever the distribution of the
+section 8.3). The result is the scaling of the mean square itself, for any distribution of the
 figure. A straight line through logarithms would not give this scaling. The covariance is a sandwich
 estimate, so the figure can have another distribution in each row.
 
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
 need the number of independent errors in a row's figure, while this band uses the scatter of the
-figure over the rows. In simulations with two or more rows, figures were the rms of three or more
-normal numbers. The band contained the true rms in 95 to 97 % of cases. For figures that are single
-normal numbers, the worst case, it did so in at least 92 %. A single row has no band.
+figure over the rows. In simulations with two or more rows, the band contained the true rms in 95 to
+97 % of cases if the figures were the rms of three or more normal numbers, and in at least 92 % if
+they were single normal numbers, the worst case. A single row has no band.
 
 A law states an exponent or a ratio, with a tolerance. The law fails if no value within the
 tolerance lies in the 99 % interval of the measured value. Otherwise the law passes if the interval
@@ -264,7 +264,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     """Test whether the figure's mean square is proportional to factor ** (2 exponent)."""
     factor = _numeric(str(law.factor), frame)
-    design = np.column_stack([_beside(law, study, frame), 2.0 * np.log(factor)])
+    design = np.column_stack([_other_columns(law, study, frame), 2.0 * np.log(factor)])
     fit = scale_regression(law_data(law, frame) ** 2, design)
     low, high = fit.interval(design.shape[1] - 1, CONFIDENCE)
     expected = float(law.exponent or 0.0)
@@ -292,7 +292,7 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     place = chosen[law.factor].map(values.index).to_numpy(dtype=float)
     steps = np.column_stack([2.0 * (place >= k) for k in range(1, len(values))])
     fit = scale_regression(
-        law_data(law, chosen) ** 2, np.column_stack([_beside(law, study, chosen), steps])
+        law_data(law, chosen) ** 2, np.column_stack([_other_columns(law, study, chosen), steps])
     )
     low, middle, high = _smallest_step(fit, len(values) - 1)
     verdict = (
@@ -312,7 +312,7 @@ def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, floa
     return low, float(fit.coefficients[k]), fit.interval(k, CONFIDENCE)[1]
 
 
-def _beside(law: Law, study: Study, frame: pd.DataFrame) -> Array:
+def _other_columns(law: Law, study: Study, frame: pd.DataFrame) -> Array:
     """Return the columns of the design for all other factors.
 
     For a grid they are an indicator for each setting of the other factors. For a sample they are a

@@ -96,9 +96,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     sensor = plan.make(setup.robot, number, taught)
     design = setup.design
     duration = design.unseen.duration_s
-    drawn = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
+    stream = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
     trajectory = admissible_trajectories(
-        design.robot, design.settings, duration, 1, drawn, design.check
+        design.robot, design.settings, duration, 1, stream, design.check
     )[0]
     run = run_plant(setup.plant, sensor, trajectory, duration, number, 1)
     ok = run.record["measured_ok"].values.astype(bool)

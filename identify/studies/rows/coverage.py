@@ -49,7 +49,10 @@ def coverage(
     """
     held = intervals_hold(result, plant)
     errors = np.concatenate(
-        [true_poses(one.truth) - of.poses for one, of in zip(unseen, predicted, strict=True)]
+        [
+            true_poses(one.truth) - prediction.poses
+            for one, prediction in zip(unseen, predicted, strict=True)
+        ]
     )
     variances = np.concatenate([one.covariance for one in predicted])
     free = plant.nominal.geometry.chart.basis

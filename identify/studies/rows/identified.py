@@ -209,11 +209,11 @@ def recorded(setup: Setup, options: RecordOptions) -> Recorded:
     plant = setup.plant
     trajectories = designed_trajectories(setup, options.trajectory_seed)
     sensor = row_pose_sensor(setup, options)
-    how = (plant, sensor, trajectories.excitation, settings, number)
-    experiment = excitation_run(*how)
+    arguments = (plant, sensor, trajectories.excitation, settings, number)
+    experiment = excitation_run(*arguments)
     records = [experiment.record]
     if plant.runs.anchor == "payload":
-        records.append(excitation_run(*how, payload=setup.scenario.payload).record)
+        records.append(excitation_run(*arguments, payload=setup.scenario.payload).record)
     duration_s = setup.scenario.validation.duration_s
     unseen = [
         run_plant(plant, sensor, trajectory, duration_s, number, run)
@@ -230,11 +230,11 @@ def compute(
     plant = made.plant
     robot = plant.nominal
     records = [one.record for one in made.unseen]
-    asked = {"": scenario}
+    scenarios = {"": scenario}
     if options.unaware:
-        asked["unaware_"] = scenario.with_overrides({"identification.nuisances": []})
+        scenarios["unaware_"] = scenario.with_overrides({"identification.nuisances": []})
     row: Row = {}
-    for prefix, settings in asked.items():
+    for prefix, settings in scenarios.items():
         result = identify_record(made.records, robot, settings)
         # The model is run with the identified law of the drives.
         side = model_side(robot, settings).with_drive(result.drive.law)
@@ -268,9 +268,9 @@ def _unseen_figures(
     truth: true parameters (p,).
     """
     models = []
-    for of, one in zip(predicted, unseen, strict=True):
-        if of.slopes is not None:  # the prediction is already a run of the identified model
-            models.append((of.poses, of.slopes))
+    for prediction, one in zip(predicted, unseen, strict=True):
+        if prediction.slopes is not None:  # the prediction is already a run of the identified model
+            models.append((prediction.poses, prediction.slopes))
             continue
         reference = recorded_reference(one.record)
         latencies = logged_latencies(one.record, side.timing)

@@ -66,11 +66,11 @@ class KeysRead:
         )
 
     def __str__(self) -> str:
-        read, left = (
+        read, not_read = (
             ", ".join(f"{key}*" if key.endswith(".") else key for key in keys)
             for keys in (self.keys, self.excluding)
         )
-        return f"{read}{' but ' if left else ''}{left}"
+        return f"{read}{' but ' if not_read else ''}{not_read}"
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:

@@ -158,16 +158,16 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
             for k, motion in enumerate(unseen)
         ]
 
-    done = followed(options.law, model)
-    beside = followed("pid", model)
-    normalised = [one.normalised_squared_error(setup.nominal) for one in done]
+    runs = followed(options.law, model)
+    under_pid = followed("pid", model)
+    normalised = [one.normalised_squared_error(setup.nominal) for one in runs]
     known = [value for value in normalised if value is not None]
-    row = _figures(done, beside)
+    row = _figures(runs, under_pid)
     if options.compared:
         start, truth = (
             followed(options.law, known_model(plant, name)) for name in ("initial", "true")
         )
-        row |= _against(done, start, truth)
+        row |= _against(runs, start, truth)
     return row | ({"observer_normalised_error": float(np.mean(known))} if known else {})
 
 
@@ -193,20 +193,20 @@ def _rms(runs: list[TrackingRun], axes: slice) -> float:
 def _against(done: list[TrackingRun], start: list[TrackingRun], truth: list[TrackingRun]) -> Row:
     row: Row = {}
     for name, axes, unit in AXES:
-        own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
+        with_own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
         # If the platform lacks a coordinate, its error is zero, and the ratio is left out.
         if with_truth:
             row |= {
-                f"starting_{name}_excess_{unit}": with_start - own,
-                f"true_{name}_ratio": own / with_truth,
+                f"starting_{name}_excess_{unit}": with_start - with_own,
+                f"true_{name}_ratio": with_own / with_truth,
             }
     return row
 
 
-def _figures(done: list[TrackingRun], beside: list[TrackingRun]) -> Row:
+def _figures(done: list[TrackingRun], under_pid: list[TrackingRun]) -> Row:
     row: Row = {}
     for name, axes, unit in AXES:
-        own, pid = (_rms(runs, axes) for runs in (done, beside))
+        own, pid = (_rms(runs, axes) for runs in (done, under_pid))
         row |= {f"{name}_rms_{unit}": own, f"pid_{name}_rms_{unit}": pid}
         row |= {f"{name}_share_percent": 100.0 * own / pid} if pid else {}
     torque = np.concatenate([one.run.torque for one in done])
