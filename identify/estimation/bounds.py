@@ -13,8 +13,8 @@ inertial parameters" (IROS 2016). A full body is possible if its pseudo-inertia 
 definite. The search then uses log-Cholesky coordinates of the body, which need no bounds (see
 `dynamics.pseudo_inertia`).
 
-The covariance of an estimate is computed without bounds. Active bounds move the whole estimate away
-from the estimate without bounds, the unheld estimate. Linearised about the estimate, it is
+The covariance of an estimate is computed without bounds. Active bounds move all parameters away
+from the estimate without bounds, the unheld estimate. Linearised about the bounded estimate, it is
 
     unheld = estimate - W^-1 g,
 

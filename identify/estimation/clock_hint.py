@@ -43,8 +43,8 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
     except EstimationError:
         return ()
     parameters = found["command_driven"].solution.parameters
-    left = float(np.mean(np.concatenate([run.misses(parameters) for run in judged.runs]) ** 2))
-    if left > (1 - EXPLAINS) * misfit:
+    remaining = float(np.mean(np.concatenate([run.misses(parameters) for run in judged.runs]) ** 2))
+    if remaining > (1 - EXPLAINS) * misfit:
         return ()
     hints = []
     for number, (run, lacks) in enumerate(zip(judged.runs, unstated, strict=True), start=1):
@@ -55,7 +55,7 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
         of_record = f" of record {number}" if len(runs) > 1 else ""
         hints.append(
             f"the commands{of_record} seem to act {offset:.2f} ms after their times, which takes "
-            f"the mean squared residual from {misfit:.4g} to {left:.4g}: let their clock be "
+            f"the mean squared residual from {misfit:.4g} to {remaining:.4g}: let their clock be "
             "estimated (timing.clock_offset_std_s)"
         )
     return tuple(hints)

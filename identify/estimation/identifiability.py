@@ -198,20 +198,20 @@ The warning is given only if an instrument was used to fix the factor.
 
 
 def scale_warnings(
-    anchor: ScaleAnchor, gain: str, left: float, prior_share: float
+    anchor: ScaleAnchor, gain: str, std: float, prior_share: float
 ) -> tuple[str, ...]:
     """Return a warning if an instrument was used to fix the scale, but does not fix it.
 
-    Poses determine the controller's gain up to the scale. gain: its name. left: relative standard
+    Poses determine the controller's gain up to the scale. gain: its name. std: relative standard
     deviation of the gain due to errors of the initial guess. prior_share: share of these errors in
     its variance.
     """
-    if anchor.value is None or left <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
+    if anchor.value is None or std <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
         return ()
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "
         "measured quantity only in sums with other parameters, and the initial guess of these "
-        f"leaves {gain} uncertain by {left:.1%}; values in kg, N m or N are as uncertain: "
+        f"leaves {gain} uncertain by {std:.1%}; values in kg, N m or N are as uncertain: "
         "use identification.scale_anchor = joint_gain, or state further weighed masses in "
         "identification.prior",
     )

@@ -267,7 +267,8 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
     """Return the states (segments, s) after a step (p + 1,) of the parameters.
 
-    The last entry of the step is 1. eliminated: triangles of the QR of each state.
+    The last entry of the step is 1. eliminated: triangular factor from the elimination of each
+    state.
     """
     moved = states.copy()
     size = states.shape[1]

@@ -203,27 +203,27 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     coefficients = [group["coefficients"] for group in groups]
     alone = {name for weights in coefficients for name in weights if len(weights) == 1}
     summed = {name for weights in coefficients for name in weights if len(weights) > 1}
-    left = [name for name, p in parameters.items() if not p["identifiable"]]
+    unknown = [name for name, p in parameters.items() if not p["identifiable"]]
     # If the model does not explain the record, no parameter is identified.
-    if left and len(left) == len(parameters):
-        return [("the model does not explain the record, and no estimate can be trusted", left)]
+    if unknown and len(unknown) == len(parameters):
+        return [("the model does not explain the record, and no estimate can be trusted", unknown)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
     shown = (alone | set(filter(is_gain, parameters))) - fixed
     outside = set() if identification.get("drive", {}).get("in_loop", True) else shown - alone
     shown -= outside
     kinds = {
-        "the law of the drives has no such gain": [name for name in left if name in fixed],
+        "the law of the drives has no such gain": [name for name in unknown if name in fixed],
         "the drives took torques, and these gains had no effect in the run": [
-            name for name in left if name in outside
+            name for name in unknown if name in outside
         ],
         "motion shows them only in sums with other parameters, and not individually": [
-            name for name in left if name in summed
+            name for name in unknown if name in summed
         ],
         "this record does not determine them well enough: their standard deviation is more than "
         "half of that of the initial guess, or more than half of their size. More or faster motion "
-        "may help": [n for n in left if n in shown],
+        "may help": [n for n in unknown if n in shown],
         "no motion of this robot depends on them": [
-            n for n in left if n not in summed | shown | fixed | outside
+            n for n in unknown if n not in summed | shown | fixed | outside
         ],
     }
     return [(reason, names) for reason, names in kinds.items() if names]

@@ -91,13 +91,13 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Estimator
 
     Raises EstimationError, and the exceptions of experiment and sensor.
     """
-    made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
-    robot = made.plant.nominal
-    run = made.excitation
+    runs = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
+    robot = runs.plant.nominal
+    run = runs.excitation
     channels = instrumented(
-        run.record, run.truth, scenario.timing, instruments_of(robot), made.number
+        run.record, run.truth, scenario.timing, instruments_of(robot), runs.number
     )
-    unseen = [(one.record, one.truth) for one in made.unseen]
+    unseen = [(one.record, one.truth) for one in runs.unseen]
     chosen = find_estimators(options.estimators or None)
     scores = compare_on_record(
         (run.record, run.truth),

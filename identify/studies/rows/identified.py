@@ -226,16 +226,16 @@ def compute(
     scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions
 ) -> Row:
     """Compute one row. Raises EstimationError, and the exceptions of experiment and sensor."""
-    made = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
-    plant = made.plant
+    runs = recorded(row_setup(scenario, stream_seed(seed, EXPERIMENT)), options)
+    plant = runs.plant
     robot = plant.nominal
-    records = [one.record for one in made.unseen]
+    records = [one.record for one in runs.unseen]
     scenarios = {"": scenario}
     if options.unaware:
         scenarios["unaware_"] = scenario.with_overrides({"identification.nuisances": []})
     row: Row = {}
     for prefix, settings in scenarios.items():
-        result = identify_record(made.records, robot, settings)
+        result = identify_record(runs.records, robot, settings)
         # The model is run with the identified law of the drives.
         side = model_side(robot, settings).with_drive(result.drive.law)
         predicted = predicted_runs(
@@ -243,15 +243,15 @@ def compute(
             records,
             result.estimate,
             result.whole_covariance,
-            made.number,
+            runs.number,
             SilentProgress(),
             result.common_errors.learned,
         )
         true = plant.parameters_of(result.layout)
         if not prefix:
-            row |= _record_figures(made.excitation) | _parameter_figures(result, true)
-            row |= _unseen_figures(result, side, true, made.unseen, predicted)
-        covered = coverage(result, plant, made.unseen, predicted)
+            row |= _record_figures(runs.excitation) | _parameter_figures(result, true)
+            row |= _unseen_figures(result, side, true, runs.unseen, predicted)
+        covered = coverage(result, plant, runs.unseen, predicted)
         row |= {f"{prefix}{name}": value for name, value in covered.items()}
     return row
 
