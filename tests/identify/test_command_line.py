@@ -201,7 +201,7 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         ),
         (
             "export mjcf rss6 --parameters ''",
-            "'' is neither a parameter set of robot rss6 (identified, in",
+            "'' is neither a parameter set of robot rss6 (guess, truth",
         ),
         ("export mjcf rss6 --allow-unphysical-inertia --out .", "cannot write ."),
         ("study no_such_study", "pixel_noise"),
