@@ -1,13 +1,15 @@
 """The command `cmmsim`, and a warning if another package is imported as `identify`.
 
-A package on PyPI has the same name. If it is installed, it hides our `identify`. The command
-therefore begins here, in the only module of this package that knows `identify`.
+A package on PyPI has the same name, and pre-commit depends on it. Both write the file
+`identify/__init__.py`, so that the one that is installed last breaks the other. The command
+therefore begins here, in the only module of this package that knows `identify`, and refuses to run
+beside the other package.
 """
 
 import sys
 import warnings
 from functools import cache
-from importlib import import_module
+from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,16 +25,26 @@ def foreign_identify() -> str:
     spec = find_spec("identify")
     found = Path(spec.origin) if spec and spec.origin else None
     if found and found.is_file() and OURS in found.read_text(encoding="utf-8", errors="replace"):
-        return ""
-    where = (
-        f"another package is imported instead of cmmsim's `identify`: {found.parent}"
-        if found
-        else "no `identify`"
-    )
+        beside = _installed_beside()
+        if not beside:
+            return ""
+        where = f"identify {beside} of PyPI is installed beside cmmsim, which replaced its files"
+    elif found:
+        where = f"another package is imported instead of cmmsim's `identify`: {found.parent}"
+    else:
+        where = "no `identify`"
     return (
         f"{where}; install cmmsim into a virtual environment of its own (a PyPI package has the "
         "same name)"
     )
+
+
+def _installed_beside() -> str:
+    """Return the version of PyPI's package `identify` in this environment, or an empty text."""
+    try:
+        return metadata.version("identify")
+    except metadata.PackageNotFoundError:
+        return ""
 
 
 @cache

@@ -80,7 +80,7 @@ class Instrument:
         self._progress = progress
         self.method = method
         self._known = taught.known if isinstance(taught, Taught) else known
-        figures = file.camera.model_dump(exclude={"pattern_seed"})
+        figures = file.camera.model_dump(exclude={"pattern_seed", "grey_noise_percent"})
         self.noise = CameraNoise(
             **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
         )

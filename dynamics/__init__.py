@@ -5,6 +5,7 @@ Robots
     load_robot(name_or_path)                    built-in robot, or robot of a TOML file
     built_in_robots()                           names of the built-in robots
     Robot                                       kinematics and dynamics, one pose or a batch
+    RobotModel(robot)                           torques, CasADi, MJCF and URDF with fixed numbers
     fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops
     workspace.check_motion(robot, pose, times)  travel, reach and singularities along a motion
 
@@ -33,11 +34,13 @@ if TYPE_CHECKING:
     from dynamics.robot import Robot as Robot
     from dynamics.robot import load_robot as load_robot
     from dynamics.robot_file import built_in_robots as built_in_robots
+    from dynamics.robot_model import RobotModel as RobotModel
 
 _HOME = {
     **dict.fromkeys(("Robot", "load_robot"), "dynamics.robot"),
     "fast_forward_dynamics": "dynamics.forward_dynamics",
     "built_in_robots": "dynamics.robot_file",
+    "RobotModel": "dynamics.robot_model",
     "simulate_batch": "dynamics.closed_loop",
 }
 

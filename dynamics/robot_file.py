@@ -142,7 +142,7 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
 
     A column is one value for all legs, or a list with one value per leg.
     """
-    fields = {_plural(name): name for name in KINDS[family.kind].model_fields}
+    fields = {plural(name): name for name in KINDS[family.kind].model_fields}
     legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
     for key, value in columns.items():
         name = key if key in fields.values() else fields.get(key)
@@ -161,7 +161,8 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
     return legs
 
 
-def _plural(name: str) -> str:
+def plural(name: str) -> str:
+    """Key of the column of a field of legs, if the values are vectors."""
     if name.endswith("axis"):
         return name.removesuffix("axis") + "axes"
     return name + "s" if name.endswith(("joint", "direction")) else name

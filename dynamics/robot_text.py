@@ -1,7 +1,11 @@
-"""Text of a robot file in the format of `robot_file`, with one table per leg and all digits."""
+"""Text of a robot file in the format of `robot_file`, with all digits.
+
+Legs of a family are columns of one table. Other legs have one table each.
+"""
 
 import json
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -9,7 +13,7 @@ import numpy as np
 from dynamics.legs.leg import Leg
 from dynamics.parameter_set import ParameterSet
 from dynamics.parameters import JOINT_PID, ParameterLayout
-from dynamics.robot_file import RobotDescription
+from dynamics.robot_file import FAMILIES, RobotDescription, plural
 from dynamics.spatial_inertia import FULL_INERTIAL, INERTIAL
 
 
@@ -21,12 +25,24 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     geometry = robot.geometry
     layout = robot.geometry.layout
     turning = "m and N" if layout.prismatic else "rad and N m"
-    lines = [f"# {' '.join(comment.split())}" for comment in comments]
+    lines = [
+        line
+        for comment in comments
+        for line in textwrap.wrap(
+            " ".join(comment.split()), 98, initial_indent="# ", subsequent_indent="# "
+        )
+    ]
     lines += [
         f"# Lengths in m, angles in rad, masses in kg, inertias in kg m^2; joints in {turning}.",
         "",
     ]
-    lines += [f"name = {json.dumps(robot.name)}", f"chart = {json.dumps(geometry.chart.name)}"]
+    kinds = [type(leg).model_fields["type"].default for leg in geometry.legs]
+    form = (kinds[0], len(kinds), geometry.chart.name) if len(set(kinds)) == 1 else None
+    family = next((name for name, one in FAMILIES.items() if one == form), None)
+    lines.append(f"name = {json.dumps(robot.name)}")
+    lines.append(
+        f"family = {json.dumps(family)}" if family else f"chart = {json.dumps(geometry.chart.name)}"
+    )
     lines += [
         f"home_pose = {_value(geometry.home_pose)}",
         f"travel_limit = {_value(geometry.travel_limit)}",
@@ -37,11 +53,31 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
         lines += ['inertia = "full"' if all(layout.full) else f"inertia = {{ {table} }}"]
     lines += ["", "[unstated]"]
     lines += [f"{name} = {_value(value)}" for name, value in geometry.unstated]
-    for number, leg in enumerate(geometry.legs, 1):
-        lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
+    if family:
+        lines += ["", "[legs]", *_columns(geometry.legs)]
+    else:
+        for number, leg in enumerate(geometry.legs, 1):
+            lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
     for name, values in robot.parameter_sets.items():
         lines += ["", f"[parameters.{_key(name)}]", *_parameters(values, layout)]
     return "\n".join(lines) + "\n"
+
+
+def _columns(legs: Sequence[Leg]) -> list[str]:
+    """Lines with the fields of all legs. A column of equal values is written as one value."""
+    lines = []
+    for name in type(legs[0]).model_fields:
+        column = [getattr(leg, name) for leg in legs]
+        if name == "type" or all(value is None for value in column):
+            continue
+        if all(np.array_equal(value, column[0]) for value in column):
+            lines.append(f"{name} = {_value(column[0])}")
+        elif isinstance(column[0], np.ndarray):
+            rows = [f"    {_value(value)}," for value in column]
+            lines += [f"{plural(name)} = [", *rows, "]"]
+        else:
+            lines.append(f"{name} = [{', '.join(map(_value, column))}]")
+    return lines
 
 
 def _fields(leg: Leg) -> list[str]:

@@ -70,17 +70,25 @@ def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:
     if not isinstance(side, Model) or side.start_parameters not in robot.parameter_sets:
         return side.steps_per_frame
     try:
-        rate = _fastest_rate(robot, side.start_parameters, drives_of(side, None))
+        needed = _steps_at_start(robot, side.start_parameters, drives_of(side, None), period)
     except DynamicsError:
         # the same error is raised where the model is run, with all that is known there
         return side.steps_per_frame
-    return max(side.steps_per_frame, ceil(rate * period / LONGEST_STEP))
+    return max(side.steps_per_frame, needed)
 
 
 @lru_cache(maxsize=64)
-def _fastest_rate(robot: Robot, set_name: str, drives: Drives) -> float:
-    parameters = robot.parameter_sets[set_name].vector
-    return stability.fastest_rate(robot, parameters, drives, robot.home_pose)
+def _steps_at_start(robot: Robot, set_name: str, drives: Drives, period: float) -> int:
+    return steps_needed(robot, robot.parameter_sets[set_name].vector, drives, period)
+
+
+def steps_needed(robot: Robot, parameters: Array, drives: Drives, period: float) -> int:
+    """Return the integration steps per `period`, s, that the fastest motion at home needs.
+
+    parameters (p + g,): dynamic parameters and gains.
+    """
+    rate = stability.fastest_rate(robot, parameters, drives, robot.home_pose)
+    return ceil(rate * period / LONGEST_STEP)
 
 
 def drives_of(side: Plant | Model, torque_limit: float | None) -> Drives:

@@ -139,9 +139,27 @@ def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     assert command.stderr.count("\n") == 1
 
 
+def test_beside_the_package_of_pre_commit_the_command_refuses_with_the_reason(tmp_path):
+    """Installed before ours, which replaced its `__init__.py`: only its metadata tells."""
+    other = tmp_path / "identify-2.6.9.dist-info"
+    other.mkdir()
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: identify\nVersion: 2.6.9\n")
+    command = python(
+        "-c", "import cmmsim.__main__ as c; c.main()", cwd=tmp_path, path=[ROOT, tmp_path]
+    )
+    assert command.returncode == 1
+    assert command.stderr.startswith(
+        "error: identify 2.6.9 of PyPI is installed beside cmmsim, which replaced its files; "
+        "install cmmsim into a virtual environment of its own"
+    )
+    assert command.stderr.count("\n") == 1
+
+
 def test_the_citation_names_this_version_its_licence_and_the_paper():
     stated = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    heading = f"## {stated['version']} ({stated['date-released']})\n"
+    assert heading in (ROOT / "CHANGELOG.md").read_text("utf-8")
     assert (stated["version"], stated["license"]) == (project["version"], project["license"])
     assert stated["authors"][0]["name"].lower() in (ROOT / "LICENSE").read_text("utf-8").lower()
     assert set(stated["keywords"]) == set(project["keywords"])

@@ -171,12 +171,16 @@ class Camera(Section):
     """Noise parameters of a camera after EMVA 1288.
 
     ``noise = false`` switches off all noise, including the fixed pattern of prnu and dsnu.
-    ``pattern_seed`` is the seed of the fixed pattern.
+    ``pattern_seed`` is the seed of the fixed pattern. ``grey_noise_percent`` replaces
+    ``dark_noise``.
     """
 
     electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")
     gain: GreyPerElectron = quantity(..., "grey values per electron", "system gain")
     dark_noise: Electrons = quantity(..., "electrons", "dark noise, rms")
+    grey_noise_percent: Annotated[float, Field(ge=0.0, le=20.0)] | None = quantity(
+        None, "%", "grey-value noise without light in % of white, rms; in place of dark_noise"
+    )
     full_well: Electrons = quantity(..., "electrons", "saturation capacity of a pixel")
     black_level: Grey = quantity(0.0, "grey values", "grey value without light")
     noise: bool = quantity(True, "", "true for images with noise")
@@ -196,6 +200,13 @@ class Camera(Section):
                 f"black_level {self.black_level:g} must lie below the largest grey value of "
                 f"bit_depth {self.bit_depth}, {2**self.bit_depth - 1}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _noise_of_white(self) -> Camera:
+        if self.grey_noise_percent is not None:
+            white = (2**self.bit_depth - 1) / self.gain
+            self.__dict__["dark_noise"] = self.grey_noise_percent / 100 * white
         return self
 
 

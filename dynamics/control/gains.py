@@ -6,7 +6,7 @@ the eigenvalues of the map from frame to frame. Both are computed for the linear
 (`closed_loop.stability`), without dry friction.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from dynamics.control.computed_torque import INTEGRAL, error_map
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Feedback
 from dynamics.errors import SimulationError
+from dynamics.robot import Robot
 
 HALF_POWER = 2**-0.5
 AT_ONCE = 1e-3
@@ -100,6 +101,79 @@ def design_servo(
             f"{HALF_POWER:.3g}"
         )
     return servo(found.x)
+
+
+SPEEDS = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
+"""Speeds, rad/s, of the slowest motion under designed drives, in the order in which they are tried.
+
+The first is that of the built-in robots.
+"""
+DAMPINGS = (0.35, 0.5, 0.7)
+"""Damping ratios of the slowest motion under designed drives, in the order of trial."""
+INTEGRAL_RATE = 1.1
+"""Ratio li / lp of designed drives, 1/s, as in the paper."""
+ENOUGH = 1.5
+"""Factor by which all gains of the servo can grow under designed drives."""
+
+
+@dataclass(frozen=True)
+class DesignedDrives:
+    """Gains of the drives by design, and what they give.
+
+    `gains` (3,) are lp, li and ld. `felt` are the smallest and the largest inertia that a motion of
+    the joints meets, kg m^2 or kg. `speeds` are the fastest and the slowest motion under lp, rad/s,
+    and `damping` is the damping ratio of the slowest. `margin` is the smallest factor of the gains
+    of the servo at the limit of stability.
+    """
+
+    gains: np.ndarray
+    felt: tuple[float, float]
+    speeds: tuple[float, float]
+    damping: float
+    margin: float
+
+
+def design_drives(
+    robot: Robot, dynamic: Sequence[np.ndarray], loops: Sequence[LoopSettings]
+) -> DesignedDrives:
+    """Gains of the joint PID that all joints share, for which the servo of each loop is stable.
+
+    The largest inertia at home gets the speed and the damping of the built-in robots. Other speeds
+    and dampings are tried if the gains of a servo could not grow by `ENOUGH`. `dynamic` are sets of
+    dynamic parameters (p,), the first one for the design. Raises SimulationError, with the largest
+    eigenvalue of the best gains, if there are no such gains.
+    """
+    pose = robot.home_pose
+    zero = np.zeros(len(robot.layout.joint_pid_names))
+    push = stability.torque_motion(robot, np.concatenate([dynamic[0], zero]), pose)[1]
+    felt = 1 / np.linalg.eigvalsh(robot.coordinate_jacobian(pose) @ push)[::-1]
+    best = None
+    for damping in DAMPINGS:
+        for speed in SPEEDS:
+            lp = felt[-1] * speed**2
+            exact = lp, INTEGRAL_RATE * lp, 2 * damping * speed * felt[-1]
+            gains = np.array([float(f"{gain:.3g}") for gain in exact])
+            each = np.tile(gains, len(robot.layout.joint_pid_names) // len(gains))
+            margins = [
+                stability.gain_margin(robot, np.concatenate([own, each]), loop, pose)
+                for own in dynamic
+                for loop in loops
+            ]
+            speeds = float(np.sqrt(lp / felt[0])), float(speed)
+            found = DesignedDrives(
+                gains, (float(felt[0]), float(felt[-1])), speeds, damping, min(margins)
+            )
+            if found.margin >= ENOUGH:
+                return found
+            if best is None or not best.margin >= found.margin:
+                best = found
+    if best is None or not best.margin > 1:
+        raise SimulationError(
+            f"no gains of the drives of {robot.name} make the servo stable at "
+            f"{', '.join(f'{loop.timing.frame_rate_hz:g} Hz' for loop in loops)}: with the best, "
+            f"the gains of the servo must be {best.margin if best else 0:.3g} times as large"
+        )
+    return best
 
 
 def torque_figures(

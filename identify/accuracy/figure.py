@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import pytest
@@ -15,6 +16,8 @@ import pytest
 from identify.errors import IdentifyError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
@@ -25,6 +28,13 @@ PROPERTY = "cmmsim_accuracy"
 
 CONFIDENCE = 0.95
 """Probability with which the interval of a sample contains the true mean."""
+
+
+FIRST = 20
+"""Number of values that are drawn first until a limit is decided."""
+
+MOST = 640
+"""Default of the largest number of these values."""
 
 
 class AccuracyError(IdentifyError):
@@ -38,7 +48,7 @@ class Figure:
     Attributes
     ----------
     test : str
-        Node id of the test.
+        Name of the test, see `test_name`.
     name : str
         Name of the figure, unique within its test.
     value : float
@@ -133,6 +143,20 @@ class Figure:
         if self.interval is None:
             return self.value
         return self.interval[1] if side > 0 else self.interval[0]
+
+
+def test_name(file: Path, place: str) -> str:
+    """Return the name of a test: its file, from the folder of its package on, and its place there.
+
+    Other than a node id, the name does not depend on the folder from which pytest runs, nor on the
+    place of the package. `place` is what a node id has after the file, such as `test_x[1]`.
+    """
+    parts = [file.name]
+    folder = file.parent
+    while (folder / "__init__.py").is_file():
+        parts.insert(0, folder.name)
+        folder = folder.parent
+    return "::".join(["/".join(parts), *([place] if place else [])])
 
 
 def with_unit(text: str, unit: str) -> str:
@@ -243,6 +267,73 @@ class Accuracy:
             )
         self._add(name, unit, limit, better, value=mean, interval=(low, high), count=len(numbers))
 
+    def sample_until(
+        self,
+        name: str,
+        draw: Callable[[int], ArrayLike],
+        limit: float,
+        unit: str = "",
+        better: Better = "lower",
+        most: int = MOST,
+    ) -> None:
+        """Record the mean of independent values, of which more are drawn until it is decided.
+
+        The first 20 values are doubled as long as the interval of the mean contains the limit. With
+        `most` values the figure is then undecided, and the test passes. The interval is wider than
+        that of `sample`, because it may be looked at several times (Bonferroni).
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure. It must be new in this test.
+        draw : callable
+            Function of a number n that returns n new values, which are independent of all earlier
+            ones.
+        limit : float
+            Largest mean with which the test passes, or the smallest mean if higher is better.
+        unit : str, optional
+            Unit of the values, for tables.
+        better : {"lower", "higher"}, optional
+            Direction of improvement.
+        most : int, optional
+            Largest number of values, at least 20.
+
+        Raises
+        ------
+        AccuracyError
+            `draw` returns another number of values, a value is not a finite number, `most` is not a
+            whole number of at least 20, or the name was recorded already.
+
+        Examples
+        --------
+        >>> def test_distance(accuracy, cmmsim_seed):
+        ...     rng = np.random.default_rng(cmmsim_seed)
+        ...     accuracy.sample_until(
+        ...         "distance error", lambda n: measure(rng, n), limit=3.0, unit="um"
+        ...     )
+        """
+        __tracebackhide__ = True
+        import numpy as np
+
+        if isinstance(most, bool) or not isinstance(most, int) or most < FIRST:
+            raise AccuracyError(f"{name}: most is {most!r}, must be a whole number >= {FIRST}")
+        counts = [FIRST]
+        while counts[-1] < most:
+            counts.append(min(2 * counts[-1], most))
+        confidence = 1 - (1 - CONFIDENCE) / len(counts)
+        numbers = np.empty(0)
+        for count in counts:
+            drawn = _numbers(name, "values", draw(count - len(numbers)), dimensions=1)
+            if len(drawn) != count - len(numbers):
+                raise AccuracyError(
+                    f"{name}: draw({count - len(numbers)}) returned {len(drawn)} values"
+                )
+            numbers = np.concatenate([numbers, drawn])
+            mean, interval = mean_interval(numbers, confidence)
+            if not interval[0] <= limit <= interval[1]:
+                break
+        self._add(name, unit, limit, better, value=mean, interval=interval, count=len(numbers))
+
     def _add(self, name: str, unit: str, limit: float | None, better: Better, **found: Any) -> None:
         __tracebackhide__ = True
         for what, text in (("name", name), ("unit", unit)):
@@ -262,10 +353,12 @@ class Accuracy:
             pytest.fail(figure.verdict)
 
 
-def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
+def mean_interval(
+    values: NDArray[np.float64], confidence: float = CONFIDENCE
+) -> tuple[float, tuple[float, float]]:
     """Return the mean of values (n,), n >= 2, and its confidence interval.
 
-    The interval contains the true mean with the probability CONFIDENCE. An end beyond the largest
+    The interval contains the true mean with the probability `confidence`. An end beyond the largest
     float is infinite.
     """
     import numpy as np
@@ -276,7 +369,7 @@ def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, floa
     exponent = np.frexp(np.abs(values).max())[1]
     scaled = np.ldexp(values, -exponent)
     mean = np.mean(scaled)
-    reach = stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.std(scaled, ddof=1) / np.sqrt(count)
+    reach = stdtrit(count - 1, 0.5 + 0.5 * confidence) * np.std(scaled, ddof=1) / np.sqrt(count)
     with np.errstate(over="ignore"):
         mean, low, high = np.ldexp([mean, mean - reach, mean + reach], exponent).tolist()
     return mean, (low, high)

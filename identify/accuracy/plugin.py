@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from identify.accuracy.figure import PROPERTY, Accuracy, AccuracyError
+from identify.accuracy.figure import PROPERTY, Accuracy, AccuracyError, test_name
 from identify.accuracy.session import AccuracySession
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add(
         "--accuracy-dir",
         metavar="DIR",
-        help="folder of the saved figures (default: .accuracy in the root directory)",
+        help="folder of the saved figures (default: .accuracy in the root directory or the "
+        "nearest folder above that has one)",
     )
     add(
         "--accuracy-seed",
@@ -112,13 +113,13 @@ def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     properties = request.node.user_properties
     # If a plugin repeats a failed test, the figures of the earlier try are still there.
     properties[:] = [entry for entry in properties if entry[0] != PROPERTY]
-    return Accuracy(_node_id(request.node), properties)
+    return Accuracy(_name(request.node), properties)
 
 
 @pytest.fixture
 def cmmsim_seed(request: pytest.FixtureRequest) -> int:
-    """Seed of this test. It depends only on the node id and on --accuracy-seed."""
-    text = f"{request.config.getoption('accuracy_seed')} {_node_id(request.node)}"
+    """Seed of this test. It depends only on the name of the test and on --accuracy-seed."""
+    text = f"{request.config.getoption('accuracy_seed')} {_name(request.node)}"
     return int.from_bytes(sha256(text.encode()).digest()[:4], "big")
 
 
@@ -236,9 +237,10 @@ def _file_or_name(folder: Path, name: str | PathLike[str]) -> str:
     return str(path) if path.is_file() else str(name)
 
 
-def _node_id(item: pytest.Item) -> str:
-    """Return a test's node id, without the group that pytest-xdist appends (--dist loadgroup)."""
-    return f"{item.parent.nodeid}::{item.name}" if item.parent else item.nodeid
+def _name(item: pytest.Item) -> str:
+    """Return a test's name, without the group that pytest-xdist appends (--dist loadgroup)."""
+    node = f"{item.parent.nodeid}::{item.name}" if item.parent else item.nodeid
+    return test_name(item.path, node.partition("::")[2])
 
 
 def ratio(text: str) -> float:

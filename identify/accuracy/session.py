@@ -2,7 +2,7 @@
 
 The figures are user properties in the reports of the tests. pytest-xdist transfers these reports
 from its workers, so the same figures arrive here with and without pytest-xdist. Figures are sorted
-by node id, so that table and file do not depend on the order of the tests.
+by the name of their test, so that table and file do not depend on the order of the tests.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,12 @@ from typing import Any
 import pytest
 
 from identify.accuracy import saved
-from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure, percent
+from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure, percent, test_name
 
 Row = tuple[str, ...]
 UNDECIDED = "undecided"
+FOLDER = ".accuracy"
+"""Folder of the saved figures."""
 HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit", "margin")
 
 
@@ -25,7 +27,7 @@ def terminal_table(
     comparisons: Mapping[saved.Key, saved.Comparison],
     compared_with: str | None,
 ) -> list[str]:
-    """Return the aligned lines of the table, with the figures of each test below its node id.
+    """Return the aligned lines of the table, with the figures of each test below its name.
 
     With `compared_with`, the name of a saved session, two columns show its values and the change.
     """
@@ -51,8 +53,8 @@ def terminal_table(
         lines += [test, *(_aligned(row, widths) for row in group_rows)]
     if any(figure.undecided for figure in figures):
         lines.append(
-            f"{UNDECIDED}: passed, because the interval contains the limit; more values would "
-            "decide"
+            f"{UNDECIDED}: passed, because the interval contains the limit; accuracy.sample_until "
+            "draws more values until it is decided"
         )
     return lines
 
@@ -117,9 +119,14 @@ class AccuracySession:
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
         self._outcomes: dict[str, str] = {}
+        self._nodes: dict[str, str] = {}
+        self._shared: list[str] = []
+        self._root = config.rootpath
         self._lines: list[tuple[str, bool]] = []
         folder = config.getoption("accuracy_dir")
-        base = config.rootpath / ".accuracy"
+        root = config.rootpath
+        above = (one / FOLDER for one in (root, *root.parents))
+        base = next((one for one in above if one.is_dir()), root / FOLDER)
         self._folder = config.invocation_params.dir / folder if folder else base
         self._seed = config.getoption("accuracy_seed")
         self._save = config.getoption("accuracy_save")
@@ -152,7 +159,7 @@ class AccuracySession:
 
     @property
     def figures(self) -> list[Figure]:
-        """All figures, sorted by node id and in the order of their test."""
+        """All figures, sorted by the name of their test and in the order of their test."""
         return [figure for test in sorted(self._figures) for figure in self._figures[test]]
 
     @property
@@ -163,20 +170,29 @@ class AccuracySession:
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         """Store the outcome of a module that is skipped as a whole."""
         if report.outcome != "passed":
-            self._outcomes[report.nodeid] = report.outcome
+            self._outcomes[self._name(report.nodeid)] = report.outcome
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Store the outcome from each report of a test, and the figures from its last report."""
         if report.when == "setup" or report.outcome != "passed":
-            self._outcomes[report.nodeid] = report.outcome
+            self._outcomes[self._name(report.nodeid)] = report.outcome
         if report.when == "teardown":
             properties: list[tuple[str, Any]] = report.user_properties
             found = [Figure(**value) for name, value in properties if name == PROPERTY]
             if found:
-                self._figures[found[0].test] = found
+                test = found[0].test
+                node = report.nodeid
+                if self._nodes.setdefault(test, node) != node:
+                    self._shared.append(
+                        f"{self._nodes[test]} and {node} have the same name {test}, and only one "
+                        "of them can keep figures: rename one, or add an __init__.py to its folder"
+                    )
+                self._figures[test] = found
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
         """Judge the comparison. Save if all tests passed and no figure is beyond its limit."""
+        for text in self._shared:
+            self._fail(session, text)
         if self._compare is not None:
             self._judge(session)
         if self._save is not None:
@@ -225,6 +241,11 @@ class AccuracySession:
             outcome = self._outcome(test)
             line = f"  {test}: {', '.join(names)} (the test {WHY_MISSING.get(outcome, outcome)})"
             self._report_change(session, line, guarded=outcome is not None)
+
+    def _name(self, node: str) -> str:
+        """Return the name of the test or module of a node id."""
+        file, _, place = node.partition("::")
+        return test_name(self._root / file, place)
 
     def _outcome(self, test: str) -> str | None:
         """Return the outcome of a test or of its module, or None if it did not run."""

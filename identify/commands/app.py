@@ -13,7 +13,7 @@ import typer
 from identify.commands.camera_calibration import calibrate
 from identify.commands.check import check
 from identify.commands.comparisons import estimators, variation
-from identify.commands.diagnosis import diagnose
+from identify.commands.diagnosis import budget, diagnose
 from identify.commands.gauntlet import gauntlet
 from identify.commands.geometry_run import geometry
 from identify.commands.help import (
@@ -160,7 +160,7 @@ SETTING_UP = "Setting up"
 
 _add(EXPERIMENT, run, paper)
 _add(STAGES, excite, record, identify, validate, report)
-_add(RECORDS, diagnose, estimators, variation, track)
+_add(RECORDS, diagnose, budget, estimators, variation, track)
 _add(PICTURES, replay, show)
 _add(ROBOTS, check, cls=Judging)
 _add(ROBOTS, workspace, base_parameters, geometry)

@@ -20,13 +20,7 @@ from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
-    from identify.verification.robot_check import Finding
-
-LONGEST = 160
-"""Largest number of characters of a finding in the error message.
-
-The table and the JSON hold the whole text.
-"""
+    from identify.verification.finding import Finding
 
 OF_ROBOTS = ("--scenario", "--parameters", "--set")
 """Options for robots. A record states its own scenario."""
@@ -133,26 +127,11 @@ def _check_robot(
     quiet: bool,
 ) -> None:
     from dynamics import load_robot
-    from identify.experiment.law_in_loop import feedback
-    from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
-    from identify.verification.robot_check import CheckSettings, check_robot
+    from identify.verification.robot_check import checked_in
 
     chosen = load_robot(robot)
     given = chosen_scenario(scenario, settings, None)
-    name = parameters or (
-        given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL
-    )
-    check_parameter_set(chosen, name)
-    values = chosen.parameter_sets[name].vector
-    around = CheckSettings(
-        settings=loop_settings(chosen, given.servo, given.timing, given.control, given.model),
-        control=given.control,
-        feedback=feedback(given.control, given.timing),
-        limits=given.excitation,
-        sensor=given.sensor,
-        sensor_file=given.sensor_file(),
-    )
-    findings = check_robot(chosen, values, around, terminal_progress(quiet))
+    name, findings = checked_in(given, chosen, parameters, terminal_progress(quiet))
     _tell(findings, f"{chosen.name}, parameters `{name}`", chosen.name, json, quiet)
 
 
@@ -160,6 +139,8 @@ def _tell(
     findings: "list[Finding]", title: str, about: str, json: Path | None, quiet: bool
 ) -> None:
     """Output findings, and raise VerificationError if any of them fails."""
+    from identify.verification.robot_check import LONGEST
+
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (

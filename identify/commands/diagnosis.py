@@ -1,7 +1,7 @@
-"""Command that names the causes for which an identified model misses its record."""
+"""Commands that explain an identified run: why it misses its record, and what its doubt is of."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,6 +13,7 @@ from identify.runtime import interruptible_imports
 
 if TYPE_CHECKING:
     from identify.diagnosis.diagnosis import Diagnosis
+    from identify.estimation.budget import Budget
 
 SHOWN = 12
 """Number of candidates that the table has."""
@@ -84,3 +85,85 @@ def _say(found: "Diagnosis") -> None:
     for finding in found.findings:
         for remedy in finding.remedies:
             typer.echo(f"  {remedy}")
+
+
+def budget(
+    context: typer.Context,
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of an identified run.")],
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """State what each source of uncertainty adds to poses, parameters and predicted motion.
+
+    The form is that of the GUM: the squares of what the sources add sum up to the square of the
+    combined standard uncertainty. Sources are noise of the poses, cameras, teaching, clocks,
+    geometry, drives, scale anchor, initial guess, and others that the run states. The parts are
+    those of the covariance of the identification. Predictions need a validated run.
+
+    Reads scenario.toml, experiment.nc, covariance.nc and result.json of the folder, and
+    validation.nc if there is one.
+
+    Writes budget.json, which is also the JSON, budget.csv and budget.png into the folder budget
+    there.
+
+    \b
+    Example:
+      cmmsim budget runs/quick-0
+    """
+    with interruptible_imports():
+        from identify.files.run_folder import save_files
+        from identify.reporting.figures.estimates import budget_figure
+        from identify.stages.run_budget import error_budget
+
+    RunFolder(run).require("scenario.toml", "experiment.nc", "covariance.nc", "result.json")
+    context.with_resource(lock_folder(run))
+    found = error_budget(run)
+    folder = RunFolder(run).budget
+    files: dict[str, Any] = {"budget.png": budget_figure(found), "budget.json": found.to_dict()}
+    files["budget.csv"] = found.to_dataframe().to_csv(index=False)
+    save_files(folder, files)
+    tell(found.to_dict(), json, quiet, lambda: _print_budget(found, folder))
+
+
+GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
+"""First of three entries of a pose whose mean variance is a column of the table."""
+
+
+def _print_budget(found: "Budget", folder: Path) -> None:
+    """Print what each source adds, the largest first."""
+    import numpy as np
+
+    columns = []
+    for first in GROUPS:
+        if first in found.quantities:
+            place = found.quantities.index(first)
+            columns.append(1e6 * np.sqrt(np.maximum(found.variances[place : place + 3].mean(0), 0)))
+    own = [k for k, name in enumerate(found.quantities) if not name.startswith(POSES)]
+    shares = 100 * found.shares[own]
+    means = shares.mean(axis=0)
+    order = np.argsort(-(columns[-2] if len(columns) == 4 else means), kind="stable")
+    rows = []
+    for source in order:
+        worst = int(np.argmax(shares[:, source]))
+        said = f"{found.quantities[own[worst]]} {shares[worst, source]:.3g} %"
+        numbers = [f"{column[source]:.3g}" for column in columns]
+        rows.append(
+            (found.words[source], *numbers, f"{means[source]:.3g}", said if means[source] else "")
+        )
+    combined = [f"{np.sqrt(np.sum(column**2)):.3g}" for column in columns]
+    rows.append(("combined", *combined, "100", ""))
+    titles = ("pose\num", "pose\nurad", "predicted\num", "predicted\nurad")[: len(columns)]
+    header = ("source", *titles, "parameters\n%", "most in")
+    print_table(
+        header,
+        rows,
+        ("source", "most in"),
+        "what each source adds to the standard uncertainty",
+        "the squares sum up to that of the combined one; poses: root mean square of three axes; "
+        "parameters: mean share of the variance",
+    )
+    typer.echo(f"table and picture: {folder}")
+
+
+POSES = ("pose.", "prediction.")
+"""Beginnings of the names of quantities that are poses."""

@@ -42,22 +42,64 @@ def _like(kind: str) -> Any:
     )
 
 
+def _length(what: str) -> Any:
+    return typer.Option(metavar="M", help=f"{what}, m.", show_default="as it was")
+
+
+Length = float | None
+
+
 @new.command(cls=Command)
-def robot(file: File, like: Annotated[str, _like("robot")] = "rss6", quiet: Quiet = False) -> None:
+def robot(
+    file: File,
+    like: Annotated[str, _like("robot")] = "rss6",
+    base_radius: Annotated[Length, _length("From the middle to the base joints, in plan")] = None,
+    platform_radius: Annotated[
+        Length, _length("From the middle of the platform to its joints, in plan")
+    ] = None,
+    crank: Annotated[Length, _length("Length of a crank")] = None,
+    link: Annotated[Length, _length("Length of a link")] = None,
+    bar_distance: Annotated[Length, _length("Between the two bars of a parallelogram")] = None,
+    leg: Annotated[Length, _length("Length of a leg of cylinder and rod at home")] = None,
+    cylinder: Annotated[Length, _length("Length of a cylinder")] = None,
+    rod: Annotated[Length, _length("Length of a rod")] = None,
+    quiet: Quiet = False,
+) -> None:
     """Write a robot file: geometry, parameter sets and gains of a built-in robot, under a name of
-    your own.
+    your own and with lengths of your own.
+
+    Without lengths, the file is a copy with its comments. With lengths, joints, home, directions
+    and travel follow from them, masses and inertias are scaled, and the gains of the drives are
+    designed. Lengths that are not given stay as they are. A family has its own lengths: robots
+    with cranks have base-radius, platform-radius, crank and link, delta3 also bar-distance; those
+    with sliders have base-radius, platform-radius and link; ups6 has base-radius, platform-radius,
+    leg, cylinder and rod.
 
     Reads nothing of yours. Writes one TOML file.
 
     \b
     Examples:
       cmmsim new robot mine.toml --like ups6
+      cmmsim new robot mine.toml --like rss6 --base-radius 0.25 \\
+        --platform-radius 0.15 --crank 0.08 --link 0.25
       cmmsim check mine.toml
       cmmsim run quick --robot mine.toml
     """
     from dynamics.robot_file import read_robot_file
 
-    text = _of_a_workshop(_copy("robot", like, file))
+    given = {
+        "base_radius": base_radius,
+        "platform_radius": platform_radius,
+        "crank": crank,
+        "link": link,
+        "bar_distance": bar_distance,
+        "leg": leg,
+        "cylinder": cylinder,
+        "rod": rod,
+    }
+    lengths = {name: value for name, value in given.items() if value is not None}
+    made = _of_lengths(file, like, lengths) if lengths else None
+    text = made or _of_a_workshop(_copy("robot", like, file))
     _write({_toml(file): text}, read_robot_file)
     _say(quiet, file, f"judge it with: cmmsim check {file}")
 
@@ -227,6 +269,25 @@ def _copy(kind: str, like: str, file: Path) -> str:
     """Return the text of a built-in file under the name of another file."""
     text = (built_in_folder(kind) / f"{_known(kind, like)}.toml").read_text(encoding="utf-8")
     return _with_schema(_schema(kind), _named(text, file))
+
+
+def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
+    """Return the text of a robot like a built-in one with other lengths, m."""
+    from dynamics import load_robot
+    from dynamics.robot_lengths import robot_of_lengths
+    from dynamics.robot_text import robot_text
+    from identify.loop_parameters import loop_settings
+    from identify.scenario import load_scenario
+
+    chosen = load_robot(_known("robot", like))
+    given = load_scenario("paper")
+    slower = given.timing.model_copy(update={"frame_rate_hz": 29.0, "latency_s": 1 / 29})
+    loops = [
+        loop_settings(chosen, given.servo, timing, given.control, given.plant)
+        for timing in (given.timing, slower)
+    ]
+    made, comments = robot_of_lengths(_toml(file).stem, chosen, lengths, loops)
+    return _with_schema(_schema("robot"), robot_text(made, comments))
 
 
 def _of_a_workshop(text: str) -> str:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from identify.commands.help import Command, Commands
@@ -13,7 +14,7 @@ from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
-    from dynamics import Robot
+    from dynamics import Robot, RobotModel
     from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
@@ -181,32 +182,37 @@ def _export() -> None:
     pass
 
 
+OfResult = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SET|FILE",
+        help="Parameter set of the robot, or result.json of a run, for its estimates.",
+        show_default="guess",
+    ),
+]
+AllowUnphysical = Annotated[
+    bool,
+    typer.Option(
+        "--allow-unphysical-inertia",
+        help="If a body breaks Ix + Iy >= Iz, write the nearest inertia that engines accept.",
+    ),
+]
+
+
+def _file(default: str) -> Any:
+    return typer.Option(
+        metavar="FILE",
+        help="File to write. An existing file is replaced.",
+        show_default=default,
+    )
+
+
 @export.command(cls=Command)
 def mjcf(
     robot: RobotArgument,
-    parameters: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SET|FILE",
-            help="Parameter set of the robot, or result.json of a run, for its estimates.",
-            show_default="guess",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File to write. An existing file is replaced.",
-            show_default="ROBOT.xml",
-        ),
-    ] = None,
-    allow_unphysical_inertia: Annotated[
-        bool,
-        typer.Option(
-            "--allow-unphysical-inertia",
-            help="If a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo accepts.",
-        ),
-    ] = False,
+    parameters: OfResult = None,
+    out: Annotated[Path | None, _file("ROBOT.xml")] = None,
+    allow_unphysical_inertia: AllowUnphysical = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the robot as MJCF, a closed chain that MuJoCo loads.
@@ -219,22 +225,61 @@ def mjcf(
       cmmsim export mjcf rss6 --parameters runs/paper-0/result.json \\
         --allow-unphysical-inertia
     """
-    from dynamics import load_robot
-    from dynamics.engines.mjcf import mjcf_text
+    model, values = _chosen_model(robot, parameters)
+    text = model.mjcf(allow_unphysical_inertia)
+    path = out or Path(f"{model.robot.name}.xml")
+    write_text(path, text, parents=True)
+    _tell_export(model.robot, values, [path], quiet)
+
+
+@export.command(cls=Command)
+def urdf(
+    robot: RobotArgument,
+    parameters: OfResult = None,
+    out: Annotated[Path | None, _file("ROBOT.urdf")] = None,
+    allow_unphysical_inertia: AllowUnphysical = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write the robot as URDF, with the closures of its loops in a YAML file of the same name.
+
+    URDF knows only trees. The YAML lists the frames that coincide in each closed loop, as
+    cmmsim import urdf reads them.
+
+    Reads a robot file, and the result.json that --parameters names. Writes two files.
+
+    \b
+    Example:
+      cmmsim export urdf ups6 --parameters runs/ups6/result.json --out mine.urdf
+    """
+    from identify.files.atomic import write_files
+
+    model, values = _chosen_model(robot, parameters)
+    texts = model.urdf(allow_unphysical_inertia)
+    path = out or Path(f"{model.robot.name}.urdf")
+    paths = [path, path.with_suffix(".yaml")]
+    if paths[0] == paths[1]:
+        raise typer.BadParameter(
+            f"{path} is the name of the closures: name the URDF otherwise", param_hint="--out"
+        )
+    write_files({one: text.encode() for one, text in zip(paths, texts, strict=True)}, parents=True)
+    _tell_export(model.robot, values, paths, quiet)
+
+
+def _chosen_model(robot: str, parameters: str | None) -> "tuple[RobotModel, Array]":
+    """Return the model of a robot with chosen parameters, and these parameters (p,)."""
+    from dynamics import RobotModel, load_robot
     from identify.loop_parameters import choose_parameters
 
-    with terminal_progress(quiet).stage("export", 1) as advance:
-        chosen_robot = load_robot(robot)
-        chosen = choose_parameters(chosen_robot, parameters)
-        allowed = allow_unphysical_inertia
-        text = mjcf_text(
-            chosen_robot, chosen.values, allow_unphysical_inertia=allowed, source=chosen.source
-        )
-        path = out or Path(f"{chosen_robot.name}.xml")
-        write_text(path, text, parents=True)
-        advance()
+    chosen_robot = load_robot(robot)
+    chosen = choose_parameters(chosen_robot, parameters)
+    gains = chosen_robot.parameter_sets["guess"].joint_pid
+    with_values = chosen_robot.with_parameters(np.concatenate([chosen.values, gains]))
+    return RobotModel(with_values, chosen.source), chosen.values
+
+
+def _tell_export(robot: "Robot", parameters: "Array", paths: list[Path], quiet: bool) -> None:
     if not quiet:
-        for line in [*_changes(chosen_robot, chosen.values), f"model: {path}"]:
+        for line in [*_changes(robot, parameters), *(f"model: {path}" for path in paths)]:
             typer.echo(line)
 
 

@@ -32,6 +32,7 @@ from identify.files.run_folder import (
 )
 from identify.progress import print_warnings, terminal_progress
 from identify.runtime import interruptible_imports
+from identify.scenario import Scenario
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 """Files that the first two stages write."""
@@ -80,6 +81,8 @@ def run(
     # An experiment that was begun in this folder is continued, so its files are allowed there.
     begun = _pipeline().is_begun(Setup(with_renderer(chosen), seed), path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
+    if not begun:
+        _warn_of_robot(chosen, quiet)
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_goals(result, folder.report))
@@ -311,6 +314,14 @@ def report(
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)
+
+
+def _warn_of_robot(scenario: Scenario, quiet: bool) -> None:
+    """Say in one line that `cmmsim check` finds fault with a robot file."""
+    from identify.verification.robot_check import run_warning
+
+    said = run_warning(scenario, terminal_progress(quiet))
+    print_warnings([said] if said else [])
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:

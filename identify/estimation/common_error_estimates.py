@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
@@ -119,9 +120,9 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
 
 
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:
-    """Return the covariance (p, p) of an estimate due to each kind of common errors.
+    """Return the covariance (q, q) of estimates due to each kind of common errors.
 
-    moved (p, k): change of the estimate by each standard normal number of `shared_draws`.
+    moved (q, k): change of the estimate by each standard normal number of `shared_draws`.
     """
     of_common: dict[str, Array] = {}
     for run in runs:
@@ -160,6 +161,20 @@ def common_error_estimates(
         )
         found.append(estimates)
     return found
+
+
+def with_first_errors(problem: OutputErrorProblem, whole: Array) -> Array:
+    """Return the covariance (p + k, p + k) of the parameters and of the first record's errors.
+
+    whole: covariance of the parameters and of the common errors of all records, in prior standard
+    deviations of the errors.
+    """
+    count = len(problem.guess.values)
+    first = problem.runs[0]
+    factor = np.zeros((0, 0)) if first.marginal is None else first.common.whole_factor
+    units = block_diag(np.eye(count), factor)
+    kept = slice(0, units.shape[1])
+    return np.asarray(units @ whole[kept, kept] @ units.T)
 
 
 def clock_notes(records: Sequence[CommonErrorEstimates]) -> tuple[str, ...]:

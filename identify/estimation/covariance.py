@@ -50,6 +50,15 @@ from identify.model.loop_model import LoopModel
 from identify.progress import Advance
 from identify.runtime import cores
 
+NOISE, MODEL, LOAD, GUESS, ANCHOR = "noise", "model", "load", "guess", "anchor"
+"""Sources of uncertainty beside the common errors: noise of the poses, error of the model, error of
+a known load, errors of the initial guess, and error of the scale anchor.
+"""
+CORRELATED = "correlated"
+"""What kinds of common errors add together that are correlated beforehand."""
+ROUNDING = 1e-9
+"""Largest difference of variances that counts as rounding, as a share of the variance."""
+
 DRAWS = 100
 """Number of repetitions. They determine a standard deviation to 7 %."""
 
@@ -66,10 +75,9 @@ class Uncertainty:
     whole : ndarray, shape (p + k, p + k)
         Covariance of the estimate and the k common errors. The common errors follow record by
         record, in units of their prior standard deviations.
-    of_guess : ndarray, shape (p, p)
-        Part of the estimate's covariance due to errors of the initial guess.
-    of_common : dict of ndarray, shape (p, p)
-        Parts due to common errors, by their kinds.
+    sources : dict of ndarray, shape (p + k, p + k)
+        Parts of the covariance by the sources of the uncertainty, whose sum it is: NOISE, MODEL,
+        LOAD, GUESS, ANCHOR, the kinds of common errors, and CORRELATED.
     information : ndarray, shape (p, p)
         Information of the poses alone.
     gradient : ndarray, shape (p,)
@@ -81,8 +89,7 @@ class Uncertainty:
     """
 
     whole: Array
-    of_guess: Array
-    of_common: dict[str, Array]
+    sources: dict[str, Array]
     information: Array
     gradient: Array
     misfit: Misfit
@@ -92,6 +99,19 @@ class Uncertainty:
     def covariance(self) -> Array:
         """Covariance (p, p) of the estimate."""
         return self.whole[: len(self.gradient), : len(self.gradient)]
+
+    @property
+    def of_guess(self) -> Array:
+        """Part (p, p) of the estimate's covariance due to errors of the initial guess."""
+        size = len(self.gradient)
+        return self.sources[GUESS][:size, :size]
+
+    @property
+    def of_common(self) -> dict[str, Array]:
+        """Parts (p, p) of the estimate's covariance due to common errors, by their kinds."""
+        size = len(self.gradient)
+        kinds = self.sources.keys() - {NOISE, MODEL, LOAD, GUESS, ANCHOR, CORRELATED}
+        return {kind: part[:size, :size] for kind, part in self.sources.items() if kind in kinds}
 
     @property
     def std(self) -> Array:
@@ -136,23 +156,34 @@ def estimate_uncertainty(
     units = _units([all_known, *(one.rows.reshape(-1, whole) for one in linear)])
     shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
+    by_scores = {NOISE: scores}
     if misfit.significant:
         # An error of the model lasts for many frames, so their residuals are correlated.
         model = sum(
             coloured_score_covariance(one.left, one.rows, run.ok)
             for run, one in zip(runs, shown, strict=True)
         )
-        scores = scores + misfit.share_of_model * model
+        by_scores[MODEL] = np.asarray(misfit.share_of_model * model)
     if any(run.payload_errors.any() for run in runs):
         moved = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
-        scores = scores + load_score_covariance(runs, moved)
+        by_scores[LOAD] = load_score_covariance(runs, moved)
+    scores = np.sum(list(by_scores.values()), axis=0)
     beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
     covariance = units @ (scores + beforehand) @ units.T
+    # This removes asymmetry due to rounding.
+    covariance = (covariance + covariance.T) / 2
+    sources = {kind: units @ part @ units.T for kind, part in by_scores.items()}
+    place, _ = problem.anchor.row(problem.guess.layout)
+    for kind, rows in ((GUESS, problem.guess.rows), (ANCHOR, place)):
+        if len(rows):
+            sources[kind] = _information(rows @ units[:size] @ units.T)
+    sources |= covariance_by_kind(firsts, units @ units[size:].T @ drawn)
+    rest = covariance - sum(sources.values())
+    if (np.abs(np.diag(rest)) > ROUNDING * np.diag(covariance)).any():
+        sources[CORRELATED] = rest
     return Uncertainty(
-        # This removes asymmetry due to rounding.
-        (covariance + covariance.T) / 2,
-        _information(problem.guess.rows @ units[:size] @ units[:size].T),
-        covariance_by_kind(firsts, units[:size] @ units[size:].T @ drawn),
+        covariance,
+        sources,
         information,
         np.asarray(gradient),
         misfit,

@@ -17,7 +17,11 @@ from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
 from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.clock_hint import clock_hints
-from identify.estimation.common_error_estimates import clock_notes, common_error_estimates
+from identify.estimation.common_error_estimates import (
+    clock_notes,
+    common_error_estimates,
+    with_first_errors,
+)
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation
@@ -144,6 +148,9 @@ def identify(
         estimate=solution.parameters,
         std=uncertainty.std,
         covariance=uncertainty.covariance,
+        sources={
+            kind: with_first_errors(judged, part) for kind, part in uncertainty.sources.items()
+        },
         scale_anchor=problem.anchor,
         common_errors=errors[0],
         iterations=sum(one.solution.iterations for one in searches.values()),

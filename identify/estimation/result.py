@@ -17,12 +17,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from dynamics import Robot
+from dynamics import Robot, RobotModel
 from dynamics.closed_loop.drives import READS, cascade_gains
 from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounds import BoundedEstimate
+from identify.estimation.budget import Budget, parameter_budget
 from identify.estimation.common_error_estimates import CommonErrorEstimates
 from identify.estimation.conditioning import Conditioning
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
@@ -59,6 +60,8 @@ class IdentificationResult:
         Initial guess, linear estimate, and final estimate.
     std, covariance : ndarray, shapes (p,) and (p, p)
         Uncertainty of the estimate without regard to bounds.
+    sources : dict of ndarray, shape (p + k, p + k)
+        Parts of `whole_covariance` by the sources of the uncertainty.
     intervals : ndarray, shape (p, 2)
         95 % intervals, truncated at the bounds.
     identifiable : ndarray of bool, shape (p,)
@@ -100,6 +103,7 @@ class IdentificationResult:
     estimate: Array
     std: Array
     covariance: Array
+    sources: dict[str, Array]
     intervals: Array
     identifiable: NDArray[np.bool_]
     prior_share: Array
@@ -130,6 +134,14 @@ class IdentificationResult:
     def robot(self) -> Robot:
         """Identified robot. Its nominal parameters are the estimate."""
         return self.nominal.with_parameters(self.estimate)
+
+    def model(self) -> RobotModel:
+        """Return the identified model: torques, CasADi functions, MJCF and URDF."""
+        return RobotModel(self.robot, "identified parameters")
+
+    def budget(self) -> Budget:
+        """Return what each source of uncertainty adds to the variance of each parameter."""
+        return parameter_budget(self.layout, self.covariance, self.sources)
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
@@ -239,7 +251,6 @@ class IdentificationResult:
         """Return the estimates with their uncertainty for JSON. The true values are None."""
         common = self.common_errors
         anchor = self.scale_anchor
-        whiteness = self.whiteness
         # Correlations of other parameters depend on the initial guess rather than on the record.
         identified = np.flatnonzero(self.identifiable)
         correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
@@ -254,8 +265,8 @@ class IdentificationResult:
             "active_bounds": list(self.active_bounds),
             **{name: getattr(self, name) for name in MISFIT},
             "whiteness": {
-                "p_value": whiteness.p_value,
-                "p_values": dict(zip(POSE, whiteness.p_values, strict=True)),
+                "p_value": self.whiteness.p_value,
+                "p_values": dict(zip(POSE, self.whiteness.p_values, strict=True)),
             },
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": pairs,

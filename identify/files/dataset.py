@@ -232,6 +232,10 @@ def as_number(value: object) -> float:
 
 
 VARIABLE = "covariance"
+PARTS = "source_covariance"
+SOURCE = "source"
+SUM_TOLERANCE = 1e-9
+"""Largest difference of a covariance and the sum of its parts, in standard deviations."""
 DIMENSIONS = ("parameter", "parameter_2")
 
 
@@ -253,17 +257,46 @@ def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict
     return units | {name: name.rpartition("_")[2] if "_" in name else "1" for name in others}
 
 
-def covariance_netcdf(units: Mapping[str, str], covariance: Array) -> bytes:
+def covariance_netcdf(
+    units: Mapping[str, str], covariance: Array, sources: Mapping[str, Array] | None = None
+) -> bytes:
     """Return the file of a covariance (p, p) of quantities, which are given by name with
     their units.
+
+    `sources` are the parts of the covariance (p, p) by the sources of the uncertainty.
     """
-    labels = {name: list(units) for name in DIMENSIONS}
+    labels: dict[str, list[str]] = {name: list(units) for name in DIMENSIONS}
     described = {
         "units": "product of the units of both parameters",
         "long_name": "covariance of the estimates",
     }
     data = xr.Dataset({VARIABLE: (DIMENSIONS, covariance, described)}, coords=labels)
+    if sources:
+        parts = np.stack(list(sources.values()))
+        named = described | {"long_name": "part of the covariance by a source of uncertainty"}
+        data[PARTS] = xr.DataArray(parts, dims=(SOURCE, *DIMENSIONS), attrs=named)
+        data = data.assign_coords({SOURCE: list(sources)})
     return netcdf({"": data.assign_coords(unit=(DIMENSIONS[0], list(units.values())))})
+
+
+def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
+    """Read the parts of a covariance (p, p) by the sources of the uncertainty.
+
+    Raises RecordError if the file has none, or if their sum is not the covariance.
+    """
+    data = read_group(path)
+    if PARTS not in data or data[PARTS].dims != (SOURCE, *DIMENSIONS):
+        raise RecordError(
+            f"{path} has no sources of its covariance, because an older version wrote it; repeat: "
+            f"cmmsim identify --out {Path(path).parent}"
+        )
+    parts = np.asarray(data[PARTS].values, dtype=float)
+    std = np.sqrt(np.diag(covariance))
+    fits = parts.shape[1:] == covariance.shape
+    off = (parts.sum(axis=0) - covariance) / np.outer(std, std) if fits else np.array(np.nan)
+    if not np.abs(off).max() < SUM_TOLERANCE:
+        raise RecordError(f"{path}: the sources of the covariance do not sum up to it")
+    return dict(zip(map(str, data[SOURCE].values), parts, strict=True))
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:

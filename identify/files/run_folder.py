@@ -37,7 +37,7 @@ WRITTEN_BY = {
 UNFINISHED = ("geometry", "trajectories.json")
 """Files that `excite` writes before the scenario. Without the scenario, a plan is not complete."""
 
-BEGUN = ("geometry", "figures", *WRITTEN_BY)
+BEGUN = ("geometry", "figures", "budget", *WRITTEN_BY)
 """Files and folders that the folder of an unfinished run may hold."""
 
 
@@ -56,6 +56,7 @@ class RunFolder:
         self.result = path / "result.json"  # figures of the run
         self.report = path / "report.html"
         self.figures = path / "figures"
+        self.budget = path / "budget"  # what each source adds to the uncertainty
 
     @property
     def whole_scenario(self) -> Path:

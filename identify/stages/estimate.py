@@ -157,7 +157,7 @@ def _identified_files(
         made_of["model.nc"] = digest(runs)
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     units = parameter_units(result.layout, result.common_errors.names)
-    files[run_folder.covariance] = covariance_netcdf(units, covariance)
+    files[run_folder.covariance] = covariance_netcdf(units, covariance, result.sources)
     entries: dict[str, Any] = {
         "scenario": scenario.name,
         "seed": seed,

@@ -171,8 +171,7 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         scale(axes, have[path])
         axes.set_xlabel(axis_label(path, study))
         axes.set_ylabel(axis_label(name, study))
-        if any(label != "rows" for label in axes.get_legend_handles_labels()[1]):
-            axes.legend(fontsize="small")
+    _legend_below(figure, panels)
     what = f"rms over rows, {100 * BANDS:.0f} % band" if study.sample is None else "single rows"
     _title(figure, f"{study.title or study.name}: {what}")
     return figure
@@ -227,7 +226,7 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         )
         axes.set_xlabel(axis_label(factor, study))
         axes.set_ylabel(axis_label(law.figure, study, law.per))
-        axes.legend(fontsize="small")
+    _legend_below(figure, panels)
     _title(
         figure,
         f"{study.title or study.name}: measured exponent and its {100 * LAWS:.0f} % interval",
@@ -250,6 +249,24 @@ def _title(figure: Figure, text: str) -> None:
     figure.suptitle(
         "\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9
     )
+
+
+def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
+    """Draw one legend of all panels below them, where it covers no data."""
+    found: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        found = dict(zip(labels, handles, strict=True)) | found
+    if set(found) - {"rows"}:
+        widest = max(map(len, found))
+        columns = max(1, int(LETTERS_PER_INCH * figure.get_figwidth() / (widest + 8)))
+        figure.legend(
+            found.values(),
+            found,
+            loc="outside lower center",
+            ncols=min(columns, len(found)),
+            fontsize="small",
+        )
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
@@ -315,7 +332,7 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
         "--",
         color="black",
         linewidth=1,
-        label=f"theory, power {exponent:g}",
+        label=f"theory: $y \\propto x^{{{exponent:g}}}$",
     )
 
 

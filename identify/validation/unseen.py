@@ -1,22 +1,17 @@
-"""Validation: plant and models on trajectories that were not used for the estimate (section 4.3).
-
-The expected difference between plant and model is also predicted.
-"""
+"""Plant and models on trajectories that were not used for the estimate (section 4.3)."""
 
 from __future__ import annotations
 
 import multiprocessing
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag
 
 import cmmsim
 from dynamics import Robot
@@ -30,21 +25,14 @@ from dynamics.closed_loop import (
 from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
 )
-from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
-from identify.estimation.base_parameters import structure
-from identify.estimation.covariance import repeated_experiments
 from identify.excitation.design import Design, unseen_trajectories
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import SensorPlan
-from identify.model.body_errors import body_errors
 from identify.model.from_record import predicting_model
-from identify.model.loop_model import LoopModel
 from identify.model.model_side import ModelSide
 from identify.progress import Advance, Progress
-from identify.random_streams import PREDICTION, stream_seed
-from identify.record.checks import TooFewFramesError
 from identify.record.conditions import SERVO, logged_latencies, recorded_law
 from identify.record.recording import is_timed, recorded_reference
 from identify.runtime import cores
@@ -139,175 +127,6 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
         return run.model_poses(parameters)
     except LoopFailure:
         return np.full_like(run.measured, np.nan)
-
-
-REPETITIONS = 4
-"""Number of repeated experiments per motion.
-
-With hundreds of frames each, they determine the effect of noise to 5 %.
-"""
-
-
-@dataclass(frozen=True)
-class PosePrediction:
-    """Predicted poses of the plant with their covariance.
-
-    The poses of plant and model differ for three reasons:
-
-    - The parameters are uncertain. Their covariance C acts through the exact sensitivities S of
-      the model's poses as S C S^T.
-    - The sensor's noise moves the plant through the servo, which no model can predict. The
-      covariance of this motion is sampled by repeated experiments on the identified model, and is
-      assumed constant along the motion.
-    - All measured poses have common errors that the record states, and the geometry has errors. The
-      servo compensates such an error in the measured pose, and thereby shifts the platform. The
-      error is constant along the motion. Poses and covariance contain its estimate from the record
-      of the identification.
-
-    Attributes
-    ----------
-    chart : Chart
-        Coordinates of the platform.
-    poses : ndarray, shape (N, 6)
-        Predicted poses, m and rad.
-    covariance : ndarray, shape (N, 6, 6)
-        Covariance of the plant's true poses about the predicted poses. It is zero along directions
-        in which the platform cannot move.
-    slopes : ndarray, shape (N, 6, p), optional
-        Sensitivities of the poses. They are given only if no frame is lost, poses have no common
-        errors, the platform carries no load, and the servo drives the model.
-    """
-
-    chart: Chart
-    poses: Array
-    covariance: Array
-    slopes: Array | None = None
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (N, 6) [m, rad]."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
-
-    def normalised_squared_error(self, true: Array) -> float:
-        """Return the mean over the frames of e^T P^-1 e / m.
-
-        The error e of the true poses (N, 6) is expressed in the m coordinates of the platform. The
-        result is near one if the covariance P is right. Errors of parameters last for the whole
-        motion, so the result of a single run scatters widely about one.
-        """
-        free = self.chart.basis
-        errors = (true - self.poses) @ free
-        weighted = np.linalg.solve(free.T @ self.covariance @ free, errors[..., None])[..., 0]
-        return float(np.mean(np.sum(errors * weighted, axis=1))) / free.shape[1]
-
-
-def predict_poses(
-    run: LoopModel,
-    parameters: Array,
-    covariance: Array,
-    rng: np.random.Generator,
-    learned: Mapping[str, float] | None = None,
-) -> PosePrediction:
-    """Return the predicted poses of a run with estimated parameters.
-
-    The prediction uses the reference, the sensor's covariance and the lost frames of the run, but
-    not its measured poses.
-
-    Parameters
-    ----------
-    run : LoopModel
-        Model of the run.
-    parameters : ndarray, shape (p,)
-        Estimates.
-    covariance : ndarray, shape (p, p) or (p + k, p + k)
-        Covariance of the estimates, or of the estimates and the learned errors.
-    rng : numpy.random.Generator
-        Source of the noise of the repeated experiments.
-    learned : mapping, optional
-        Estimates, by name, of k common errors of this run and of the record of the identification.
-        If the names differ from the errors of the run, the prior of the run's errors is used.
-
-    Raises
-    ------
-    LoopFailure
-        If the model, or its repetition with the sensor's noise, is unstable.
-    """
-    likely, root, known = _known_in_common(run, covariance, len(parameters), learned or {})
-    inside = len(run.errors_had)
-    run = replace(run, bodies=body_errors(run, parameters)).having(likely[:inside])
-    model = run.simulate(parameters, sensitivities=True)
-    assert model.pose_sensitivity is not None
-    drawn = []
-    for repeated in repeated_experiments(run, parameters, [rng] * REPETITIONS):
-        if isinstance(repeated, LoopFailure):
-            raise repeated
-        drawn.append(repeated.pose - model.pose)
-    noise = np.concatenate(drawn)
-    common = run.pose_modes(parameters)
-    by_parameters = run.of_all(model.pose_sensitivity)
-    slopes = np.concatenate([by_parameters, common @ root], axis=2)
-    # Deviations by noise have mean zero, so their second moment is the covariance.
-    spread = slopes @ known @ slopes.transpose(0, 2, 1) + noise.T @ noise / len(noise)
-    alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())
-    poses = model.pose + common[:, :, inside:] @ likely[inside:]
-    return PosePrediction(run.robot.geometry.chart, poses, spread, by_parameters if alone else None)
-
-
-def _known_in_common(
-    run: LoopModel, covariance: Array, parameters: int, learned: Mapping[str, float]
-) -> tuple[Array, Array, Array]:
-    """Return what is known beforehand about the common errors of a run's poses.
-
-    The errors are a linear function of k independent numbers. The first result (k,) is the most
-    likely values of these numbers. The second is the matrix (k, k) from the numbers with known
-    covariance to these numbers. The third is the covariance (p + k, p + k) of the parameters and
-    the numbers with known covariance.
-    """
-    names = run.common.all_names
-    if names and tuple(learned) == names:
-        # The factor has no inverse if the covariance lacks full rank.
-        root = np.asarray(np.linalg.pinv(run.common.whole_factor))
-        return root @ np.array([*learned.values()]), root, covariance
-    each = np.eye(len(names))
-    whole = np.asarray(block_diag(covariance[:parameters, :parameters], each))
-    return np.zeros(len(names)), each, whole
-
-
-def predicted_runs(
-    side: ModelSide,
-    records: Sequence[xr.Dataset],
-    parameters: Array,
-    covariance: Array,
-    seed: int,
-    progress: Progress,
-    learned: Mapping[str, float] | None = None,
-) -> list[PosePrediction]:
-    """Predict the plant on the references of records from the identified model.
-
-    The parameters (p,) have covariance (p, p). For ``learned`` see `predict_poses`. All poses of a
-    prediction are NaN if the loop is unstable, or if too few frames were measured to determine the
-    sensor's noise.
-
-    Raises RecordError or EstimationError for a record that is damaged, or of another robot, timing
-    or servo. Raises dynamics.DynamicsError for parameters that no model can have.
-    """
-    groups = structure(side.robot).rigid_groups
-    predictions = []
-    with progress.stage("predict", len(records)) as advance:
-        for number, record in enumerate(records, start=1):
-            rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
-            try:
-                run = replace(predicting_model(record, side), groups=groups)
-                prediction = predict_poses(run, parameters, covariance, rng, learned)
-            except (LoopFailure, TooFewFramesError):
-                shape = (record.sizes["time"], 6)
-                chart = side.robot.geometry.chart
-                prediction = PosePrediction(
-                    chart, np.full(shape, np.nan), np.full((*shape, 6), np.nan)
-                )
-            predictions.append(prediction)
-            advance()
-    return predictions
 
 
 class _Worker:

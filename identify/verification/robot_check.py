@@ -6,79 +6,32 @@ frame, without dry friction.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from textwrap import shorten
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cmmsim.files import SensorFile
-from dynamics import Robot, closed_loop, workspace
-from dynamics.closed_loop import stability
-from dynamics.control.gains import design_servo, largest_bandwidth, servo_figures, torque_figures
-from dynamics.control.inverse_dynamics import Model
-from dynamics.control.law import Feedback
-from dynamics.errors import DynamicsError, SimulationError
+from dynamics import Robot, built_in_robots, load_robot, workspace
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
+from identify.experiment.law_in_loop import feedback
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances
+from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Excitation
-from identify.scenario.plant_sections import Control
+from identify.scenario import Excitation, Scenario
+from identify.verification.finding import Finding
+from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
 
 SAMPLES = 2000
 """Number of random joint coordinates over the travel."""
 
+LONGEST = 160
+"""Largest number of characters of a finding in a message."""
+
 NEGLIGIBLE_CHANGE = 1e-9
 """Largest relative change of an acceleration that counts as zero."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Result of one check.
-
-    ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the number
-    1..n of the leg concerned, or None if no single leg is concerned. ``text`` is a sentence.
-    """
-
-    check: str
-    ok: bool
-    value: float | None
-    limit: float | None
-    unit: str
-    leg: int | None
-    text: str
-
-    def entry(self) -> dict[str, Any]:
-        """Return the finding as a JSON entry."""
-        return asdict(self)
-
-
-@dataclass(frozen=True)
-class CheckSettings:
-    """Loop and sensor with which a robot is checked.
-
-    Attributes
-    ----------
-    settings : LoopSettings
-        Servo, timing, friction and drives.
-    control : Control
-        Requested bandwidth and damping for the design of the servo, if any.
-    feedback : Feedback
-        Bandwidth and damping of computed_torque.
-    limits : Excitation
-        Limits of leverage and condition number.
-    sensor, sensor_file : str and SensorFile
-        Name of the sensor for messages, and its file.
-    """
-
-    settings: closed_loop.LoopSettings
-    control: Control
-    feedback: Feedback
-    limits: Excitation
-    sensor: str
-    sensor_file: SensorFile
 
 
 def check_robot(
@@ -94,8 +47,9 @@ def check_robot(
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
         lambda: _centres(robot, parameters),
-        lambda: _loop(robot, parameters, around.settings),
-        lambda: _designed(robot, parameters, around),
+        lambda: check_loop(robot, parameters, around.settings),
+        lambda: check_steps(robot, parameters, around),
+        lambda: check_gains(robot, parameters, around),
         lambda: _seen(robot, around.sensor, around.sensor_file),
     ]
     findings = []
@@ -104,6 +58,49 @@ def check_robot(
             findings += list(question())
             advance()
     return findings
+
+
+def checked_in(
+    scenario: Scenario, robot: Robot, set_name: str | None = None, progress: Progress | None = None
+) -> tuple[str, list[Finding]]:
+    """Return the name of a parameter set, and the findings about it in the loop of a scenario.
+
+    The default set is the scenario's truth, or the initial guess if the robot has no such set.
+    """
+    truth = scenario.plant.parameters
+    name = set_name or (truth if truth in robot.parameter_sets else NOMINAL)
+    check_parameter_set(robot, name)
+    servo, timing, control = scenario.servo, scenario.timing, scenario.control
+    around = CheckSettings(
+        settings=loop_settings(robot, servo, timing, control, scenario.model),
+        control=control,
+        feedback=feedback(control, timing),
+        limits=scenario.excitation,
+        sensor=scenario.sensor,
+        sensor_file=scenario.sensor_file(),
+        plant_steps=scenario.plant.steps_per_frame,
+    )
+    return name, check_robot(robot, robot.parameter_sets[name].vector, around, progress)
+
+
+def run_warning(scenario: Scenario, progress: Progress | None = None) -> str | None:
+    """Return one line if the check finds fault with the robot file of a scenario, else None.
+
+    Built-in robots are not checked, because their documentation states their faults.
+    """
+    if scenario.robot in built_in_robots():
+        return None
+    robot = load_robot(scenario.robot)
+    _, findings = checked_in(scenario, robot, progress=progress)
+    failed = [finding for finding in findings if not finding.ok]
+    if not failed:
+        return None
+    more = f", and of {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
+    said = shorten(failed[0].text, LONGEST, placeholder=" …")
+    return (
+        f"cmmsim check finds fault with {robot.name}: of {failed[0].check} ({said}){more}; the run "
+        f"begins nevertheless; for all findings: cmmsim check {scenario.robot}"
+    )
 
 
 def _freedoms(robot: Robot) -> Iterator[Finding]:
@@ -250,107 +247,6 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
     )
     share = float(off[worst] / reach[worst])
     yield Finding("centres of mass", share <= 1.0, share, 1.0, "1", leg, text)
-
-
-def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Iterator[Finding]:
-    timing = settings.timing
-    home = robot.home_pose
-    arguments = robot, parameters, settings, home
-    try:
-        radius = stability.spectral_radius(*arguments)
-    except DynamicsError as error:
-        # The robot is singular at home, which another finding reports.
-        text = f"the loop cannot be judged at home: {error}"
-        yield Finding("loop", False, None, 1.0, "1", None, text)
-        return
-    at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
-    text = (
-        f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is "
-        "stable below 1"
-    )
-    yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
-    factor = stability.gain_margin(*arguments)
-    gains = settings.servo
-    text = (
-        f"the servo's gains, kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = "
-        f"{gains.ki:.4g} 1/s, can be {factor:.3g} times as large until the loop is unstable"
-    )
-    if not factor > 0:
-        text = "the loop is unstable with any gains of the servo"
-    elif factor < 1:
-        text = text.replace("can be", "must be")
-        text = text.replace(" until the loop is unstable", " for a stable loop")
-    yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
-    rate = stability.lowest_frame_rate(*arguments)
-    text = (
-        f"the loop is stable from {rate:.3g} Hz on with this latency"
-        if rate > 0
-        else "no frame rate makes it stable"
-    )
-    yield Finding(
-        "frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text
-    )
-
-
-def _designed(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
-    """Check the gains of the servo and of computed_torque.
-
-    If a bandwidth and a damping are requested, gains of the servo are also designed.
-    """
-    settings = around.settings
-    home = robot.home_pose
-    control = around.control
-    asked = around.feedback
-    model = Model(robot, parameters, settings.friction)
-    try:
-        found = servo_figures(model, settings, home)
-        torques = torque_figures(model, settings, home, asked)
-        limit = largest_bandwidth(model, settings, home, asked)
-    except DynamicsError as error:
-        text = f"the loop cannot be judged at home: {error}"
-        yield Finding("bandwidth", False, None, None, "rad/s", None, text)
-        return
-    text = (
-        f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of "
-        f"{found.damping:.3g}"
-    )
-    bandwidth: float | None = found.bandwidth
-    if found.radius >= 1:
-        bandwidth = None
-        text = "an unstable loop has no bandwidth"
-    yield Finding("bandwidth", found.radius < 1, bandwidth, None, "rad/s", None, text)
-    wanted = control.servo_bandwidth_rad_s
-    if wanted is not None:
-        try:
-            gains = design_servo(model, settings, home, wanted, control.servo_damping)
-            made = servo_figures(model, replace(settings, servo=gains), home)
-            text = (
-                f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a "
-                f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
-                f"{made.gain_margin:.3g} times these gains make the loop unstable"
-            )
-            yield Finding(
-                "servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text
-            )
-        except SimulationError as error:
-            yield Finding("servo by design", False, None, 1.0, "1", None, str(error))
-    w = asked.bandwidth
-    nyquist = np.pi * settings.timing.frame_rate_hz
-    text = (
-        f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = "
-        f"{2 * asked.damping * w:.4g} 1/s, has the largest eigenvalue {torques.radius:.4g}, which "
-        "is stable below 1"
-    )
-    if torques.radius < 1:
-        text += f"; {torques.gain_margin:.3g} times these gains make it unstable"
-    yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
-    known = limit if limit > 0 else None
-    most = f"up to {limit:.3g} rad/s" if limit > 0 else "with no bandwidth"
-    text = f"computed_torque is stable {most}"
-    # Commands come once per frame, so bandwidths above half the frame rate are not searched.
-    if limit == nyquist:
-        text = f"computed_torque is stable up to {nyquist:.3g} rad/s, half the frame rate"
-    yield Finding("torque bandwidth", w <= limit, w, known, "rad/s", None, text)
 
 
 def _seen(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:

@@ -18,8 +18,8 @@ from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
 from identify.record.pose_noise import JUMPS, mean_rate
 from identify.record.suspicions import joint_motion
+from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
-from identify.verification.robot_check import Finding
 
 RATE = 0.01
 """Largest relative difference of a frame rate from the stated one."""

@@ -7,8 +7,8 @@ from identify.reporting.figures import logs as figures
 from identify.reporting.pictures import Picture
 from identify.reporting.report import page_environment, picture_elements
 from identify.reporting.tables import Table, number
+from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
-from identify.verification.robot_check import Finding
 
 MISSED = "MISSED"
 """Word for a finding beyond its limit, which the style of the page marks."""

@@ -1,12 +1,16 @@
 """The end of a session: the table and saved figures; and what is refused before it begins."""
 
+import contextlib
 import json
+import re
+import textwrap
 
 import numpy as np
 import pytest
 
 from identify.accuracy.__main__ import main
-from tests.accuracy.conftest import COMPARE, FIGURES, SAVE
+from identify.accuracy.figure import Accuracy
+from tests.accuracy.conftest import COMPARE, FIGURES, QUICK, SAVE
 
 
 @pytest.fixture
@@ -98,8 +102,82 @@ def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
     assert ends["few seen"] == "-11% undecided"
     assert not [name for name in ("good", "seen", "open", "value") if "undecided" in ends[name]]
     done.stdout.fnmatch_lines(
-        ["undecided: passed, because the interval contains the limit; more values would decide"]
+        ["undecided: passed, because the interval contains the limit; accuracy.sample_until draws*"]
     )
+
+
+def test_values_are_drawn_until_the_limit_is_decided_or_there_are_enough(project):
+    done = project(
+        """
+        def values(mean):
+            drawn = []
+            def draw(n):
+                drawn.append(n)
+                return mean + 0.1 * RNG.standard_normal(n)
+            return drawn, draw
+
+        def test_it(accuracy):
+            for name, mean, most in (("far", 0, 640), ("near", 0.95, 640), ("at", 1, 100)):
+                drawn, draw = values(mean)
+                accuracy.sample_until(name, draw, limit=1.0, most=most)
+                print(name, drawn)
+
+        def test_beyond(accuracy):
+            accuracy.sample_until("over", values(1.03)[1], limit=1.0)
+
+        def test_few(accuracy):
+            accuracy.sample_until("few", lambda n: [1.0, 2.0], limit=1.0)
+        """,
+        "-s",
+    )
+    done.assert_outcomes(passed=1, failed=2)
+    text = done.stdout.str()
+    counts = {
+        name: [int(one) for one in found.split(", ")]
+        for name, found in re.findall(r"^\.?(far|near|at) \[([\d, ]+)\]", text, re.MULTILINE)
+    }
+    assert counts["far"] == [20]
+    assert sum(counts["near"]) < 640
+    assert counts["at"] == [20, 20, 40, 20]
+    assert re.search(r"^  at .* undecided$", text, re.MULTILINE)
+    assert re.search("over: mean .* lies wholly above the limit", text)
+    assert "few: draw(20) returned 2 values" in text
+
+
+def test_intervals_of_values_that_are_drawn_until_decided_contain_the_mean():
+    """With a limit at the mean itself, every look could decide wrongly: 5 % of 1000 may."""
+    rng, missed = np.random.default_rng(5), 0
+    for _ in range(1000):
+        kept = []
+        recorder = Accuracy("test", kept)
+        with contextlib.suppress(pytest.fail.Exception):
+            recorder.sample_until("x", lambda n: rng.standard_normal(n), limit=0.0, most=160)
+        low, high = kept[0][1]["interval"]
+        missed += not low <= 0.0 <= high
+    assert missed <= 66  # 50 + 2.3 standard deviations
+
+
+def test_figures_are_kept_by_test_and_not_by_folder(pytester):
+    body = """
+    def test_it(accuracy, cmmsim_seed):
+        accuracy.record("seed", cmmsim_seed)
+    """
+    kept = ("--accuracy-dir", str(pytester.path / "kept"))
+    for name in ("one", "two"):
+        pytester.mkdir(name)
+        (pytester.path / name / "test_same.py").write_text(textwrap.dedent(body))
+    whole = pytester.runpytest_inprocess(*QUICK, "one", *SAVE, *kept)
+    whole.assert_outcomes(passed=1)
+    pytester.chdir()
+    for folder in ("one", "two"):
+        done = pytester.runpytest_inprocess(
+            *QUICK, f"--rootdir={folder}", folder, *COMPARE, "--accuracy-fail", "0", *kept
+        )
+        assert done.ret == 0
+        assert [line.split()[-1] for line in table(done)][2:] == ["+0.0%"]
+    both = pytester.runpytest_inprocess(*QUICK, "--import-mode=importlib", "one", "two", *kept)
+    assert both.ret == 1
+    both.stdout.fnmatch_lines(["*have the same name test_same.py::test_it, and only one of them*"])
 
 
 def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_markdown_table(

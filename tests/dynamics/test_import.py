@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.mjcf_import import robot_of_mjcf
+from dynamics.engines.urdf import urdf_texts
 from dynamics.engines.urdf_import import robot_of_urdf
 from dynamics.errors import RobotFileError
 from dynamics.inertia import physical_inertias, travel_states
@@ -21,7 +22,6 @@ from dynamics.robot import Robot, load_robot
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from tests.dynamics.conftest import SLOW_ROBOTS
-from tests.dynamics.urdf import urdf_of
 from tests.identify.commands import refusal
 
 
@@ -115,7 +115,7 @@ def test_full_bodies_of_legs_exported_and_imported_have_the_same_dynamics(name, 
     spin = [] if name == "rus6" else ["can spin about their length between two ball joints"]
     for description, notes in (
         robot_of_mjcf(tmp_path / "robot.xml"),
-        robot_of(tmp_path, *urdf_of(robot, values, False)),
+        robot_of(tmp_path, *urdf_texts(robot, values)),
     ):
         assert_same_dynamics(robot, values, description, tmp_path)
         assert [text for text in spin if not any(text in note for note in notes)] == []
@@ -143,7 +143,9 @@ def test_a_robot_written_as_urdf_with_closures_has_the_same_dynamics(
 ):
     robot = load_robot(name)
     values = with_bodies(robot)
-    description, notes = robot_of(tmp_path, *urdf_of(robot, values, platform_on_a_leg))
+    description, notes = robot_of(
+        tmp_path, *urdf_texts(robot, values, platform_on_a_leg=platform_on_a_leg)
+    )
     assert_same_dynamics(robot, values, description, tmp_path)
     assert ["joint PID" in note for note in notes] == [True]
     assert (description.parameter_sets["guess"].joint_pid > 0).all()
@@ -160,7 +162,7 @@ def test_loops_that_are_open_where_all_coordinates_are_zero_are_closed_first(tmp
     geometry = replace(robot.geometry, legs=tuple(turned), travel_limit=0.5)
     robot = Robot(RobotDescription("turned", geometry, robot.parameter_sets))
     values = with_bodies(robot)
-    description, _ = robot_of(tmp_path, *urdf_of(robot, values, False))
+    description, _ = robot_of(tmp_path, *urdf_texts(robot, values))
     assert np.abs(np.subtract(description.geometry.chart.home, robot.home_pose)).max() > 1e-3
     assert_same_dynamics(robot, values, description, tmp_path)
 
@@ -329,7 +331,7 @@ def test_a_model_of_no_known_kind_is_refused_in_one_line(robot, old, new, words,
     ],
 )
 def test_a_urdf_of_no_known_kind_is_refused_in_one_line(robot, which, old, new, words, tmp_path):
-    texts = dict(zip(("urdf", "yaml"), urdf_of(robot, with_bodies(robot), False), strict=True))
+    texts = dict(zip(("urdf", "yaml"), urdf_texts(robot, with_bodies(robot)), strict=True))
     assert old in texts[which]
     texts[which] = texts[which].replace(old, new, 1)
     assert re.search(

@@ -29,7 +29,8 @@ from identify.record.stored_common_errors import (
     store_common_errors,
 )
 from identify.reporting.tables import common_error_table
-from identify.validation.unseen import model_run, predicted_runs
+from identify.validation.prediction import predicted_runs
+from identify.validation.unseen import model_run
 from tests.identify.synthetic import (
     SIGMA,
     problem_of,

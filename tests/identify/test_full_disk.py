@@ -32,12 +32,12 @@ from matplotlib.figure import Figure
 from cmmsim.compilation import CompilationWarning
 from dynamics import load_robot
 from dynamics.compiled.object_files import DIGEST, load_object, save_object
+from dynamics.engines.urdf import urdf_texts
 from identify.experiment import warm_up
 from identify.files import atomic
 from identify.files.atomic import figure_bytes
 from identify.files.run_folder import as_json
 from identify.record.recording import write_runs
-from tests.dynamics.urdf import urdf_of
 from tests.identify.commands import command, leaves, one_line
 from tests.identify.static_poses import drawn, poses_of
 from tests.identify.study_rows import KIND
@@ -394,7 +394,7 @@ def made(tmp_path_factory):
     assert command("calibrate", "--render", 4, *pictures, *out) == 0
     assert command("export", "mjcf", "ups6", "--out", folder / "ups6.xml", "--quiet") == 0
     robot = load_robot("ups6")
-    urdf, closures = urdf_of(robot, robot.nominal_parameters, False)
+    urdf, closures = urdf_texts(robot)
     (folder / "robot.urdf").write_text(urdf, encoding="utf-8")
     (folder / "robot.yaml").write_text(closures, encoding="utf-8")
     return folder

@@ -55,6 +55,21 @@ def test_a_new_robot_is_the_built_in_one_under_the_name_of_its_file(name, capsys
     assert schema_named_in("mine.toml") == robot_schema()
 
 
+def test_a_new_robot_of_other_lengths_is_written_and_a_length_it_does_not_have_is_refused(capfd):
+    lengths = ("--base-radius", 0.4, "--platform-radius", 0.1, "--crank", 0.2, "--link", 0.3)
+    write("robot", "mine.toml", "--like", "rrr3", *lengths)
+    mine = load_robot("mine.toml")
+    assert (mine.name, mine.geometry.legs[0].crank_length) == ("mine", 0.2)
+    text = Path("mine.toml").read_text()
+    assert "base_radius 0.4 m, platform_radius 0.1 m, crank 0.2 m, link 0.3 m" in " ".join(
+        text.replace("#", "").split()
+    )
+    assert schema_named_in("mine.toml") == robot_schema()
+    assert command("new", "robot", "other.toml", "--like", "rrr3", "--leg", 0.3) == NOT_DONE
+    assert "unknown length of rrr3 `leg`; valid: base_radius" in one_line(capfd.readouterr().err)
+    assert not Path("other.toml").exists()
+
+
 @pytest.mark.parametrize("name", built_in_names())
 def test_a_new_sensor_is_the_built_in_one(name):
     write("sensor", "mine.toml", "--like", name, "--quiet")

@@ -174,6 +174,38 @@ def test_without_webgl_the_page_says_so_and_shows_stills(replayed, browser):
     assert page.requests() == []
 
 
+ONCE = """
+const ask = HTMLCanvasElement.prototype.getContext;
+let asked = 0;
+HTMLCanvasElement.prototype.getContext = function (kind, more) {
+  if (kind.startsWith("webgl") && (asked += 1) > 1) return null;
+  return ask.call(this, kind, more);
+};
+"""
+
+
+def test_graphics_that_fail_or_are_taken_away_leave_the_still_picture_with_words(replayed, browser):
+    """A browser that promises WebGL and then does not draw, and one that loses its driver."""
+    page = browser()
+    visible = "return document.getElementById('still').offsetWidth > 200 && "
+    visible += "document.getElementById('without-webgl').offsetHeight > 0"
+    opened(page, replayed())
+    assert not page.run(visible)
+    page.run(
+        "window.replay.scene.renderer.getContext().getExtension('WEBGL_lose_context').loseContext()"
+    )
+    page.wait("!window.replay.scene")
+    assert page.run(visible)
+    assert page.run("return document.querySelectorAll('#scene canvas').length") == 0
+    assert sought(page, 59)["frame"] == 59
+    added = page.driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": ONCE})
+    opened(page, replayed())
+    assert page.run(visible)
+    assert sought(page, 59)["frame"] == 59
+    page.driver.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+    page.console()
+
+
 @pytest.mark.parametrize(("size", "dark"), [((390, 844), True), ((1400, 900), False)])
 def test_the_page_fits_a_phone_and_is_readable_in_the_dark(replayed, browser, size, dark):
     page = opened(browser(), replayed(), size, dark)

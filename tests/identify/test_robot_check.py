@@ -10,6 +10,8 @@ import pytest
 
 from dynamics import load_robot
 from identify.commands.help import BEYOND_LIMIT
+from identify.scenario import load_scenario
+from identify.verification.robot_check import run_warning
 from tests.identify.commands import command, one_line
 
 
@@ -109,6 +111,13 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
     found = _found(tmp_path / "found.json")
     failed = {name for name, entry in found.items() if not entry["ok"]}
     assert {"inertias", "loop", "gain margin", "frame rate"} <= failed
+    assert found["drives by design"]["ok"]
+    assert "joint_pid = { lp = " in found["drives by design"]["text"]
+    warned = run_warning(load_scenario("quick", robot=str(tmp_path / "mine.toml")))
+    assert warned.startswith("cmmsim check finds fault with ups6: of ")
+    assert "gain margin" in warned
+    assert "\n" not in warned
+    assert run_warning(load_scenario("quick", robot="ups6")) is None
     assert found["inertias"]["leg"] == 3
     assert found["loop"]["value"] > 1 == found["loop"]["limit"]
     assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(
@@ -123,7 +132,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
     )
     said = one_line(capfd.readouterr().err)
     assert (
-        "2 of 21 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+        "2 of 22 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
         "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "

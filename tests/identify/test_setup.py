@@ -80,6 +80,15 @@ def test_the_identified_robot_moves_by_the_estimate(setup, result):
     pose, rest = setup.robot.home_pose, np.zeros(6)
     torque = setup.robot.inverse_dynamics(pose, rest, rest, result.estimate[:gains])
     np.testing.assert_array_equal(robot.inverse_dynamics(pose, rest, rest), torque)
+    model = result.model()
+    np.testing.assert_array_equal(model.tau(pose, rest, rest), torque)
+    np.testing.assert_array_equal(
+        setup.robot.inverse_dynamics(pose, rest, rest, result.estimate), torque
+    )
+    still = np.zeros(robot.layout.joints)
+    np.testing.assert_allclose(model.tau_of_joints(still, still, still), torque, atol=1e-6)
+    assert "identified parameters" in model.mjcf(allow_unphysical_inertia=True)
+    assert "closed_loop" in model.urdf(allow_unphysical_inertia=True)[1]
 
 
 def test_unseen_errors_are_those_of_the_parameters(setup, result):

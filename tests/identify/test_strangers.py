@@ -24,6 +24,7 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from dynamics import DynamicsError, built_in_robots, load_robot
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.mjcf_import import robot_of_mjcf
+from dynamics.engines.urdf import urdf_texts
 from dynamics.engines.urdf_import import robot_of_urdf
 from dynamics.files import LONGEST_NAME, is_name
 from dynamics.robot_file import read_robot_file
@@ -39,7 +40,6 @@ from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import SCENARIOS
 from identify.studies.study_design import prepare
 from identify.studies.study_file import STARTING, STUDIES, load_study
-from tests.dynamics.urdf import urdf_of
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.study_rows import PATIENCE, process
 
@@ -475,7 +475,7 @@ def test_two_thousand_changed_files_are_read_as_they_say_or_refused_in_a_line(ki
 def check_imports(count, tmp_path):
     """Read changed MJCF, URDF and YAML. Returns how many robots were found."""
     robot = load_robot("rss6")
-    urdf, closures = urdf_of(robot, robot.nominal_parameters, platform_on_a_leg=False)
+    urdf, closures = urdf_texts(robot, allow_unphysical_inertia=True)
     texts = {
         "x.xml": mjcf_text(robot, allow_unphysical_inertia=True),
         "x.urdf": urdf,

@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from identify.arrays import Array
-from identify.reporting.figures.style import BLUE, GREY, LINE, PAPER, WIDTH
+from identify.estimation.budget import Budget
+from identify.reporting.figures.style import BLUE, GREY, LINE, PALETTE, PAPER, WIDTH
 from identify.reporting.goals import PARAMETER_FRACTION, is_friction_or_pid
 
 
@@ -205,3 +206,47 @@ def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> Non
         title=f"{meaning}:",
         alignment="left",
     )
+
+
+HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
+"""Hatches of the sources of a budget, which differ also without colour."""
+
+
+def budget_figure(budget: Budget) -> Figure:
+    """Draw the share of each source in the variance of poses, predictions and parameters.
+
+    Quantities are rows. The number beside a row is the combined standard uncertainty. Shares that
+    are negative, by correlations, are left out.
+    """
+    shown = [k for k in range(len(budget.quantities)) if budget.std[k] > 0]
+    shares = 100 * np.maximum(budget.shares[shown], 0)
+    order = np.argsort(-shares.mean(axis=0), kind="stable")
+    colours = list(PALETTE.values())[4:]
+    figure = Figure(figsize=(WIDTH, 1.1 + 0.15 * len(shown)), layout="constrained")
+    axes = figure.subplots()
+    rows = np.arange(len(shown))
+    left = np.zeros(len(shown))
+    for number, source in enumerate(order):
+        if not shares[:, source].any():
+            continue
+        axes.barh(
+            rows,
+            shares[:, source],
+            left=left,
+            height=0.8,
+            color=colours[number % len(colours)],
+            edgecolor=PAPER,
+            linewidth=0.3,
+            hatch=HATCHES[number // len(colours) % len(HATCHES)],
+            label=budget.words[source],
+        )
+        left += shares[:, source]
+    labels = [f"{budget.quantities[k]}: {budget.std[k]:.2g} {budget.units[k]}" for k in shown]
+    axes.set_yticks(rows, labels, fontsize=6)
+    axes.set_ylim(len(shown) - 0.4, -0.6)
+    axes.set_xlim(0, 100)
+    axes.set_xlabel("share of the variance [%]")
+    axes.grid(visible=False, axis="y")
+    handles, words = axes.get_legend_handles_labels()
+    figure.legend(handles, words, loc="outside upper left", ncols=2)
+    return figure

@@ -39,15 +39,7 @@ class Replay {
 
   async start() {
     this.colours = this.readColours();
-    if (canDraw()) {
-      this.scene = new Scene(this.data, document.getElementById("scene"), (kind, frame) => this.pose(kind, frame));
-      await this.scene.build(this.colours);
-      document.getElementById("still").hidden = true;
-      document.getElementById("still").style.display = "none";
-    } else {
-      document.getElementById("without-webgl").hidden = false;
-      document.querySelector("#scene figcaption").hidden = true;
-    }
+    if (!canDraw() || !(await this.showScene())) this.showStill();
     const differs = this.data.frames > 1 || this.data.looks.length > 0;
     document.getElementById("enlargement").hidden = !this.scene || !differs;
     this.buildLegend();
@@ -62,6 +54,31 @@ class Replay {
     this.seek(0);
     for (let k = 0; k < 2; k += 1) await new Promise(requestAnimationFrame); /* until the scene has been drawn */
     this.ready = true;
+  }
+
+  /* Build the scene in space. Return false where the browser cannot draw it after all. */
+  async showScene() {
+    try {
+      this.scene = new Scene(this.data, document.getElementById("scene"), (kind, frame) => this.pose(kind, frame));
+      await this.scene.build(this.colours);
+    } catch (error) {
+      return false;
+    }
+    document.getElementById("still").hidden = true;
+    /* a browser takes the graphics away when too many pages draw, or when its driver ends */
+    this.scene.renderer.domElement.addEventListener("webglcontextlost", () => this.showStill());
+    return true;
+  }
+
+  /* Show a still picture in place of the scene, and say why. */
+  showStill() {
+    if (this.scene) this.scene.renderer.domElement.remove();
+    this.scene = null;
+    document.getElementById("still").hidden = false;
+    document.getElementById("badge").hidden = true;
+    document.getElementById("enlargement").hidden = true;
+    document.getElementById("without-webgl").hidden = false;
+    document.querySelector("#scene figcaption").hidden = true;
   }
 
   readColours() {

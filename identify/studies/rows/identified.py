@@ -45,7 +45,8 @@ from identify.studies.rows.kind import (
 )
 from identify.studies.rows.row_sensor import SensorOptions, rms_um, row_pose_sensor, stated_um
 from identify.trajectory import TrajectorySet
-from identify.validation.unseen import PosePrediction, model_on_record, predicted_runs
+from identify.validation.prediction import PosePrediction, predicted_runs
+from identify.validation.unseen import model_on_record
 
 EXPERIMENT = 0
 CHOSEN = {

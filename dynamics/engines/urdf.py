@@ -1,0 +1,145 @@
+"""URDF of a robot and YAML of its closures, in the convention that `urdf_import` reads.
+
+URDF knows only trees. The last body of each leg ends in a frame `end_...` that coincides with a
+frame `seat_...` of the platform, and the YAML lists these pairs. The platform floats, or hangs on
+the first leg by a spherical joint. Actuated joints are written at zero, and passive joints as they
+are at home. A universal joint is two revolute joints with a hub between them. A spherical joint is
+written as a revolute joint, and the YAML names it.
+"""
+
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dynamics.bodies import parts_of
+from dynamics.inertia import physical_inertias
+from dynamics.kinematics.platform import base_from_platform
+from dynamics.pseudo_inertia import about_centre
+from dynamics.robot import Robot
+
+Places = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Origin (3,), m, and axes (3, 3) of each link by name, in the axes of the base."""
+
+
+def urdf_texts(
+    robot: Robot,
+    parameters: np.ndarray | None = None,
+    *,
+    platform_on_a_leg: bool = False,
+    allow_unphysical_inertia: bool = False,
+) -> tuple[str, str]:
+    """URDF and YAML of a robot with dynamic parameters (p,), by default the nominal ones.
+
+    Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
+    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
+    """
+    values = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
+    bodies = physical_inertias(robot.layout, values, allow_unphysical_inertia).values
+    parts = parts_of(robot.geometry).all
+    home = parts_of(robot.geometry).frames(robot, robot.home_pose)
+    at_home = robot.inverse_kinematics(robot.home_pose)
+    dry = values[robot.layout.coulomb].tolist()
+    viscous = values[robot.layout.viscous].tolist()
+    turn = base_from_platform(robot.home_pose)
+    places: Places = {"base": (np.zeros(3), np.eye(3)), "platform": (robot.home_pose[:3], turn)}
+    lines = [_link("base"), _link("platform", bodies[0])]
+    balls: list[str] = []
+    loops: list[list[str]] = []
+    if not platform_on_a_leg:
+        lines.append(_joint("platform", "floating", "base", "platform", places))
+    for number, part in enumerate(parts):
+        segment = part.segment
+        name = part.name
+        before = "base" if part.before < 0 else parts[part.before].name
+        places[name] = home.origin[number], home.axes[number]
+        axis = home.axes[number].T @ home.axes[part.before] @ segment.axis
+        lines.append(_link(name, part.share * bodies[part.body], segment.centre))
+        if segment.joint == "ball":
+            balls.append(name)
+        if segment.joint == "universal":
+            hub = f"hub_{name}"
+            lines.append(_link(hub))
+            places[hub] = places[name]
+            lines.append(_joint(f"first_{name}", "continuous", before, hub, places, axis))
+            before = hub
+            axis = np.array([1.0, 0.0, 0.0])
+        kind = "prismatic" if segment.joint == "slide" else "revolute"
+        turned = 0.0
+        more = ""
+        if segment.actuated:
+            name = robot.joint_names[part.leg]
+            limit = robot.travel_limit
+            turned = at_home[part.leg]
+            more = f'<dynamics friction="{dry[part.leg]!r}" damping="{viscous[part.leg]!r}"/>'
+            more += f'<limit lower="{-limit!r}" upper="{limit!r}" effort="1" velocity="1"/>'
+        lines.append(_joint(name, kind, before, part.name, places, axis, turned, more))
+        if part.last:
+            end, seat = f"end_{part.name}", f"seat_{part.name}"
+            place = home.origin[number] + home.axes[number] @ segment.end
+            places |= {end: (place, home.axes[number]), seat: (place, turn)}
+            lines += [_link(end), _link(seat)]
+            lines.append(_joint(f"to_{end}", "fixed", part.name, end, places))
+            if platform_on_a_leg and not loops and "hanging" not in balls:
+                balls.append("hanging")
+                lines.append(_joint("hanging", "revolute", end, seat, places))
+                lines.append(_joint("to_platform", "fixed", seat, "platform", places))
+            else:
+                lines.append(_joint(f"to_{seat}", "fixed", "platform", seat, places))
+                loops.append([end, seat])
+    closures = {
+        "closed_loop": loops,
+        "type": ["3d"] * len(loops),
+        "name_mot": list(robot.joint_names),
+        "joint_name": balls,
+        "joint_type": ["SPHERICAL"] * len(balls),
+    }
+    text = "\n".join([f"<robot name={quoteattr(robot.name)}>", *lines, "</robot>"])
+    return text, "\n".join(f"{key}: {value}" for key, value in closures.items())
+
+
+def _link(
+    name: str,
+    inertia: np.ndarray | None = None,
+    reference: np.ndarray | tuple[int, ...] = (0, 0, 0),
+) -> str:
+    """Link without a body, or with a body (10,) about a reference point (3,)."""
+    if inertia is None:
+        return f'<link name="{name}"/>'
+    off, tensor = about_centre(inertia)
+    mass = inertia[0]
+    (xx, xy, xz), (yy, yz), (zz,) = tensor[0], tensor[1, 1:], tensor[2, 2:]
+    moments = f'ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="{xy}" ixz="{xz}" iyz="{yz}"'
+    place = f'<origin xyz="{_numbers(np.array(reference) + off)}"/>'
+    return (
+        f'<link name="{name}"><inertial>{place}<mass value="{mass}"/><inertia {moments}/>'
+        "</inertial></link>"
+    )
+
+
+def _joint(
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    places: Places,
+    axis: np.ndarray | tuple[int, ...] = (1, 0, 0),
+    turned: float = 0.0,
+    more: str = "",
+) -> str:
+    """Joint that is where the child is at home, less the coordinate that it has there."""
+    at, axes = places[parent]
+    point, turn = places[child]
+    axis = np.array(axis, dtype=float)
+    if kind == "prismatic":
+        point = point - turned * turn @ axis
+    else:
+        turn = turn @ Rotation.from_rotvec(-turned * axis).as_matrix()
+    angles = Rotation.from_matrix(axes.T @ turn).as_euler("xyz", suppress_warnings=True)
+    origin = f'<origin xyz="{_numbers(axes.T @ (point - at))}" rpy="{_numbers(angles)}"/>'
+    ends = f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{_numbers(axis)}"/>'
+    return f'<joint name="{name}" type="{kind}">{origin}{ends}{more}</joint>'
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,192 @@
+"""Error budget: what each source of uncertainty adds to a standard deviation.
+
+The form is that of the Guide to the Expression of Uncertainty in Measurement (GUM, JCGM 100:2008).
+A source has a standard uncertainty, and a sensitivity with respect to it. Their product is what the
+source adds to the standard uncertainty of a quantity. The squares of all that is added sum up to
+the square of the combined standard uncertainty. Sources that are correlated beforehand have a row
+of their own, which may be negative in its square (GUM, section 5.2).
+
+The parts come from the matrices of the covariance itself, see `covariance`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from dynamics.parameters import ParameterLayout
+from identify.arrays import Array
+from identify.estimation.covariance import (
+    ANCHOR,
+    CORRELATED,
+    GUESS,
+    LOAD,
+    MODEL,
+    NOISE,
+    ROUNDING,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COVERAGE = 1.96
+"""Coverage factor of the expanded uncertainty, for 95 %."""
+
+
+class Source(NamedTuple):
+    """Source of uncertainty in words, and its evaluation: A by statistics, or B by other means."""
+
+    words: str
+    evaluation: str
+
+
+SOURCES = {
+    NOISE: Source("noise of the poses (pixels)", "B"),
+    "motion": Source("noise of the poses in the servo", "B"),
+    "rig": Source("cameras", "B"),
+    "teaching": Source("teaching of frames and stickers", "B"),
+    "latency": Source("clocks: latency", "B"),
+    "exposure": Source("clocks: exposures of both cameras", "B"),
+    "clock": Source("clocks: poses and commands", "B"),
+    "geometry": Source("geometry of the robot", "B"),
+    "zeros": Source("drives: zeros of the joints", "B"),
+    "scale": Source("drives: scale of the commands", "B"),
+    "start": Source("start of the record", "B"),
+    "centres": Source("bodies: centres of mass", "B"),
+    "products": Source("bodies: products of inertia", "B"),
+    "passive_friction": Source("friction of passive joints", "B"),
+    ANCHOR: Source("scale anchor", "B"),
+    GUESS: Source("initial guess (prior)", "B"),
+    LOAD: Source("known load", "B"),
+    MODEL: Source("error of the model", "A"),
+    CORRELATED: Source("covariances of these sources", "B"),
+}
+"""Sources of uncertainty by the names that the covariance gives them."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Variances of q quantities by s sources.
+
+    Attributes
+    ----------
+    quantities, units : tuple of str
+        Names and units of the quantities.
+    sources : tuple of str
+        Keys of `SOURCES`.
+    variances : ndarray, shape (q, s)
+        What each source adds to the variance of each quantity.
+    """
+
+    quantities: tuple[str, ...]
+    units: tuple[str, ...]
+    sources: tuple[str, ...]
+    variances: Array
+
+    @property
+    def std(self) -> Array:
+        """Combined standard uncertainties (q,)."""
+        return np.asarray(np.sqrt(self.variances.sum(axis=1)))
+
+    @property
+    def words(self) -> list[str]:
+        """Names of the sources (s) in words."""
+        return [SOURCES[key].words for key in self.sources]
+
+    @property
+    def shares(self) -> Array:
+        """Shares (q, s) of the variances. They are zero for a quantity without uncertainty."""
+        total = self.variances.sum(axis=1, keepdims=True)
+        return np.divide(self.variances, total, out=np.zeros_like(self.variances), where=total > 0)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the table, with a row for each source of each quantity, the largest first.
+
+        The column `added` is the standard uncertainty that the source adds. Its square is negative
+        in the row of covariances, if they make the quantity better known; it is then negative, too.
+        """
+        import pandas as pd
+
+        added = np.sign(self.variances) * np.sqrt(np.abs(self.variances))
+        rows = []
+        for k, name in enumerate(self.quantities):
+            for source in np.argsort(-self.variances[k], kind="stable"):
+                if self.variances[k, source]:
+                    words, evaluation = SOURCES[self.sources[source]]
+                    rows.append(
+                        (
+                            *(name, self.units[k], words, evaluation),
+                            *(added[k, source], self.shares[k, source]),
+                            *(self.std[k], COVERAGE * self.std[k]),
+                        )
+                    )
+        columns = ["quantity", "unit", "source", "evaluation", "added", "share"]
+        return pd.DataFrame(rows, columns=[*columns, "combined", "expanded"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the budget for JSON, by quantity."""
+        return {
+            name: {
+                "unit": self.units[k],
+                "combined": self.std[k],
+                "expanded": COVERAGE * self.std[k],
+                "variances": dict(zip(self.sources, self.variances[k].tolist(), strict=True)),
+            }
+            for k, name in enumerate(self.quantities)
+        }
+
+
+def budget_of(
+    quantities: Sequence[str],
+    units: Sequence[str],
+    parts: Mapping[str, Array],
+    total: Array,
+) -> Budget:
+    """Return the budget of variances (q,) by source, whose total (q,) is stated.
+
+    What the parts leave of the total is the effect of covariances between sources.
+    """
+    rest = total - np.asarray(sum(parts.values()))
+    if np.any(np.abs(rest) > ROUNDING * total):
+        parts = {**parts, CORRELATED: rest}
+    variances = np.stack([np.asarray(part, dtype=float) for part in parts.values()], axis=1)
+    return Budget(tuple(quantities), tuple(units), tuple(parts), variances)
+
+
+def parameter_budget(
+    layout: ParameterLayout, covariance: Array, sources: Mapping[str, Array]
+) -> Budget:
+    """Return the budget of a robot's parameters.
+
+    The first p rows of the covariance and of its parts by source are those of the parameters.
+    """
+    names = layout.names
+    parts = {key: np.diag(part)[: len(names)] for key, part in sources.items()}
+    units = [layout.unit(name) for name in names]
+    return budget_of(names, units, parts, np.diag(covariance)[: len(names)])
+
+
+def together(budgets: Sequence[Budget]) -> Budget:
+    """Return one budget of all quantities, with the sources of all."""
+    sources = [key for key in SOURCES if any(key in one.sources for one in budgets)]
+    rows = [
+        np.stack(
+            [
+                one.variances[:, one.sources.index(key)]
+                if key in one.sources
+                else np.zeros(len(one.quantities))
+                for key in sources
+            ],
+            axis=1,
+        )
+        for one in budgets
+    ]
+    return Budget(
+        tuple(name for one in budgets for name in one.quantities),
+        tuple(unit for one in budgets for unit in one.units),
+        tuple(sources),
+        np.concatenate(rows),
+    )

@@ -1,0 +1,273 @@
+"""Prediction of the plant's poses from an identified model, with their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+from scipy.linalg import block_diag
+
+from dynamics.closed_loop import LoopFailure
+from dynamics.kinematics.platform import Chart
+from identify.arrays import Array
+from identify.estimation.base_parameters import structure
+from identify.estimation.covariance import repeated_experiments
+from identify.model.body_errors import body_errors
+from identify.model.from_record import predicting_model
+from identify.model.loop_model import LoopModel
+from identify.model.model_side import ModelSide
+from identify.progress import Progress
+from identify.random_streams import PREDICTION, stream_seed
+from identify.record.checks import TooFewFramesError
+
+MOTION = "motion"
+"""Source of uncertainty of a prediction: the sensor's noise moves the plant through the servo."""
+
+REPETITIONS = 4
+"""Number of repeated experiments per motion.
+
+With hundreds of frames each, they determine the effect of noise to 5 %.
+"""
+
+
+@dataclass(frozen=True)
+class PosePrediction:
+    """Predicted poses of the plant with their covariance.
+
+    The poses of plant and model differ for three reasons:
+
+    - The parameters are uncertain. Their covariance C acts through the exact sensitivities S of
+      the model's poses as S C S^T.
+    - The sensor's noise moves the plant through the servo, which no model can predict. The
+      covariance of this motion is sampled by repeated experiments on the identified model, and is
+      assumed constant along the motion.
+    - All measured poses have common errors that the record states, and the geometry has errors. The
+      servo compensates such an error in the measured pose, and thereby shifts the platform. The
+      error is constant along the motion. Poses and covariance contain its estimate from the record
+      of the identification.
+
+    Attributes
+    ----------
+    chart : Chart
+        Coordinates of the platform.
+    poses : ndarray, shape (N, 6)
+        Predicted poses, m and rad.
+    covariance : ndarray, shape (N, 6, 6)
+        Covariance of the plant's true poses about the predicted poses. It is zero along directions
+        in which the platform cannot move.
+    slopes : ndarray, shape (N, 6, p), optional
+        Sensitivities of the poses. They are given only if no frame is lost, poses have no common
+        errors, the platform carries no load, and the servo drives the model.
+    """
+
+    chart: Chart
+    poses: Array
+    covariance: Array
+    slopes: Array | None = None
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (N, 6) [m, rad]."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
+
+    def normalised_squared_error(self, true: Array) -> float:
+        """Return the mean over the frames of e^T P^-1 e / m.
+
+        The error e of the true poses (N, 6) is expressed in the m coordinates of the platform. The
+        result is near one if the covariance P is right. Errors of parameters last for the whole
+        motion, so the result of a single run scatters widely about one.
+        """
+        free = self.chart.basis
+        errors = (true - self.poses) @ free
+        weighted = np.linalg.solve(free.T @ self.covariance @ free, errors[..., None])[..., 0]
+        return float(np.mean(np.sum(errors * weighted, axis=1))) / free.shape[1]
+
+
+def predict_poses(
+    run: LoopModel,
+    parameters: Array,
+    covariance: Array,
+    rng: np.random.Generator,
+    learned: Mapping[str, float] | None = None,
+) -> PosePrediction:
+    """Return the predicted poses of a run with estimated parameters.
+
+    The prediction uses the reference, the sensor's covariance and the lost frames of the run, but
+    not its measured poses.
+
+    Parameters
+    ----------
+    run : LoopModel
+        Model of the run.
+    parameters : ndarray, shape (p,)
+        Estimates.
+    covariance : ndarray, shape (p, p) or (p + k, p + k)
+        Covariance of the estimates, or of the estimates and the learned errors.
+    rng : numpy.random.Generator
+        Source of the noise of the repeated experiments.
+    learned : mapping, optional
+        Estimates, by name, of k common errors of this run and of the record of the identification.
+        If the names differ from the errors of the run, the prior of the run's errors is used.
+
+    Raises
+    ------
+    LoopFailure
+        If the model, or its repetition with the sensor's noise, is unstable.
+    """
+    basis = _basis(run, parameters, covariance, rng, learned or {})
+    alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())
+    by_parameters = basis.slopes[..., : len(parameters)]
+    return PosePrediction(
+        run.robot.geometry.chart,
+        basis.poses,
+        basis.spread(basis.known) + basis.by_noise,
+        by_parameters if alone else None,
+    )
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """Predicted poses (N, 6), and what their covariance is made of.
+
+    slopes (N, 6, p + k): derivatives of the poses with respect to the parameters and to the numbers
+    of `_known_in_common`, whose covariance is known (p + k, p + k). by_noise (6, 6): covariance of
+    the motion by the sensor's noise.
+    """
+
+    poses: Array
+    slopes: Array
+    known: Array
+    by_noise: Array
+
+    def spread(self, covariance: Array) -> Array:
+        """Return the covariance (N, 6, 6) of the poses by one (p + k, p + k)."""
+        return np.asarray(self.slopes @ covariance @ self.slopes.transpose(0, 2, 1))
+
+
+def _basis(
+    run: LoopModel,
+    parameters: Array,
+    covariance: Array,
+    rng: np.random.Generator,
+    learned: Mapping[str, float],
+) -> _Basis:
+    """Return the linear prediction of a run. For arguments and errors see `predict_poses`."""
+    likely, root, known = _known_in_common(run, covariance, len(parameters), learned)
+    inside = len(run.errors_had)
+    run = replace(run, bodies=body_errors(run, parameters)).having(likely[:inside])
+    model = run.simulate(parameters, sensitivities=True)
+    assert model.pose_sensitivity is not None
+    drawn = []
+    for repeated in repeated_experiments(run, parameters, [rng] * REPETITIONS):
+        if isinstance(repeated, LoopFailure):
+            raise repeated
+        drawn.append(repeated.pose - model.pose)
+    noise = np.concatenate(drawn)
+    common = run.pose_modes(parameters)
+    by_parameters = run.of_all(model.pose_sensitivity)
+    slopes = np.concatenate([by_parameters, common @ root], axis=2)
+    poses = model.pose + common[:, :, inside:] @ likely[inside:]
+    # Deviations by noise have mean zero, so their second moment is the covariance.
+    return _Basis(poses, slopes, known, noise.T @ noise / len(noise))
+
+
+def _known_in_common(
+    run: LoopModel, covariance: Array, parameters: int, learned: Mapping[str, float]
+) -> tuple[Array, Array, Array]:
+    """Return what is known beforehand about the common errors of a run's poses.
+
+    The errors are a linear function of k independent numbers. The first result (k,) is the most
+    likely values of these numbers. The second is the matrix (k, k) from the numbers with known
+    covariance to these numbers. The third is the covariance (p + k, p + k) of the parameters and
+    the numbers with known covariance.
+    """
+    names = run.common.all_names
+    if names and tuple(learned) == names:
+        # The factor has no inverse if the covariance lacks full rank.
+        root = np.asarray(np.linalg.pinv(run.common.whole_factor))
+        return root @ np.array([*learned.values()]), root, covariance
+    each = np.eye(len(names))
+    whole = np.asarray(block_diag(covariance[:parameters, :parameters], each))
+    return np.zeros(len(names)), each, whole
+
+
+def predicted_runs(
+    side: ModelSide,
+    records: Sequence[xr.Dataset],
+    parameters: Array,
+    covariance: Array,
+    seed: int,
+    progress: Progress,
+    learned: Mapping[str, float] | None = None,
+) -> list[PosePrediction]:
+    """Predict the plant on the references of records from the identified model.
+
+    The parameters (p,) have covariance (p, p). For ``learned`` see `predict_poses`. All poses of a
+    prediction are NaN if the loop is unstable, or if too few frames were measured to determine the
+    sensor's noise.
+
+    Raises RecordError or EstimationError for a record that is damaged, or of another robot, timing
+    or servo. Raises dynamics.DynamicsError for parameters that no model can have.
+    """
+    predictions = []
+    with progress.stage("predict", len(records)) as advance:
+        for number, record in enumerate(records, start=1):
+            try:
+                run, rng = _predicting(side, record, seed, number)
+                prediction = predict_poses(run, parameters, covariance, rng, learned)
+            except (LoopFailure, TooFewFramesError):
+                shape = (record.sizes["time"], 6)
+                chart = side.robot.geometry.chart
+                prediction = PosePrediction(
+                    chart, np.full(shape, np.nan), np.full((*shape, 6), np.nan)
+                )
+            predictions.append(prediction)
+            advance()
+    return predictions
+
+
+def _predicting(
+    side: ModelSide, record: xr.Dataset, seed: int, number: int
+) -> tuple[LoopModel, np.random.Generator]:
+    """Return the model of a record to predict, and the generator of its noise."""
+    run = replace(predicting_model(record, side), groups=structure(side.robot).rigid_groups)
+    return run, np.random.default_rng(stream_seed(seed, PREDICTION, number))
+
+
+def predicted_variances(
+    side: ModelSide,
+    record: xr.Dataset,
+    number: int,
+    parameters: Array,
+    sources: Mapping[str, Array],
+    seed: int,
+    learned: Mapping[str, float] | None = None,
+) -> dict[str, Array]:
+    """Return the variances (N, 6) of a prediction by the sources of the uncertainty, whose sum is
+    its variance.
+
+    `sources` (p + k, p + k) are the parts of the covariance by their names. The motion by the
+    sensor's noise is another source, MOTION, and so are common errors of which the record of the
+    identification tells nothing. `number` of the record, from one on, and `seed` select the noise,
+    as in `predicted_runs`. Raises LoopFailure or TooFewFramesError if nothing can be predicted.
+    """
+    run, rng = _predicting(side, record, seed, number)
+    whole = np.asarray(sum(sources.values()))
+    basis = _basis(run, parameters, whole, rng, learned or {})
+    count = len(parameters)
+    size = len(basis.known)
+    parts = dict(sources)
+    if basis.known is not whole:
+        of_errors = np.eye(size - count)
+        parts = {
+            name: block_diag(part[:count, :count], 0 * of_errors) for name, part in parts.items()
+        }
+        for kind, modes in run.common.by_kind(of_errors).items() if size > count else ():
+            before = parts.get(kind, np.zeros((size, size)))
+            parts[kind] = before + block_diag(np.zeros((count, count)), modes @ modes.T)
+    found = {
+        name: np.diagonal(basis.spread(part), axis1=1, axis2=2) for name, part in parts.items()
+    }
+    return found | {MOTION: np.broadcast_to(np.diag(basis.by_noise), basis.poses.shape)}
