@@ -23,12 +23,11 @@ from dynamics.geometry import RobotGeometry
 from dynamics.inertia import physical_inertias
 from dynamics.kinematics.platform import Chart
 from dynamics.legs.leg import Leg
-from dynamics.parameter_set import ParameterSet
+from dynamics.parameter_set import ParameterSet, Unstated
 from dynamics.parameters import ParameterLayout
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
 from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
-from dynamics.unstated import Unstated
 
 FIELDS = {
     "crank": "crank_length",

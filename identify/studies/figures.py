@@ -258,15 +258,10 @@ def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
         handles, labels = axes.get_legend_handles_labels()
         found = dict(zip(labels, handles, strict=True)) | found
     if set(found) - {"rows"}:
-        widest = max(map(len, found))
-        columns = max(1, int(LETTERS_PER_INCH * figure.get_figwidth() / (widest + 8)))
-        figure.legend(
-            found.values(),
-            found,
-            loc="outside lower center",
-            ncols=min(columns, len(found)),
-            fontsize="small",
-        )
+        fits = int(LETTERS_PER_INCH * figure.get_figwidth() / (max(map(len, found)) + 8))
+        columns = max(1, min(fits, len(found)))
+        style: Any = {"loc": "outside lower center", "fontsize": "small", "ncols": columns}
+        figure.legend(found.values(), found, **style)
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
@@ -326,14 +321,8 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
         return
     level = np.sqrt(np.mean((values / x**exponent) ** 2))
     ends = np.geomspace(x.min(), x.max(), 50)
-    axes.plot(
-        ends,
-        level * ends**exponent,
-        "--",
-        color="black",
-        linewidth=1,
-        label=f"theory: $y \\propto x^{{{exponent:g}}}$",
-    )
+    label = f"theory: $y \\propto x^{{{exponent:g}}}$"
+    axes.plot(ends, level * ends**exponent, "--k", linewidth=1, label=label)
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:
