@@ -210,20 +210,21 @@ class MultipleShooting:
         cost = float(known @ known)
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
-            state = states.shape[1]
-            # Nothing depends on the first state, so identity rows keep it unchanged.
-            carried = np.eye(state, state + size + 1)
+            count = states.shape[1]
+            # Nothing depends on the first state. These identity rows keep it unchanged, and make
+            # the elimination possible.
+            carried = np.eye(count, count + size + 1)
             eliminated = []
             for k, part in enumerate(chain):
                 following = None if part.ends_the_run else states[k + 1]
                 rows = _linearised(part, parameters, states[k], following)
                 cost += float(np.sum(rows[:, -1] ** 2))
                 # Columns for the next state are inserted.
-                carried = np.insert(carried, [state] * state, 0.0, axis=1)
+                carried = np.insert(carried, [count] * count, 0.0, axis=1)
                 triangle = np.asarray(np.linalg.qr(np.vstack([carried, rows]), mode="r"))
-                eliminated.append(triangle[:state])
-                carried = triangle[state:, state:]
-            condensed = np.vstack([condensed, carried[:, state:]])
+                eliminated.append(triangle[:count])
+                carried = triangle[count:, count:]
+            condensed = np.vstack([condensed, carried[:, count:]])
             self._eliminated.append(eliminated)
         triangle = np.asarray(np.linalg.qr(condensed, mode="r"))
         return cost, triangle[:size, :size], triangle[:size, size]

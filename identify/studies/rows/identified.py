@@ -1,9 +1,10 @@
 """Rows of kind `identification`: a record, the parameters identified from it, and their errors.
 
 By default the sensor is `drawn`: it adds Gaussian noise with the covariance that the scenario's
-sensor states at the home pose. The entries of that sensor therefore have an effect. With images,
-the sensor teaches itself, seeded by the row. All rows have the same exciting and validation
-trajectories, from `trajectory_seed`. Rows thus differ only by their factors and their noise.
+sensor states at the home pose. The keys of the sensor file therefore have an effect although no
+image is drawn. With images, the sensor teaches itself, seeded by the row. All rows have the same
+exciting and validation trajectories, from `trajectory_seed`. Rows thus differ only by their factors
+and their noise.
 """
 
 from dataclasses import dataclass

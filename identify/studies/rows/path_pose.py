@@ -90,14 +90,14 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
 
     Raises EstimationError if fewer than two poses were measured, and any exception of the sensor.
     """
-    eye = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
+    on_path = row_sensor(Setup(scenario).sensor_plan, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
-    path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
+    path = drawn_trajectory(rng, Chart("free", tuple(on_path.sensor.home)), scenario.excitation)
     # The path is periodic with the fundamental frequency.
     start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
-    seen = eye.sensor.measure_many(path.pose(times), path.pose_rate(times))
+    seen = on_path.sensor.measure_many(path.pose(times), path.pose_rate(times))
     ok = np.isfinite(seen.poses[:, 0])
     if ok.sum() < 2:
         raise EstimationError(

@@ -168,7 +168,7 @@ def pose_figures(errors: Array, covariances: Array) -> Row:
 
 
 def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
-    """Return the sensor of a row. A sensor with images is taught. Raises its exceptions."""
+    """Return the sensor of a row, taught if it has images. Raises the exceptions of the sensor."""
     if options.sensor == "drawn":
         covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
         return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
