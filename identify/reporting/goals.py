@@ -27,8 +27,8 @@ UNSEEN_ORIENTATION = "validation motion, orientation"
 SENSOR_POSITION = "cameras, position"
 SENSOR_ORIENTATION = "cameras, orientation"
 LOST = "lost frames"
-RESIDUALS = "residuals of the model"
-CHANCE = "chance of such residuals"
+RESIDUALS = "residual variance / noise variance"
+CHANCE = "p value of the residuals"
 FAR_OFF = "friction and gains far off"
 
 
@@ -74,14 +74,14 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
             math.nan if identification[key] is None else identification[key] for key in MISFIT
         )
         text = (
-            "mean square of measured minus identified pose, in units of the noise that the cameras "
+            "mean square of measured minus identified pose, over the variance that the cameras "
             f"state; noise alone gives {expected:.3f} ± {std:.3f}"
         )
-        goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "× noise", text))
+        goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "", text))
     if "whiteness" in identification:
         chance = identification["whiteness"]["p_value"]
         percent = math.nan if chance is None else 100 * chance
-        text = "probability that noise alone gives residuals with such a dependence between frames"
+        text = "probability that noise alone makes residuals as correlated from frame to frame"
         goals.append(Goal(CHANCE, percent, ">=", 100 * SUSPICIOUS, "%", text))
     return goals
 

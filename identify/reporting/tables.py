@@ -103,7 +103,7 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     if rate:
         what = "rendered and measured, in one process"
-        rows.append(("stereo frames", f"{number(rate)} 1/s", "", "", what))
+        rows.append(("processed stereo frames", f"{number(rate)} 1/s", "", "", what))
     if stages:
         total = seconds.get("total") or sum(stages)
         what = "all stages so far, compiling included"
@@ -293,7 +293,7 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
     )
     goals = explanation_goals(result)
     for goal in goals:
-        typer.echo(f"{goal.name}: {number(goal.value)} {goal.unit}: {goal.detail}")
+        typer.echo(f"{goal.name}: {f'{number(goal.value)} {goal.unit}'.strip()}: {goal.detail}")
     if goals and all(goal.passed for goal in goals):
         typer.echo("the model explains the record to within the cameras' noise")
     elif goals:

@@ -64,7 +64,7 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
     save_result(run_folder.result, warned(load_result(run_folder.result)))
     said = (
         "identified: 4 of 5 parameters and 1 of 1 sums of them that the motion depends on",
-        "residuals of the model: 1.356 × noise: mean square of",
+        "residual variance / noise variance: 1.356: mean square of",
         "noise alone gives 1.100 ± 0.040",
         "the model does NOT explain the record: the model is wrong, or the errors of the cameras "
         "exceed their stated noise",
@@ -99,8 +99,11 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
     out, err = capfd.readouterr()
     assert err == "warning: not white\nwarning: a b\n"
     missed = [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")]
-    assert missed == [" residuals of the model", " chance of such residuals"]
-    assert "missed: residuals of the model: mean square of measured minus identified pose" in out
+    assert missed == [" residual variance / noise variance", " p value of the residuals"]
+    assert (
+        "missed: residual variance / noise variance: mean square of measured minus identified pose"
+        in out
+    )
 
 
 def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(

@@ -181,7 +181,7 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     assert all(line.startswith("warning: ") for line in err.splitlines())
     assert "are correlated from frame to frame" in err
     result = load_result(run.result)
-    assert "chance of such residuals" in missed(result)
+    assert "p value of the residuals" in missed(result)
     assert result["identification"]["noise_ratio"] > 1.05
 
 

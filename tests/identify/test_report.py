@@ -535,7 +535,7 @@ def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_
     assert all(goal.passed for goal in goals(result).values())
     assert goals(result)["validation motion, position"].value == pytest.approx(1.8)
     assert goals(result)["cameras, orientation"].value == 50.0
-    assert goals(result)["residuals of the model"].limit == pytest.approx(
+    assert goals(result)["residual variance / noise variance"].limit == pytest.approx(
         1.1 + 3.0902 * 0.04, abs=1e-5
     )
     assert check_goals({"scenario": "quick"}) == []
@@ -563,19 +563,25 @@ def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_
             lambda r: r["identification"]["parameters"]["joint_pid.lp"].update(estimate=11.6),
             "friction and gains far off",
         ),
-        (lambda r: r["identification"].update(noise_ratio=1.31), "residuals of the model"),
+        (
+            lambda r: r["identification"].update(noise_ratio=1.31),
+            "residual variance / noise variance",
+        ),
         (
             lambda r: r["identification"].update(noise_ratio=1.1 + 3.1 * 0.04),
-            "residuals of the model",
+            "residual variance / noise variance",
         ),
-        (lambda r: r["identification"].update(noise_ratio=None), "residuals of the model"),
+        (
+            lambda r: r["identification"].update(noise_ratio=None),
+            "residual variance / noise variance",
+        ),
         (
             lambda r: r["identification"]["whiteness"].update(p_value=9e-5),
-            "chance of such residuals",
+            "p value of the residuals",
         ),
         (
             lambda r: r["identification"]["whiteness"].update(p_value=None),
-            "chance of such residuals",
+            "p value of the residuals",
         ),
     ],
 )
@@ -593,7 +599,7 @@ def test_speed_stands_beside_the_goals_and_no_machine_misses_one(result):
         "validate": None,
     }
     frames, whole = tables.goals_table(result).rows[-2:]
-    assert frames[:4] == ("stereo frames", "0.5 1/s", "", "")
+    assert frames[:4] == ("processed stereo frames", "0.5 1/s", "", "")
     assert whole[:4] == ("whole run", "3020 s", "", ""), "parts of a stage are not counted twice"
     assert all(goal.passed for goal in check_goals(result))
     result["seconds"]["total"] = 3500.0
