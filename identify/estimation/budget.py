@@ -2,9 +2,9 @@
 
 The form is that of the Guide to the Expression of Uncertainty in Measurement (GUM, JCGM 100:2008).
 A source has a standard uncertainty, and a sensitivity with respect to it. Their product is what the
-source adds to the standard uncertainty of a quantity. The squares of all that is added sum up to
-the square of the combined standard uncertainty. Sources that are correlated beforehand have a row
-of their own, which may be negative in its square (GUM, section 5.2).
+source adds to the standard uncertainty of a quantity. The squares of these products sum up to the
+square of the combined standard uncertainty. If sources are correlated beforehand, their covariances
+have a separate row, whose square can be negative (GUM, section 5.2).
 
 The parts come from the matrices of the covariance itself, see `covariance`.
 """
@@ -105,8 +105,8 @@ class Budget:
     def to_dataframe(self) -> pd.DataFrame:
         """Return the table, with a row for each source of each quantity, the largest first.
 
-        The column `added` is the standard uncertainty that the source adds. Its square is negative
-        in the row of covariances, if they make the quantity better known; it is then negative, too.
+        The column `added` is the standard uncertainty that the source adds. It is negative in the
+        row of covariances if these make the quantity better known.
         """
         import pandas as pd
 
@@ -145,9 +145,10 @@ def budget_of(
     parts: Mapping[str, Array],
     total: Array,
 ) -> Budget:
-    """Return the budget of variances (q,) by source, whose total (q,) is stated.
+    """Return the budget of q quantities from the parts (q,) of their variances, by source.
 
-    What the parts leave of the total is the effect of covariances between sources.
+    total (q,): variances of the quantities. What they exceed the sum of the parts by is the effect
+    of covariances between sources.
     """
     rest = total - np.asarray(sum(parts.values()))
     if np.any(np.abs(rest) > ROUNDING * total):
@@ -170,7 +171,7 @@ def parameter_budget(
 
 
 def together(budgets: Sequence[Budget]) -> Budget:
-    """Return one budget of all quantities, with the sources of all."""
+    """Return one budget with the quantities and the sources of all budgets."""
     sources = [key for key in SOURCES if any(key in one.sources for one in budgets)]
     rows = [
         np.stack(

@@ -55,7 +55,7 @@ NOISE, MODEL, LOAD, GUESS, ANCHOR = "noise", "model", "load", "guess", "anchor"
 a known load, errors of the initial guess, and error of the scale anchor.
 """
 CORRELATED = "correlated"
-"""What kinds of common errors add together that are correlated beforehand."""
+"""Part due to covariances between kinds of common errors that are correlated beforehand."""
 ROUNDING = 1e-9
 """Largest difference of variances that counts as rounding, as a share of the variance."""
 
@@ -76,8 +76,8 @@ class Uncertainty:
         Covariance of the estimate and the k common errors. The common errors follow record by
         record, in units of their prior standard deviations.
     sources : dict of ndarray, shape (p + k, p + k)
-        Parts of the covariance by the sources of the uncertainty, whose sum it is: NOISE, MODEL,
-        LOAD, GUESS, ANCHOR, the kinds of common errors, and CORRELATED.
+        Parts of `whole` by source of the uncertainty: NOISE, MODEL, LOAD, GUESS, ANCHOR, the kinds
+        of common errors, and CORRELATED. Their sum is `whole`.
     information : ndarray, shape (p, p)
         Information of the poses alone.
     gradient : ndarray, shape (p,)

@@ -35,7 +35,7 @@ def initial_parameters(runs: PaperRuns) -> Exhibit:
         "Table 1",
         "Initial parameters",
         "Masses and moments of inertia from the manufacturer, without friction.",
-        "The same numbers. They are the set initial of the robot rss6. Some of these moments of "
+        "The same numbers. They are the set guess of the robot rss6. Some of these moments of "
         "inertia no rigid body can have (Ixx + Iyy < Izz); they are kept as data.",
         {
             "parameter": names,

@@ -89,8 +89,8 @@ def error_budget(folder: Path | str) -> Budget:
 def pose_budget(record: xr.Dataset, side: ModelSide) -> Budget:
     """Return the budget of the measured poses of a record, as means over its frames.
 
-    It has all common errors that the record states, also those that the identification takes as
-    exact.
+    It includes all common errors that the record states, even those that the identification takes
+    as exact.
     """
     noise = predicting_model(record, side).covariance
     parts = {NOISE: np.diag(noise)}
