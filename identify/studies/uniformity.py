@@ -3,10 +3,10 @@
 A figure of a row whose name begins with `PROBABILITY` is the probability that a stated distribution
 gives to values below the truth. If the distribution is right, the figure is uniform between 0 and 1
 over the rows. Each figure is tested by Kolmogorov and Smirnov, with a correction for the number of
-figures. The plot shows the distance of its cumulative distribution from the uniform one. In the
-middle of the plot, a curve like a hill belongs to estimates that are too large, a curve that falls
-and rises to intervals that are too narrow. The band contains the whole curve of a right
-distribution with 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test for discrete
+figures. The plot shows the cumulative distribution of each figure minus the uniform one. A single
+hill belongs to estimates that are too large. A hill in the left half and a valley in the right half
+belong to intervals that are too narrow. The band contains the whole curve of a right distribution
+with a probability of 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test for discrete
 uniformity and its applications in goodness-of-fit evaluation and multiple sample comparison").
 """
 

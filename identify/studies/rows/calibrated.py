@@ -6,8 +6,8 @@ distribution gives to values below the truth. If the stated distributions are ri
 probabilities are uniform between 0 and 1 over the rows, whatever the truth (Talts et al. 2018,
 "Validating Bayesian inference algorithms with simulation-based calibration").
 
-A truth that cannot be run is drawn again, and counted: its bodies cannot exist, a parameter is
-below its bound, or its loop is unstable.
+A truth is drawn again if a body of it cannot exist, if a parameter is below its bound, or if its
+loop is unstable. The row counts these draws.
 """
 
 from dataclasses import dataclass, replace
@@ -90,8 +90,8 @@ def drawn_truth(
 ) -> DrawnTruth:
     """Draw true parameters from an estimator's prior within its bounds.
 
-    Parameters of their own, and bodies as a whole, are drawn again until they are within the
-    bounds. The result has the distribution of the prior truncated at the bounds.
+    Single parameters, and all parameters of a body together, are drawn again until they are within
+    the bounds. The result has the distribution of the prior truncated at the bounds.
     """
     values = guess.values.copy()
     missing = np.ones(len(values), dtype=bool)
