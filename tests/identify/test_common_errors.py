@@ -338,9 +338,13 @@ def test_records_that_share_a_draw_do_not_average_it():
 
     def covariance(second):
         runs = run(0, told, np.eye(2)), run(1, second, basis)
-        guess = SimpleNamespace(rows=np.eye(size))
+        guess = SimpleNamespace(rows=np.eye(size), layout=None)
+        anchor = SimpleNamespace(row=lambda layout: (np.zeros((0, size)), np.zeros(0)))
         problem = SimpleNamespace(
-            runs=runs, known=lambda parameters: (np.zeros(size), np.eye(size)), guess=guess
+            runs=runs,
+            known=lambda parameters: (np.zeros(size), np.eye(size)),
+            guess=guess,
+            anchor=anchor,
         )
         return estimate_uncertainty(problem, np.zeros(size), np.random.default_rng(0))
 
