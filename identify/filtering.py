@@ -123,8 +123,10 @@ def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def interpolated(times: NDArray[Any], known: NDArray[Any], values: Array) -> Array:
-    """Return values (k, m), which are known at times (k,), at other times (N,), linearly."""
-    return np.column_stack([np.interp(times, known, column) for column in values.T])
+    """Return values (k, ...), which are known at times (k,), at other times (N,), linearly."""
+    columns = values.reshape(len(values), -1).T
+    found = np.column_stack([np.interp(times, known, column) for column in columns])
+    return found.reshape(len(times), *values.shape[1:])
 
 
 def _finite(samples: ArrayLike) -> Array:

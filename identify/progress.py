@@ -123,10 +123,10 @@ class _RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:.3g} {self._unit}")
 
 
-def print_warnings(warnings: Iterable[str]) -> None:
+def print_warnings(warnings: Iterable[str], word: str = "warning") -> None:
     """Print each warning as one line on standard error, even if the command is quiet."""
     for warning in warnings:
-        typer.echo(f"warning: {' '.join(warning.split())}", err=True)
+        typer.echo(f"{word}: {' '.join(warning.split())}", err=True)
 
 
 def print_table(

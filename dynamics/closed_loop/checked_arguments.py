@@ -45,17 +45,22 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     return layout.derivatives(len(robot.geometry.chart.freedoms)) - shown - 1
 
 
-def checked_directions(directions: object, shape: tuple[int, int], most: int) -> np.ndarray:
+def checked_directions(
+    directions: object, before: object, shape: tuple[int, int], most: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Directions (frames, n, k) of commands of a shape (frames, n), at most so many.
 
-    Raises SimulationError.
+    The second array (n, k) has those of the commands from before the start, zero if `before` is
+    None. Raises SimulationError.
     """
     given = np.asarray(directions)
     count = given.shape[2] if given.ndim == 3 else 0
     if count > most:
         raise SimulationError(f"{count} directions of the commands, at most {most} fit here")
     checked = floats("directions", directions, (*shape, count), error=SimulationError)
-    return np.ascontiguousarray(checked)
+    start = np.zeros((shape[1], count)) if before is None else before
+    start = floats("start_directions", start, (shape[1], count), error=SimulationError)
+    return np.ascontiguousarray(checked), np.ascontiguousarray(start)
 
 
 def checked_times(times: object, frames: int) -> np.ndarray:

@@ -244,6 +244,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "reference_rate": chart.coordinates(problem.reference.rates),
         "commands": commands,
         "directions": problem.directions,
+        "start_directions": problem.start_directions,
         "feedforward": np.zeros((0, 0)) if problem.feedforward is None else problem.feedforward,
         "lost": np.zeros(0, bool) if ideal.lost is None else np.ascontiguousarray(ideal.lost),
         "noise": np.zeros((0, 0)) if ideal.noise is None else chart.coordinates(ideal.noise),
@@ -351,9 +352,8 @@ def _fill(
         last = np.concatenate([fixed, function.constants])
         end = sum(function.inputs)
         inputs[end - len(last) : end].T[...] = last
-    elastic = settings.elasticity is not None
     # the motors come last in the state
-    now.unknowns = len(now.state) - (0 if elastic else 2 * sizes.joints)
+    now.unknowns = len(now.state) - (0 if settings.elasticity else 2 * sizes.joints)
     now.parameters = len(columns)
     now.start_moves = problem.start_sensitivities
     now.step_column = len(columns) + problem.further_columns

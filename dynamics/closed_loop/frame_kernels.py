@@ -47,7 +47,9 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
         issued = d.issued[len(d.issued) - 1]
         copy_rows(plan.start_command_sensitivity, issued, now.parameters)
-        scale_received(task, issued, now.parameters)
+        further = plan.start_directions
+        copy_rows(further, issued[:, now.parameters :], further.shape[1])
+        scale_received(task, issued, now.width)
         # at a start at rest, the command comes from the integral of the servo
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)

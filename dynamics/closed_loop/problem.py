@@ -89,6 +89,7 @@ class LoopProblem:
     start_sensitivities: bool = False
     groups: RigidGroups | None = None
     directions: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    start_directions: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def columns(self) -> np.ndarray:
@@ -219,10 +220,12 @@ def with_derivatives(
     by_start: object,
     groups: RigidGroups | None,
     directions: np.ndarray | None = None,
+    start_directions: np.ndarray | None = None,
 ) -> LoopProblem:
     """Problem with derivatives, also along directions (frames, n, k) of its commands.
 
-    Raises SimulationError for elastic joints, and for directions that do not fit.
+    start_directions (n, k): those of the commands from before the start. Raises SimulationError for
+    elastic joints, and for directions that do not fit.
     """
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
@@ -230,18 +233,16 @@ def with_derivatives(
         raise SimulationError(
             "derivatives exist only for rigid joints: pass settings with elasticity=None"
         )
+    by_start = flag("by_start", by_start, SimulationError)
     found = dataclasses.replace(
-        problem,
-        sensitivities=True,
-        start_sensitivities=flag("by_start", by_start, SimulationError),
-        groups=groups,
+        problem, sensitivities=True, start_sensitivities=by_start, groups=groups
     )
     if directions is None:
         return found
     most = 0 if found.start_sensitivities else most_directions(problem.robot, groups)
     shape = problem.frames, problem.robot.layout.joints
-    checked = checked_directions(directions, shape, most)
-    return dataclasses.replace(found, directions=checked)
+    moved, before = checked_directions(directions, start_directions, shape, most)
+    return dataclasses.replace(found, directions=moved, start_directions=before)
 
 
 def _problem(

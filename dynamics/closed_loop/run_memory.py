@@ -36,6 +36,7 @@ class Plan(NamedTuple):
     reference_rate: np.ndarray
     commands: np.ndarray
     directions: np.ndarray
+    start_directions: np.ndarray
     feedforward: np.ndarray
     lost: np.ndarray
     noise: np.ndarray

@@ -215,6 +215,7 @@ def differentiate_servo(
     latencies: np.ndarray | None = None,
     by_start: bool = False,
     groups: RigidGroups | None = None,
+    directions: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the servo's loop with derivatives of the poses and of the last frame's state.
@@ -232,12 +233,15 @@ def differentiate_servo(
         only for the pivots of the groups and for all other parameters, which is faster.
         `groups.of_all` extends them to all parameters. This is not valid with a start whose own
         sensitivities do not depend on the groups alone.
+    directions : ndarray, shape (frames, n, k), optional
+        Directions of the feedforward along which the poses are differentiated, too, at most
+        `most_directions`. They are not combined with `by_start`.
 
     Returns
     -------
     ClosedLoopRun
-        Its fields `pose_sensitivity` and `end_sensitivity` are set, and if `by_start` is True, also
-        the sensitivities with respect to the start.
+        Its fields `pose_sensitivity` and `end_sensitivity` are set. With `by_start`, so are the
+        sensitivities with respect to the start, and with directions `command_sensitivity`.
 
     Raises
     ------
@@ -256,7 +260,7 @@ def differentiate_servo(
     problem = servo_problem(
         robot, parameters, reference, settings, sensor, None, start, feedforward, latencies
     )
-    return _run(with_derivatives(problem, by_start, groups), compiled)
+    return _run(with_derivatives(problem, by_start, groups, directions), compiled)
 
 
 def differentiate_commands(
@@ -273,6 +277,7 @@ def differentiate_commands(
     by_start: bool = False,
     groups: RigidGroups | None = None,
     directions: np.ndarray | None = None,
+    start_directions: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the robot under given commands, with derivatives like those of `differentiate_servo`.
@@ -285,7 +290,10 @@ def differentiate_commands(
         As for `differentiate_servo`.
     directions : ndarray, shape (frames, n, k), optional
         Directions of the commands along which the poses are differentiated, too, at most
-        `most_directions`. They are not combined with `by_start`.
+        `most_directions`. They are not combined with `by_start`. With `times`, the direction of a
+        row of NaN must be that of the command before.
+    start_directions : ndarray, shape (n, k), optional
+        The same for the last command from before the start. The default is zero.
 
     Returns
     -------
@@ -310,7 +318,7 @@ def differentiate_commands(
     problem = commands_problem(
         robot, parameters, reference, settings, commands, sensor, start, latencies, times
     )
-    return _run(with_derivatives(problem, by_start, groups, directions), compiled)
+    return _run(with_derivatives(problem, by_start, groups, directions, start_directions), compiled)
 
 
 def _run(problem: LoopProblem, compiled: object) -> ClosedLoopRun:

@@ -325,8 +325,9 @@ def _warn_of_robot(scenario: Scenario, quiet: bool) -> None:
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:
-    """Load the result of a run, and print the warnings of its identification."""
+    """Load the result of a run, and print the notes and warnings of its identification."""
     result = load_result(folder.result)
+    print_warnings(result["identification"].get("notes", []), "note")
     print_warnings(result["identification"].get("warnings", []))
     return result
 

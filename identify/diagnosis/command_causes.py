@@ -1,4 +1,7 @@
-"""Causes between the log of the commands and the drives: their scale, and clocks."""
+"""Causes between the log of the commands and the drives: their scale, and clocks.
+
+A record on the grid states when each command acts by a latency, and one at any times by a time.
+"""
 
 from dataclasses import replace
 
@@ -9,9 +12,13 @@ from identify.arrays import Array
 from identify.diagnosis.cause import Cause, OnCommands, in_each_run, prior_std
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
+from identify.model.timed_model import TimedModel
 
 CLOCK_STEP_S = 1e-4
 """Change of a latency for differences."""
+
+SHORTEST_S = 1e-4
+"""Shortest time for which a command acts, s."""
 
 SCALE_STD = 1e-3
 """Standard deviation of the scale of commands in an ordinary workshop."""
@@ -51,27 +58,34 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
     """Return the offset and the drift of the clock of the commands against that of the frames."""
     timing = problem.runs[0].settings.timing
 
-    def later(run: LoopModel, size: float) -> LoopModel:
-        return replace(run, acted=possible(run, run.stated_latencies + size))
-
     def drifting(run: LoopModel, size: float) -> LoopModel:
-        return replace(run, acted=possible(run, run.stated_latencies + size * seconds_of(run)))
+        return acting_later(run, size * seconds_of(run))
 
-    earliest = min(float(run.stated_latencies.min()) for run in problem.runs)
-    longest = max(len(run.ok) for run in problem.runs) / timing.frame_rate_hz
+    def remedied(size: float) -> str:
+        when = f"{1e3 * abs(size):.3g} ms {'later' if size > 0 else 'earlier'}"
+        if timed:
+            return (
+                f"the commands act {when} than their times say: state timing.clock_offset_std_s, "
+                "or correct these times"
+            )
+        return (
+            f"state timing.latency_s = {timing.latency_s + size:.6g} with the record: the commands "
+            f"act {when} than it says"
+        )
+
+    timed = any(isinstance(run, TimedModel) for run in problem.runs)
+    # a clock may have any offset
+    earliest = np.inf if timed else min(float(run.stated_latencies.min()) for run in problem.runs)
+    longest = max(float(seconds_of(run)[-1]) for run in problem.runs)
     return (
         Cause(
             name="latency of the commands",
             unit="s",
             group="latency of the commands",
-            change=in_each_run(later),
+            change=in_each_run(acting_later),
             step=CLOCK_STEP_S,
             effect=OnCommands(lambda run, place: delayed(run)),
-            remedy=lambda size: (
-                f"state timing.latency_s = {timing.latency_s + size:.6g} with the record: the "
-                f"commands act {1e3 * abs(size):.3g} ms {'later' if size > 0 else 'earlier'} than "
-                "it says"
-            ),
+            remedy=remedied,
             least=-earliest,
         ),
         Cause(
@@ -91,8 +105,17 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
 
 
 def seconds_of(run: LoopModel) -> Array:
-    """Return the times (N,) of the frames of a run, s."""
-    return np.arange(len(run.ok)) / run.settings.timing.frame_rate_hz
+    """Return the times (N,) of the commands of a run since its first frame, s."""
+    if isinstance(run, TimedModel):
+        return np.asarray(run.acting - run.times[0])
+    return np.arange(len(run.logged)) / run.settings.timing.frame_rate_hz
+
+
+def acting_later(run: LoopModel, seconds: Array | float) -> LoopModel:
+    """Return a model whose commands act later by some seconds (N,)."""
+    if isinstance(run, TimedModel):
+        return replace(run, acting=run.acting + seconds)
+    return replace(run, acted=possible(run, run.stated_latencies + seconds))
 
 
 def delayed(run: LoopModel) -> Array:
@@ -102,7 +125,11 @@ def delayed(run: LoopModel) -> Array:
     its time. Half of this change is in the time of either one, so that its middle is there.
     """
     changes = np.diff(run.logged, axis=0, prepend=run.logged[:1], append=run.logged[-1:])
-    return -run.settings.timing.frame_rate_hz * (changes[:-1] + changes[1:]) / 2
+    rates = np.full((len(run.logged), 1), run.settings.timing.frame_rate_hz)
+    if isinstance(run, TimedModel) and len(rates) > 1:
+        # two commands that act together are as one
+        rates[:-1, 0] = 1.0 / np.maximum(np.diff(run.acting), SHORTEST_S)
+    return -rates * (changes[:-1] + changes[1:]) / 2
 
 
 def possible(run: LoopModel, latencies: Array) -> Array:

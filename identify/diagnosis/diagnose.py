@@ -1,9 +1,11 @@
 """Diagnosis of records: from what was identified of them to the causes that explain the rest."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
+import numpy as np
 import xarray as xr
 
 from dynamics import Robot
@@ -19,7 +21,6 @@ from identify.estimation.identification import asked_of, identify, output_error_
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
-from identify.record.recording import is_timed
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
@@ -72,24 +73,24 @@ def diagnose(
     began = time.perf_counter()
     asked = asked_of(record, robot, scenario)
     side = asked.side.with_drive(result.drive.law)
-    if any(map(is_timed, asked.records)):
-        raise EstimationError(
-            "the diagnosis asks for causes frame by frame, and the commands of a record have times "
-            "of their own"
-        )
     problem = output_error_problem(asked.records, side, asked.settings)
-    found = diagnosis_from(problem, result.driven_estimate, causes)
+    errors = result.common_errors.learned
+    found = diagnosis_from(problem, result.driven_estimate, causes, errors)
     return replace(found, seconds=time.perf_counter() - began)
 
 
 @one_thread
 def diagnosis_from(
-    problem: OutputErrorProblem, start: Array, own: Sequence[Cause] = ()
+    problem: OutputErrorProblem,
+    start: Array,
+    own: Sequence[Cause] = (),
+    errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Diagnosis:
     """Return the diagnosis of a problem, from parameters (p,) near its optimum.
 
     The joints are driven by the logged commands, since the residuals of a right model are white
-    only then. own: causes beside those of the catalogue.
+    only then. own: causes beside those of the catalogue. errors: estimates, by name, of the errors
+    that all poses of the first record have in common, from which the search for them begins.
 
     Raises EstimationError for a cause of one's own that has no column and for drives that took
     torques, and LoopFailure if the model is unstable.
@@ -100,7 +101,7 @@ def diagnosis_from(
             "the drives took torques: a record is diagnosed only where they took joint commands"
         )
     # an estimate that is still under way would be accused of what it has not reached yet
-    problem = problem.driven_by_commands()
+    problem = _with_errors(problem.driven_by_commands(), errors)
     problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
     found = search_with_common_errors(problem, [start], lambda n=1: None)
     problem = found.linearised()
@@ -111,3 +112,15 @@ def diagnosis_from(
     selected = select(problem, point, causes, first)
     rows = Rows.of(problem, point.residual)
     return diagnosis_of(selected, causes, rows, time.perf_counter() - began)
+
+
+def _with_errors(problem: OutputErrorProblem, errors: Mapping[str, float]) -> OutputErrorProblem:
+    """Return a problem whose first run has these common errors, if they are all that it can have.
+
+    Of other records nothing is known, and they begin without errors.
+    """
+    first, *others = problem.runs
+    if not errors or tuple(errors) != first.common.all_names:
+        return problem
+    drawn = np.linalg.pinv(first.common.whole_factor) @ np.array([*errors.values()])
+    return replace(problem, runs=(first.having(drawn[: len(first.errors_had)]), *others))

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics import DynamicsError
-from dynamics.closed_loop import ClosedLoopRun, differentiate_commands, most_directions
 from dynamics.closure import Closure
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
@@ -38,7 +37,7 @@ from identify.diagnosis.cause import (
     with_causes,
 )
 from identify.estimation.output_error import OutputErrorProblem
-from identify.model.joint_torques import equivalent_commands
+from identify.model.error_modes import differentiated
 from identify.model.loop_model import LoopModel
 from identify.model.unequal_gains import UnequalGains, with_unequal_gains
 from identify.runtime import in_threads
@@ -110,7 +109,7 @@ def _of_run(
         zeros = np.broadcast_to(np.eye(joints), (len(run.logged), joints, joints))
         directions = np.concatenate([directions, zeros], axis=2)
     model = with_unequal_gains(run, np.zeros((joints, len(JOINT_PID)))) if gains else run
-    found, by_commands = _differentiated(model, parameters, directions)
+    found, by_commands = differentiated(model, parameters, directions)
     sensitivity = found.pose_sensitivity
     assert sensitivity is not None
     changes = np.zeros((*found.pose.shape, len(effects)))
@@ -147,30 +146,9 @@ def _directions(
         parts.append(np.stack([one.changes(run, place) for one in commands.values()], axis=2))
     if torques:
         needed = np.stack([one.torques[place] for one in torques.values()], axis=1)
-        late = run.stated_latencies if run.latencies is None else run.latencies
-        law = run.drive_law(parameters)
-        added = equivalent_commands(needed, late, law, run.settings.timing)
+        added = run.commands_for(needed, run.drive_law(parameters))
         parts.append(-added.transpose(0, 2, 1))
     return [*commands, *torques], np.concatenate(parts, axis=2)
-
-
-def _differentiated(
-    run: LoopModel, parameters: Array, directions: Array
-) -> tuple[ClosedLoopRun, Array]:
-    """Return a run with sensitivities, and the derivatives (N, 6, k) along directions (N, n, k)."""
-    own = run.robot.with_own_gains() if isinstance(run, UnequalGains) else run.robot
-    room = most_directions(own, run.groups)
-    count = directions.shape[2]
-    ends = range(room, count, room)
-    known = run.commanded(parameters)
-    late = run.latencies
-    runs = [
-        differentiate_commands(*known, latencies=late, groups=run.groups, directions=part)
-        for part in np.split(directions, ends, axis=2)
-    ]
-    found = [one.command_sensitivity for one in runs if one.command_sensitivity is not None]
-    none = np.zeros((*runs[0].pose.shape, 0))
-    return runs[0], np.concatenate([none, *found], axis=2)
 
 
 def geometry_changes(run: LoopModel, poses: Array, by_zeros: Array) -> Array:

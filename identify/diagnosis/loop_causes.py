@@ -21,6 +21,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.filtering import interpolated
 from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel
+from identify.model.timed_model import TimedModel
 
 SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
 """Velocities over which static friction fades, as shares of the joints' RMS velocity."""
@@ -177,10 +178,13 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
     _, coulomb, viscous, _ = run.robot.layout.split(parameters + run.payload)
     friction = run.settings.friction
     carried = found.torque - coulomb * friction.level(rates) - viscous * rates
-    late = run.stated_latencies if run.latencies is None else run.latencies
     period = 1.0 / run.settings.timing.frame_rate_hz
-    acting = found.time + late + period / 2
-    return interpolated(acting, found.time, carried)
+    if isinstance(run, TimedModel):
+        begin = run.acting_now
+    else:
+        late = run.stated_latencies if run.latencies is None else run.latencies
+        begin = found.time + late
+    return interpolated(begin + period / 2, found.time, carried)
 
 
 def torque_limit(run: LoopModel, peak: float) -> Cause:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from identify.arrays import Array
+from identify.arrays import Array, triangular_factor
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.explanation import (
@@ -151,13 +151,20 @@ def rank(
     every = candidates(causes)
     price = np.log(len(rows.of_poses(residual)))
     share = misfit_of(rows, left).share_of_model
-    colour = rows.colour(left) if share else ()
+    # what one of them leaves is hardly less than what all of them have to explain
+    beyond = share * rows.spread(rows.colour(left), projected) if share else None
+    # in as many rows as columns, these have the same products with each other and the residuals
+    triangle = triangular_factor(projected, left)
+    inner, rest = triangle[:, :-1], triangle[:, -1]
     ranked = []
     for one in every:
         places = list(one.places)
-        found = _possible_score(projected, left, lengths, places, causes)
-        # what one of them leaves is hardly less than what all of them have to explain
-        chance = min(1.0, len(every) * _chance(found, left, rows, share, colour))
+        found = _possible_score(inner, rest, lengths, places, causes)
+        spread = None
+        if beyond is not None:
+            spread = found.by_directions.T @ beyond[np.ix_(places, places)] @ found.by_directions
+        chance = min(1.0, len(every) * _chance(found, rest, spread))
+        found = replace(found, directions=projected[:, places] @ found.by_directions)
         worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
         ranked.append(Ranked(one, found, chance, worth))
     ranked.sort(key=lambda one: -one.worth)
@@ -167,8 +174,9 @@ def rank(
     # causes that would need a size that nothing can have are left out
     possible = {one.candidate.places for one in ranked if one.score.freedoms}
     alone = [place for place, one in enumerate(causes) if one.alone and (place,) in possible]
-    few, found = forward_selection(projected[:, alone], left, lengths[alone])
+    few, found = forward_selection(inner[:, alone], rest, lengths[alone], price)
     chain = tuple(alone[place] for place in few)
+    found = replace(found, directions=projected[:, list(chain)] @ found.by_directions)
     worth = found.statistic - len(chain) * (price + 2 * np.log(len(alone)))
     if worth <= ranked[0].worth:
         return tuple(ranked)
@@ -210,15 +218,16 @@ def _possible_score(
 
 
 def forward_selection(
-    columns: Array, residual: Array, lengths: Array
+    columns: Array, residual: Array, lengths: Array, price: float
 ) -> tuple[tuple[int, ...], Score]:
     """Return the places of a few causes alone, each the best beside those before, and their score.
 
-    The arguments are as for `score`.
+    The arguments are as for `score`. price: statistic that a cause is worth by chance, beside its
+    choice among all.
     """
     chain: tuple[int, ...] = ()
     found = score(columns[:, :0], residual, lengths[:0])
-    price = np.log(len(residual)) + 2 * np.log(columns.shape[1])
+    price = price + 2 * np.log(columns.shape[1])
     for _ in range(FEW):
         beside = OrthogonalComplement.of(columns[:, list(chain)])
         free = beside.part(columns)
@@ -239,20 +248,20 @@ def p_value_of(found: Score, residual: Array, rows: Rows) -> float:
     """
     left = residual - found.directions @ (found.directions.T @ residual)
     share = misfit_of(rows, left).share_of_model
-    return _chance(found, residual, rows, share, rows.colour(left) if share else ())
+    spread = share * rows.spread(rows.colour(left), found.directions) if share else None
+    return _chance(found, residual, spread)
 
 
-def _chance(
-    found: Score, residual: Array, rows: Rows, share: float, colour: Sequence[Array]
-) -> float:
-    """Return the probability of a statistic beside a share of the model's error of some colour."""
+def _chance(found: Score, residual: Array, spread: Array | None) -> float:
+    """Return the probability of a statistic.
+
+    spread (d, d): covariance of U^T r by the model's error, beside that by noise, if there is any.
+    """
     if not found.freedoms:
         return 1.0
     along = found.directions.T @ residual
-    spread = np.eye(found.freedoms)
-    if share:
-        spread = spread + share * rows.spread(colour, found.directions)
-    return float(chdtrc(found.freedoms, along @ np.linalg.solve(spread, along)))
+    whole = np.eye(found.freedoms) if spread is None else np.eye(found.freedoms) + spread
+    return float(chdtrc(found.freedoms, along @ np.linalg.solve(whole, along)))
 
 
 def indistinguishable(ranking: Sequence[Ranked], rows: Rows, residual: Array) -> tuple[Ranked, ...]:

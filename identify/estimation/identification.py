@@ -131,9 +131,7 @@ def identify(
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, settings.qr_threshold, solution, uncertainty, explained)
     errors = common_error_estimates(judged, solution.parameters, uncertainty.whole)
-    notes = (
-        *reading_notes(records),
-        *clock_notes(errors),
+    warned = (
         *(() if explained.model_holds else clock_hints(problem, warm, explained.misfit.found)),
         *command_time_warnings(records, side.timing),
         *drift_warnings(records),
@@ -170,7 +168,8 @@ def identify(
             "search": searched - warmed,
             "uncertainty": ended - searched,
         },
-        **vars(judgement) | {"warnings": (*notes, *drive.warnings(), *judgement.warnings)},
+        notes=(*reading_notes(records), *clock_notes(errors)),
+        **vars(judgement) | {"warnings": (*warned, *drive.warnings(), *judgement.warnings)},
     )
 
 

@@ -300,7 +300,7 @@ def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:
 def _why(problem: OutputErrorProblem, parameters: Array) -> str:
     try:
         for run in problem.runs:
-            run.model_poses(parameters)
+            run.simulate(parameters)
     except DynamicsError as error:
         return str(error)
     return "the cost is not finite"

@@ -93,6 +93,8 @@ class IdentificationResult:
         Estimate with that model. It equals `estimate` if no closed-loop search followed.
     driven_misfit : Misfit
         Misfit of that model.
+    notes, warnings : tuple of str
+        Decisions when the record was read, and what may be wrong.
     """
 
     layout: ParameterLayout
@@ -127,6 +129,7 @@ class IdentificationResult:
     whiteness: Whiteness
     driven_estimate: Array
     driven_misfit: Misfit
+    notes: tuple[str, ...]
     warnings: tuple[str, ...]
     seconds: dict[str, float]
 
@@ -167,10 +170,8 @@ class IdentificationResult:
     def __repr__(self) -> str:
         return (
             f"<IdentificationResult: {np.sum(self.identifiable)} of {len(self.names)} parameters "
-            "and "
-            f"{np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified in "
-            f"{self.iterations} "
-            f"iterations, {self.misfit}, {len(self.warnings)} warnings>"
+            f"and {np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified "
+            f"in {self.iterations} iterations, {self.misfit}, {len(self.warnings)} warnings>"
         )
 
     def to_dataframe(self) -> pd.DataFrame:
@@ -270,7 +271,7 @@ class IdentificationResult:
             },
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": pairs,
-            "warnings": list(self.warnings),
+            **{name: list(getattr(self, name)) for name in ("notes", "warnings")},
             "nuisances": dict(zip(common.names, common.std.tolist(), strict=True)),
             "nuisance_estimates": common.learned,
             "nuisance_prior_std": dict(zip(common.names, common.prior_std.tolist(), strict=True)),
@@ -362,13 +363,12 @@ class IdentificationResult:
 
 
 def result_html(result: IdentificationResult) -> str:
-    """Return HTML with the one-line summary, the warnings, a picture and the identified rows."""
+    """Return HTML with a summary, the notes and warnings, a picture and the identified rows."""
     table = result.table().query("identifiable").drop(columns="identifiable")
-    warnings = "".join(f"<li>{html.escape(text)}</li>" for text in result.warnings)
+    lines = "".join(f"<li>{html.escape(text)}</li>" for text in (*result.notes, *result.warnings))
     picture = base64.b64encode(relative_uncertainty_png(result)).decode()
     return (
-        f"<p>{html.escape(repr(result).strip('<>'))}</p>"
-        f"<ul>{warnings}</ul>"
+        f"<p>{html.escape(repr(result).strip('<>'))}</p><ul>{lines}</ul>"
         f'<img alt="standard deviation of the identified parameters" '
         f'src="data:image/png;base64,{picture}">'
         f"{table.to_html(float_format='%.6g')}"

@@ -25,10 +25,14 @@ from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.loop_parameters import check_parameter_set
 from identify.model.body_torques import full_regressor, passive_columns, run_motion
+from identify.model.error_modes import differentiated
 from identify.scenario import Model
 
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
+
+LEAST_COMMAND = 1e-10
+"""Largest change of a command, rad, m, N m or N, that counts as none."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +96,29 @@ def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
     torques = _torques(run, parameters, run.simulate(parameters))
     if run.settings.drives.torques:
         return -torques
-    law = run.drive_law(parameters)
-    count, frames, joints = torques.shape
-    # all errors at once, as if each had joints of its own
-    gains = [np.tile(one, count) for one in (law.lp, law.li, law.ld)]
-    tiled = law._replace(lp=gains[0], li=gains[1], ld=gains[2])
-    side_by_side = torques.transpose(1, 0, 2).reshape(frames, -1)
-    needed = run.commands_for(side_by_side, tiled)
-    return -needed.reshape(len(needed), count, joints).transpose(1, 0, 2)
+    needed = run.commands_for(torques.transpose(1, 0, 2), run.drive_law(parameters))
+    return -needed.transpose(1, 0, 2)
+
+
+def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
+    """Return the changes (N, 6) of a run's poses by its errors of bodies, by their places.
+
+    One run is differentiated along the changes of the commands. Under torques, only errors that
+    need none are returned. parameters (p,): those of the run. Raises LoopFailure if the model is
+    unstable.
+    """
+    if run.bodies is None:
+        return {}
+    first = len(run.errors_had) - len(run.bodies)
+    # a crank about a vertical axis, for example, needs no torque for most of its errors
+    moving = np.abs(run.bodies).max(axis=(1, 2)) >= LEAST_COMMAND
+    found: dict[int, Array | float] = {first + int(k): 0.0 for k in np.flatnonzero(~moving)}
+    if run.settings.drives.torques:
+        return found
+    made, changes = differentiated(run, parameters, run.bodies[moving].transpose(1, 2, 0))
+    run.known_runs[True] = parameters.tobytes(), made
+    places = first + np.flatnonzero(moving)
+    return found | {int(place): changes[:, :, k] for k, place in enumerate(places)}
 
 
 def fed_forward(

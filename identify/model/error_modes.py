@@ -1,20 +1,20 @@
-"""Effect of errors that all poses of a run have in common, by runs of the model with each error."""
+"""Effect of errors that all poses of a run have in common, by runs of the model with each error.
+
+Errors that act as changes of the commands need no run of their own: one run is differentiated along
+all of these changes.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynamics.closed_loop import ClosedLoopRun
+from dynamics.closed_loop import ClosedLoopRun, most_directions
 from identify.arrays import Array
 from identify.runtime import in_threads
 
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
-
-
-LEAST_COMMAND = 1e-10
-"""Largest change of a command, rad, m, N m or N, that counts as none."""
 
 
 def error_modes(
@@ -28,22 +28,18 @@ def error_modes(
     They are central differences about the common errors that the model contains, at parameters
     (p,).
     shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6) by
-    errors that are not simulated, by the place of the error.
+    errors that are not simulated, by the place of the error, beside the model's `derived_modes`.
 
     Raises LoopFailure if the model is unstable.
     """
     drawn = run.errors_had
     modes = np.zeros((*run.measured.shape, len(drawn)))
+    known = {**known, **run.derived_modes(parameters)}
     for place, change in known.items():
         modes[:, :, place] = change
     # Errors of poses beyond the noticed ones change nothing.
     unnoticed = range(run.common.noticed, len(run.common.names))
     moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
-    if run.bodies is not None:
-        # A crank about a vertical axis, for example, needs no torque for most of its errors.
-        without = np.abs(run.bodies).max(axis=(1, 2)) < LEAST_COMMAND
-        still = len(drawn) - len(without) + np.flatnonzero(without)
-        moving = [k for k in moving if k not in still]
     ends = [
         np.maximum(drawn + sign * np.diag(run.difference_steps)[k], run.lowest_drawn)
         for k in moving
@@ -59,3 +55,18 @@ def error_modes(
         return modes
     by_geometry = geometry.modes(lambda robot: run.simulate(parameters, robot=robot).pose)
     return np.concatenate([modes, by_geometry], axis=2)
+
+
+def differentiated(
+    run: "LoopModel", parameters: Array, directions: Array
+) -> tuple[ClosedLoopRun, Array]:
+    """Return a run of the model with sensitivities, and the derivatives (N, 6, k) of its poses.
+
+    directions (N, n, k): those of the commands, see `LoopModel.along`.
+    """
+    room = most_directions(run.moving(parameters, run.robot)[0], run.groups)
+    parts = np.split(directions, range(room, directions.shape[2], room), axis=2)
+    runs = [run.along(parameters, part) for part in parts]
+    found = [one.command_sensitivity for one in runs if one.command_sensitivity is not None]
+    none = np.zeros((*run.measured.shape, 0))
+    return runs[0], np.concatenate([none, *found], axis=2)

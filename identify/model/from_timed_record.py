@@ -22,6 +22,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.conditions import takes_torques
+from identify.record.frame_times import mean_rate
 from identify.record.load import recorded_payload
 from identify.record.recording import STRETCH, poses
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
@@ -87,13 +88,9 @@ def _settings(settings: LoopSettings, acting: Array) -> LoopSettings:
     The rate of commands is the frame rate, unless the times show another one.
     """
     rate_hz = settings.timing.frame_rate_hz
-    intervals = np.diff(acting)
-    intervals = intervals[intervals > 0]
-    usual = float(np.median(intervals))
-    # The mean is not rounded to the digits of a log, and the limits exclude gaps.
-    mean = float(intervals[np.abs(intervals - usual) <= usual / 2].mean())
-    if abs(mean * rate_hz - 1) > SAME_RATE:
-        rate_hz = 1.0 / mean
+    found = mean_rate(acting)
+    if abs(rate_hz / found - 1) > SAME_RATE:
+        rate_hz = found
     steps = ceil(settings.steps_per_frame * settings.timing.frame_rate_hz / rate_hz - 1e-9)
     timing = FrameTiming(rate_hz, 0.0, settings.timing.hold)
     return replace(settings, timing=timing, steps_per_frame=max(1, steps))

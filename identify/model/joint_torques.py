@@ -7,9 +7,16 @@ A drive turns a change U of its command into the torque
 beside that of the motion (`dynamics.closed_loop.drives`). A torque that a joint needs beside those
 of the model therefore acts as a change of its commands, which follows from this equation command by
 command. A model can thus have torques that its equation of motion lacks.
+
+Over a command of the period h, the integral grows by h U for a held command, and for a ramp by the
+mean of U before and after it. The torque T in the middle of a held command, or at the end of a
+ramp, obeys in both cases
+
+    (lp + b + li h / 2) U_k - (lp + 2 b - li h / 2) U_k-1 + b U_k-2 = T_k - T_k-1,   b = ld c / h.
 """
 
 import numpy as np
+import scipy
 from scipy.interpolate import PchipInterpolator
 
 from dynamics.closed_loop import FrameTiming
@@ -26,20 +33,15 @@ def equivalent_commands(
     frame to the start of the action of its command. Before the first command there is no torque.
     """
     period = 1.0 / timing.frame_rate_hz
-    ramp = timing.hold == "linear"
     by_rate = law.ld * law.rate_weight / period
-    stiffness = law.lp + by_rate + law.li * period / 2
+    half = law.li * period / 2
     needed = _while_commands_act(torques, latencies, timing)
     commands = np.zeros_like(torques)
-    integral = np.zeros(torques.shape[1:])
-    before = np.zeros(torques.shape[1:])
-    for k, torque in enumerate(needed):
-        held = by_rate * before - law.li * (integral + ramp * period * before / 2)
-        commands[k] = (torque + held) / stiffness
-        integral = integral + period * (
-            ramp * (before + commands[k]) / 2 + (not ramp) * commands[k]
+    for joint, (lp, b, h) in enumerate(zip(law.lp, by_rate, half, strict=True)):
+        weights = [lp + b + h, h - lp - 2 * b, b]
+        commands[..., joint] = scipy.signal.lfilter(
+            [1.0, -1.0], weights, needed[..., joint], axis=0
         )
-        before = commands[k]
     return commands
 
 

@@ -6,7 +6,7 @@ covariance of the sensor's noise and of the errors that all measured poses have 
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from dynamics.closed_loop import (
     Reference,
     differentiate_commands,
     differentiate_servo,
-    repeat_commands,
     repeat_servo,
     simulate_commands,
     simulate_servo,
@@ -29,7 +28,7 @@ from dynamics.closed_loop.drives import JointLaw
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
 from identify.filtering import without_gaps
-from identify.model.body_errors import body_errors, fed_forward
+from identify.model.body_errors import body_errors, body_modes, fed_forward
 from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
@@ -121,7 +120,7 @@ class LoopModel:
         had = modes[:, inside] @ self.errors_had[inside]
         whitened = replace(run, marginal=Marginal.of(modes, had))
         # Whitening changes no run.
-        whitened._runs.update(run._runs)
+        whitened.known_runs.update(run.known_runs)
         return whitened
 
     def modes(self, parameters: Array) -> Array:
@@ -143,6 +142,10 @@ class LoopModel:
         given = dict.fromkeys(range(len(self.common.names)), 0.0) if self.driven else {}
         return error_modes(self, parameters, lambda run: run.pose, given)
 
+    def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
+        """Return shifts (N, 6) that need no run of each error, by the places of the errors."""
+        return body_modes(self, parameters)
+
     @property
     def stated_latencies(self) -> Array:
         """Latencies (N,) of the commands, s, as the record or the timing states them."""
@@ -156,10 +159,8 @@ class LoopModel:
 
         They include the common error of the latency that the model contains.
         """
-        errors = self._loop_errors
-        if LATENCY not in errors:
-            return self.acted
-        return np.maximum(self.stated_latencies + errors[LATENCY], 0.0)
+        error = self._loop_errors.get(LATENCY)
+        return self.acted if error is None else np.maximum(self.stated_latencies + error, 0.0)
 
     @property
     def _loop_errors(self) -> dict[str, float]:
@@ -204,7 +205,6 @@ class LoopModel:
         parameters: Array,
         sensitivities: bool = False,
         robot: Robot | None = None,
-        noise: Array | None = None,
     ) -> ClosedLoopRun:
         """Simulate the model with the common errors that it contains.
 
@@ -215,28 +215,36 @@ class LoopModel:
         sensitivities : bool
             Whether derivatives with respect to the parameters are also computed.
         robot : Robot, optional
-            Robot that moves. The default is the robot that the servo knows.
-        noise : ndarray, shape (N, 6), optional
-            Noise of the poses that the servo measures.
+            Robot that moves, without sensitivities. The default is the robot that the servo knows.
 
         Raises
         ------
         LoopFailure
             The run is unstable.
         """
-        given = *self._moving(parameters, robot or self.robot), self.reference, self._loop
-        sensor = IdealSensor(self._lost, self._sensed(noise))
+        if sensitivities:
+            return self.along(parameters)
+        given = *self.moving(parameters, robot or self.robot), self.reference, self._loop
         late = self.latencies
         if self.driven:
-            known = *given, self._commands(parameters)
-            if sensitivities:
-                return differentiate_commands(*known, sensor, latencies=late, groups=self.groups)
-            return simulate_commands(*known, sensor, latencies=late)
+            known = *given, self._commands(parameters), self._sensor
+            return simulate_commands(*known, latencies=late)
         fed = fed_forward(self, *given)
-        if sensitivities:
-            return differentiate_servo(*given, sensor, latencies=late, groups=self.groups, **fed)
         # The servo always uses the robot that it knows, even if another robot moves.
-        return simulate_servo(*given, sensor, servo_robot=self.robot, latencies=late, **fed)
+        return simulate_servo(*given, self._sensor, servo_robot=self.robot, latencies=late, **fed)
+
+    def along(self, parameters: Array, directions: Array | None = None) -> ClosedLoopRun:
+        """Simulate the model with sensitivities, also along directions (N, n, k) of its commands.
+
+        These are directions of what is added to the commands of a servo, if one acts.
+        """
+        given = *self.moving(parameters, self.robot), self.reference, self._loop
+        more: dict[str, Any] = {"latencies": self.latencies, "groups": self.groups}
+        more["directions"] = directions
+        if self.driven:
+            return differentiate_commands(*given, self._commands(parameters), self._sensor, **more)
+        more |= fed_forward(self, *given)
+        return differentiate_servo(*given, self._sensor, **more)
 
     def simulate_repeats(
         self, parameters: Array, noises: Array
@@ -246,17 +254,14 @@ class LoopModel:
         The servo measures its poses with this noise. For an unstable run, the LoopFailure is
         returned in place of the run.
         """
-        sensed = np.asarray(self._sensed(noises))
         if self.driven:
-            return repeat_commands(*self.commanded(parameters), sensed, latencies=self.latencies)
-        given = *self._moving(parameters, self.robot), self.reference, self._loop
+            # without a servo, noise does not move the model
+            run = self.simulate(parameters)
+            return [replace(run, measured=run.pose + noise) for noise in noises]
+        sensed = np.asarray(self._sensed(noises))
+        given = *self.moving(parameters, self.robot), self.reference, self._loop
         fed = fed_forward(self, *given)
-        return repeat_servo(*given, sensed, lost=self._lost, latencies=self.latencies, **fed)
-
-    def commanded(self, parameters: Array) -> tuple[Robot, Array, Reference, LoopSettings, Array]:
-        """Return what a run under the logged commands takes, for parameters (p,)."""
-        moving = self._moving(parameters, self.robot)
-        return *moving, self.reference, self._loop, self._commands(parameters)
+        return repeat_servo(*given, sensed, lost=~self.ok, latencies=self.latencies, **fed)
 
     def drive_law(self, parameters: Array) -> JointLaw:
         """Return the law of the drives with its gains among parameters (p,)."""
@@ -271,7 +276,7 @@ class LoopModel:
         return commands if change is None else commands + change
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
-        """Return the changes of the commands for which drives add torques (N, j) at the frames."""
+        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n)."""
         late = self.stated_latencies if self.latencies is None else self.latencies
         return equivalent_commands(torques, late, law, self.settings.timing)
 
@@ -282,7 +287,7 @@ class LoopModel:
             return None
         return np.tensordot(self.drawn[-len(self.bodies) :], self.bodies, 1)
 
-    def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
+    def moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
         """Return the robot that moves in a run, and its parameters (p,) with the known load."""
         return robot, parameters + self.payload
 
@@ -292,20 +297,16 @@ class LoopModel:
         return settings_with_errors(self.settings, self._loop_errors)
 
     @property
-    def _lost(self) -> NDArray[np.bool_] | None:
-        """Marks (N,) of frames without a measurement by the model's servo. None without a servo."""
-        return None if self.driven else ~self.ok
+    def _sensor(self) -> IdealSensor:
+        """Sensor of the model, which loses the frames that were lost if a servo needs them."""
+        return IdealSensor(None if self.driven else ~self.ok, self._sensed())
 
-    def _sensed(self, noise: Array | None) -> Array | None:
+    def _sensed(self, noise: Array | None = None) -> Array | None:
         """Return what is added to poses that the servo measures: errors, noise (..., N, 6)."""
         if self.drawn is None or not self.common.names or self.driven:
             return noise
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]
         return error if noise is None else error + noise
-
-    def model_poses(self, parameters: Array) -> Array:
-        """Return the poses (N, 6) of the model. Raises LoopFailure if it is unstable."""
-        return self.simulate(parameters).pose
 
     def misses(self, parameters: Array, ahead: bool = False) -> Array:
         """Return the whitened residuals model - measurement (n, 6) of the good frames.
@@ -318,14 +319,12 @@ class LoopModel:
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
         given = parameters.tobytes()  # a copy, because the caller can change the array
-        known, run = self._runs.get(sensitivities, (b"", None))
-        if run is None or known != given:
-            run = self.simulate(parameters, sensitivities=sensitivities)
-            self._runs[sensitivities] = given, run
-        return run
+        if self.known_runs.get(sensitivities, (b"", None))[0] != given:
+            self.known_runs[sensitivities] = given, self.simulate(parameters, sensitivities)
+        return self.known_runs[sensitivities][1]
 
     @cached_property
-    def _runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
+    def known_runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
         """Latest run without and latest run with sensitivities, and their parameters."""
         return {}
 

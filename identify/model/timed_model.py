@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.closed_loop import (
     ClosedLoopRun,
-    LoopFailure,
     Reference,
     differentiate_commands,
     simulate_commands,
@@ -33,7 +32,6 @@ from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.filtering import interpolated
 from identify.model.common_error_prior import lowest_errors
-from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
 from identify.model.loop_model import LoopModel
 from identify.model.stretch import Stretch
@@ -96,39 +94,25 @@ class TimedModel(LoopModel):
         parameters: Array,
         sensitivities: bool = False,
         robot: Robot | None = None,
-        noise: Array | None = None,
     ) -> ClosedLoopRun:
         """Simulate the model stretch by stretch. The rows of the run are those of the poses.
 
         Arguments and errors are as for `LoopModel.simulate`.
         """
-        run = _joined(self._simulated(parameters, sensitivities, robot))
-        # Without a servo, noise does not move the model.
-        return run if noise is None else replace(run, measured=run.pose + noise)
+        if sensitivities:
+            return self.along(parameters)
+        return _joined(self._simulated(parameters, False, robot))
 
-    def simulate_repeats(
-        self, parameters: Array, noises: Array
-    ) -> list[ClosedLoopRun | LoopFailure]:
-        """Return the model's run once for each noise (N, 6) of noises (runs, N, 6)."""
-        run = self.simulate(parameters)
-        return [replace(run, measured=run.pose + noise) for noise in noises]
+    def along(self, parameters: Array, directions: Array | None = None) -> ClosedLoopRun:
+        """Simulate the model with sensitivities, also along directions (M, n, k) of commands."""
+        return _joined(self._simulated(parameters, True, directions=directions))
 
-    def modes(self, parameters: Array) -> Array:
-        """Return the shift (N, 6, k) of the measured poses by one standard deviation of each error.
+    def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
+        """Return shifts (N, 6) that need no run of each error, by the places of the errors.
 
-        The shifts by the start are derivatives, and those by all other errors of the loop are
-        differences of runs.
+        They are those by the start and by errors of bodies.
         """
-        given = self.common.modes
-        known = {k: given[:, :, k] for k in range(len(self.common.names))}
-        known |= self._shown_starts(parameters)
-        return error_modes(self, parameters, lambda run: run.pose, known)
-
-    def pose_modes(self, parameters: Array) -> Array:
-        """Return the shift (N, 6, k) of the platform by one standard deviation of each error."""
-        known = dict.fromkeys(range(len(self.common.names)), np.zeros_like(self.measured))
-        known |= self._shown_starts(parameters)
-        return error_modes(self, parameters, lambda run: run.pose, known)
+        return super().derived_modes(parameters) | self._shown_starts(parameters)
 
     @property
     def difference_steps(self) -> Array:
@@ -150,7 +134,7 @@ class TimedModel(LoopModel):
         return np.asarray(np.linalg.qr(np.vstack([np.eye(len(change)), modes]), mode="r") @ change)
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
-        """Return the changes (M, j) of the commands for which drives add torques (N, j) at poses.
+        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n) at poses.
 
         They follow from commands one period apart, and change little in a period.
         """
@@ -198,10 +182,14 @@ class TimedModel(LoopModel):
         sensitivities: bool,
         robot: Robot | None = None,
         by_start: bool = False,
+        directions: Array | None = None,
     ) -> list[ClosedLoopRun]:
-        """Return the runs of the stretches, with the errors that the model contains."""
+        """Return the runs of the stretches, with the errors that the model contains.
+
+        directions (M, n, k): those of the commands along which the runs are differentiated.
+        """
         errors = self._loop_errors
-        moved, values = self._moving(parameters, robot or self.robot)
+        moved, values = self.moving(parameters, robot or self.robot)
         commands = self._commands(parameters)
         settings = self._loop
         acting = np.round(np.maximum.accumulate(self.acting_now), ROUNDING)
@@ -220,12 +208,15 @@ class TimedModel(LoopModel):
             )
             still = Reference(np.tile(start.pose, (len(events), 1)), np.zeros((len(events), 6)))
             given = moved, values, still, settings, written
+            more: dict[str, Any] = {"start": start, "times": events}
+            if directions is not None:
+                # at each event that of the command that was written last
+                last = np.maximum(np.searchsorted(acting, events, side="right") - 1, newest - 1)
+                more |= {"directions": directions[last], "start_directions": directions[newest - 1]}
             run = (
-                differentiate_commands(
-                    *given, start=start, times=events, by_start=by_start, groups=self.groups
-                )
+                differentiate_commands(*given, by_start=by_start, groups=self.groups, **more)
                 if sensitivities
-                else simulate_commands(*given, start=start, times=events)
+                else simulate_commands(*given, **more)
             )
             runs.append(_at_rows(run, np.searchsorted(events, seen)))
         return runs
@@ -234,7 +225,7 @@ class TimedModel(LoopModel):
         """Return the changes (N, 6) of the poses by each error of a start, by the error's place."""
         runs = self._simulated(parameters, sensitivities=True, by_start=True)
         # The search linearises at the same parameters next.
-        self._runs[True] = parameters.tobytes(), _joined(runs)
+        self.known_runs[True] = parameters.tobytes(), _joined(runs)
         stds = self.common.loop_std
         places = {name: len(self.common.names) + k for k, name in enumerate(stds)}
         found = {}
@@ -252,6 +243,7 @@ class TimedModel(LoopModel):
 PER_FRAME = (
     *("time", "pose", "pose_rate", "torque", "command", "measured", "measured_ok"),
     *("joint_integral", "servo_integral", "pose_sensitivity", "start_sensitivity"),
+    "command_sensitivity",
     *("motor_angle", "motor_rate", "filtered_rate"),
 )
 """Fields of a run with one row per frame."""

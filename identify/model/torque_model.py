@@ -18,7 +18,6 @@ from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import (
     ClosedLoopRun,
     Drives,
-    LoopFailure,
     Reference,
     StartState,
     differentiate_commands,
@@ -90,7 +89,6 @@ class TorqueModel(LoopModel):
         parameters: Array,
         sensitivities: bool = False,
         robot: Robot | None = None,
-        noise: Array | None = None,
     ) -> ClosedLoopRun:
         """Simulate the model in fitted spans, with derivatives of its poses.
 
@@ -105,18 +103,7 @@ class TorqueModel(LoopModel):
                 for fit, (first, last) in zip(fits, self._spans, strict=True)
             ]
         )
-        # Without a servo, noise does not move the model.
-        measured = pose if noise is None else pose + noise
-        return replace(fits[0].run, pose=pose, measured=measured, pose_sensitivity=slopes)
-
-    def simulate_repeats(
-        self, parameters: Array, noises: Array
-    ) -> list[ClosedLoopRun | LoopFailure]:
-        """Return the model's run once for each noise (N, 6) of noises (runs, N, 6).
-
-        The noise is added to the measured poses. It does not move the model.
-        """
-        return [self.simulate(parameters, noise=noise) for noise in noises]
+        return replace(fits[0].run, pose=pose, measured=pose, pose_sensitivity=slopes)
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run. Only its fits are cached, because the next fits start there."""

@@ -10,6 +10,7 @@ from dynamics.closed_loop.drives import JointLaw
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.model.loop_model import LoopModel
+from identify.model.timed_model import TimedModel
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class UnequalGains(LoopModel):
 
     differences: Array = field(default_factory=lambda: np.zeros((0, len(JOINT_PID))))
 
-    def _moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
+    def moving(self, parameters: Array, robot: Robot) -> tuple[Robot, Array]:
+        """Return the robot that moves in a run with gains of each joint, and its parameters."""
         dynamic = (parameters + self.payload)[robot.layout.dynamic]
         return robot.with_own_gains(), np.concatenate([dynamic, self._gains(parameters).ravel()])
 
@@ -36,15 +38,18 @@ class UnequalGains(LoopModel):
         """Return the gains (n, 3) of each joint for parameters (p,)."""
         return self.robot.layout.split(parameters)[3] + self.differences
 
+    def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
+        """Return shifts (N, 6) that need no run of each error, by the places of the errors."""
+        found = super().derived_modes(parameters)
+        # the run that was kept has sensitivities by the gains of each joint
+        self.known_runs.clear()
+        return found
+
     def simulate(
-        self,
-        parameters: Array,
-        sensitivities: bool = False,
-        robot: Robot | None = None,
-        noise: Array | None = None,
+        self, parameters: Array, sensitivities: bool = False, robot: Robot | None = None
     ) -> ClosedLoopRun:
         """Simulate the model. Derivatives are with respect to the shared gains."""
-        run = super().simulate(parameters, sensitivities, robot, noise)
+        run = super().simulate(parameters, sensitivities, robot)
         if run.pose_sensitivity is None:
             return run
         shared, _ = self.by_gains(run.pose_sensitivity)
@@ -63,9 +68,15 @@ class UnequalGains(LoopModel):
         return np.concatenate(shared, axis=2), by_gains
 
 
+@dataclass(frozen=True)
+class TimedUnequalGains(UnequalGains, TimedModel):
+    """The same of a run at any times."""
+
+
 def with_unequal_gains(run: LoopModel, differences: Array) -> UnequalGains:
     """Return a model of a run with gains (n, 3) beyond those that its joints have."""
     if isinstance(run, UnequalGains):
         return replace(run, differences=run.differences + differences)
     same = {one.name: getattr(run, one.name) for one in fields(run)}
-    return UnequalGains(**same, differences=differences)
+    kind = TimedUnequalGains if isinstance(run, TimedModel) else UnequalGains
+    return kind(**same, differences=differences)

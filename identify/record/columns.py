@@ -33,6 +33,9 @@ ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "turn": 6.283185307179586}
 COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vector": 3}
 """Number of columns of each convention but the Euler sequences, which have three."""
 
+COVARIANCES = (6, 21, 36)
+COVARIANCES_SAID = "6 standard deviations, 21 of the upper triangle, or 36 row by row"
+
 EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
 
 EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
@@ -138,6 +141,12 @@ class PoseColumns(Log):
     ok: str | None = Field(
         None, description="column that is 1 where the pose was measured, and 0 where it was lost"
     )
+    covariance: list[str] | None = Field(
+        None,
+        description="columns of the covariance of the position and of small turns about axes of "
+        "the log that stand still, in squares of position_unit and angle_unit: 36 row by row, 21 "
+        "of the upper triangle, or 6 standard deviations; without them, [record] states it",
+    )
 
     @property
     def other_conventions(self) -> tuple[str, ...]:
@@ -157,7 +166,11 @@ class PoseColumns(Log):
             )
         if sorted(axis.lstrip("-") for axis in self.axes) != ["x", "y", "z"]:
             raise ValueError(f"axes = {self.axes} must name each of x, y and z once")
-        _check_once([*self.position, *self.orientation])
+        if self.covariance is not None and len(self.covariance) not in COVARIANCES:
+            raise ValueError(
+                f"covariance names {len(self.covariance)} columns, must be {COVARIANCES_SAID}"
+            )
+        _check_once([*self.position, *self.orientation, *(self.covariance or [])])
         return self
 
 

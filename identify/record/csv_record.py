@@ -151,10 +151,15 @@ class Table:
         """Return the covariances (N, 6, 6) of the measured poses, or None without such columns."""
         if "covariance" not in self.groups:
             return None
-        rows, columns = np.triu_indices(len(POSE))
-        values = np.empty((len(self.lines), 6, 6))
-        values[:, rows, columns] = values[:, columns, rows] = self.groups["covariance"]
-        return values
+        return symmetric(self.groups["covariance"])
+
+
+def symmetric(triangles: Array) -> Array:
+    """Return matrices (N, 6, 6) with these upper triangles (N, 21), row by row."""
+    rows, columns = np.triu_indices(len(POSE))
+    found = np.empty((len(triangles), len(POSE), len(POSE)))
+    found[:, rows, columns] = found[:, columns, rows] = triangles
+    return found
 
 
 def read_table(path: Path, robot: Robot) -> Table:

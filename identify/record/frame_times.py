@@ -9,11 +9,25 @@ import numpy as np
 from identify.arrays import Array
 from identify.record.smoothness import local_misfit
 
+GAP = 1.5
+"""Time between two rows, in usual times between rows, above which rows are missing."""
+
 FARTHEST = 0.4
 """Largest distance of a stated time from a frame, in periods, at which it can be of that frame."""
 
 BETTER = 0.97
 """Largest ratio of two misfits at which the smaller one decides."""
+
+
+def mean_rate(times: Array) -> float:
+    """Return the rate, Hz, of rows at times (N,), s, without their gaps.
+
+    Times that are rounded, as to milliseconds, have another median interval than the rate.
+    """
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    usual = float(np.median(steps))
+    return 1.0 / float(steps[np.abs(steps - usual) <= (GAP - 1.0) * usual].mean())
 
 
 def frame_grid(times: Array, rate_hz: float) -> Array | None:

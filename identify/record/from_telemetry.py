@@ -21,18 +21,15 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.checks import begins_at_rest
-from identify.record.frame_times import frame_grid, likelier_times
+from identify.record.frame_times import GAP, frame_grid, likelier_times, mean_rate
 from identify.record.recording import build_record
-from identify.record.smoothness import gross_errors
-from identify.record.telemetry import TIME_ROUNDING, CommandLog, ReferenceLog, Telemetry
+from identify.record.smoothness import wrong_poses
+from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, ReferenceLog, Telemetry
 from identify.record.timed_record import build_timed_record
 from identify.scenario import Scenario, Timing
 
 MOST_GROSS = 0.1
 """Largest share of poses that can be gross errors."""
-
-GAP = 1.5
-"""Time between two rows, in usual times between rows, above which rows are missing."""
 
 OTHER_RATE = 0.05
 """Smallest relative difference of the rate of rows from the frame rate that is an error."""
@@ -55,7 +52,7 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
     covariances = telemetry.poses.covariance
     if covariances is None:
         covariances = np.tile(stated, (len(ok), 1, 1))
-    wrong, notes = _gross(telemetry, covariances)
+    wrong, notes = _gross(telemetry.poses, covariances)
     poses = replace(telemetry.poses, ok=ok & ~wrong, covariance=covariances)
     telemetry = replace(telemetry, poses=poses)
     given: dict[str, Any] = {
@@ -81,6 +78,7 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
     else:
         times, acting, more = _event_times(telemetry, scenario.timing)
         kept = _new_commands(telemetry.commands)
+        gaps, held = _gaps(telemetry, acting, kept)
         record = build_timed_record(
             time=times,
             measured_pose=poses.pose,
@@ -88,10 +86,10 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
             measured_ok=poses.ok,
             acting=acting[kept],
             command=telemetry.commands.command[kept],
-            gaps=_gaps(telemetry, acting, kept),
+            gaps=gaps,
             **given,
         )
-        notes += [f"the commands drive the model: {why}", *more]
+        notes += [f"the commands drive the model: {why}", *more, *held]
     if notes:
         record.attrs[NOTES] = json.dumps(notes)
     return record
@@ -127,32 +125,41 @@ def rates(reference: ReferenceLog, frame_period_s: float) -> Array:
     return np.asarray(spline.derivative()(times), dtype=float)
 
 
-def _gross(telemetry: Telemetry, covariances: Array) -> tuple[NDArray[np.bool_], list[str]]:
+class GrossErrors(RecordError):
+    """Error for a log with too many poses that are gross errors.
+
+    Attributes
+    ----------
+    log : PoseLog
+        The log.
+    wrong : ndarray, shape (N,)
+        True for its poses that are gross errors.
+    """
+
+    def __init__(self, message: str, log: PoseLog, wrong: NDArray[np.bool_]) -> None:
+        super().__init__(message)
+        self.log = log
+        self.wrong = wrong
+
+
+def _gross(log: PoseLog, covariances: Array) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which poses (N,) are gross errors, and a note that names them.
 
-    Raises RecordError if there are too many.
+    Raises GrossErrors if there are too many.
     """
-    log = telemetry.poses
-    wrong = np.zeros(len(log.ok), dtype=bool)
-    good = np.flatnonzero(log.ok)
-    # Fewer poses make no record, which is said later.
-    if len(good) < 30:
-        return wrong, []
-    mean = covariances[good].mean(axis=0)
-    # An invalid covariance is refused later, with all that is known there.
-    if not np.isfinite(mean).all() or np.linalg.eigvalsh((mean + mean.T) / 2)[0] <= 0:
-        return wrong, []
-    wrong[good[gross_errors(log.time[good], log.pose[good], mean)]] = True
+    good = int(log.ok.sum())
+    wrong = wrong_poses(log, covariances[log.ok].mean(axis=0) if good else covariances[0])
     count = int(wrong.sum())
     if not count:
         return wrong, []
     shown = ", ".join(f"{time:.3f}" for time in log.time[wrong][:NAMED])
     named = f"t = {shown} s" + (f" and {count - NAMED} more" if count > NAMED else "")
-    if count > MOST_GROSS * len(good):
-        raise RecordError(
-            f"{log.rows.source}: {count} of {len(good)} poses are far from the motion of their "
-            f"neighbours, at {named}; at most {MOST_GROSS:.0%} are left out as gross errors "
-            "(cmmsim check draws the poses)"
+    if count > MOST_GROSS * good:
+        raise GrossErrors(
+            f"{log.rows.source}: {count} of {good} poses are far from the motion of their "
+            f"neighbours, at {named}; at most {MOST_GROSS:.0%} are left out as gross errors",
+            log,
+            wrong,
         )
     return wrong, [f"{count} single poses were left out as gross errors: {named}"]
 
@@ -194,8 +201,7 @@ def _check_rate(telemetry: Telemetry, rate_hz: float) -> None:
     if len(times) < 2:
         return
     frames = np.diff(times) * rate_hz
-    usual = float(np.median(frames))
-    mean = float(frames[np.abs(frames - usual) <= usual / 2].mean())
+    mean = rate_hz / mean_rate(times)
     if abs(mean - 1) > OTHER_RATE:
         row = int(np.argmax(np.abs(frames - 1) > OTHER_RATE))
         raise RecordError(
@@ -259,20 +265,30 @@ def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
     return given
 
 
-def _gaps(telemetry: Telemetry, acting: Array, kept: NDArray[np.bool_]) -> Array:
-    """Return the times (k, 2) of the last and the first command around gaps, s.
+def _gaps(telemetry: Telemetry, acting: Array, kept: NDArray[np.bool_]) -> tuple[Array, list[str]]:
+    """Return the times (k, 2) of the last and the first command around gaps, s, and notes.
 
-    In a gap, rows of commands and of poses are missing. Where only commands are missing, the last
-    one was held.
+    In a gap, rows of commands and of poses are missing. The last command was held where only
+    commands are missing, and where the command after the missing rows is the one before them.
+    Otherwise it is not known what was commanded.
     """
     rows = telemetry.commands.time
     poses = telemetry.poses.time
     usual = GAP * max(float(np.median(np.diff(rows))), float(np.median(np.diff(poses))))
+    command = telemetry.commands.command
     found = []
+    notes = []
     for row in np.flatnonzero(np.diff(rows) > usual):
         inside = (poses > rows[row] + 1e-9) & (poses < rows[row + 1] - 1e-9)
         before = np.flatnonzero(kept[: row + 1])
         after = np.flatnonzero(kept[row + 1 :])
-        if not inside.any() and len(before) and len(after):
+        if inside.any() or not (len(before) and len(after)):
+            continue
+        if np.array_equal(command[row], command[row + 1]):
+            notes.append(
+                f"rows are missing from t = {rows[row]:.2f} s to {rows[row + 1]:.2f} s, and the "
+                "command after them is the one before: it was held"
+            )
+        else:
             found.append((acting[before[-1]], acting[row + 1 + after[0]]))
-    return np.array(found).reshape(-1, 2)
+    return np.array(found).reshape(-1, 2), notes

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.record.pose_noise import windows_of
+from identify.record.smoothness import windows_of
 from identify.record.telemetry import Telemetry
 
 REACH_S = 0.5
@@ -60,9 +60,9 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
     reached = (robot.reach_margin(poses) > 0).all(axis=-1)
     time, joints = time[reached], robot.inverse_kinematics(poses[reached])
     windows = windows_of(time)
-    if not len(windows.middles):
+    if not len(windows.rows):
         return None
-    noise = windows.residuals(joints)
+    noise = windows.deviations(joints)
     moments = _written(telemetry)
     rows = np.flatnonzero(np.isfinite(moments))
     step = float(np.median(np.diff(time))) / PARTS
@@ -70,7 +70,9 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
     delays = step * (np.arange(-reach, reach + 1) + 0.5)
     found = np.array(
         [
-            _correlation(noise, windows.residuals(_held(telemetry, rows, moments, time + delay)[1]))
+            _correlation(
+                noise, windows.deviations(_held(telemetry, rows, moments, time + delay)[1])
+            )
             for delay in delays
         ]
     )
@@ -79,9 +81,9 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
     correlation = float(found[best])
     if abs(correlation) * np.sqrt(noise.size) < CERTAIN:
         return None
-    held = _held(telemetry, rows, moments, time[windows.middles] + delays[best])[0]
-    each = moments[held] - time[windows.middles]
-    since = time[windows.middles] - time[windows.middles].mean()
+    held = _held(telemetry, rows, moments, time[windows.rows] + delays[best])[0]
+    each = moments[held] - time[windows.rows]
+    since = time[windows.rows] - time[windows.rows].mean()
     median = float(np.median(each))
     drift = float(since @ (each - median) / (since @ since))
     return ServoDelay(

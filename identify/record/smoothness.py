@@ -4,11 +4,14 @@ A polynomial through the nearest poses on both sides predicts each pose. No mode
 needed.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from identify.arrays import Array
+from identify.record.telemetry import PoseLog
 
 NEIGHBOURS = 12
 """Number of poses near a pose, through which polynomials go."""
@@ -33,6 +36,64 @@ It is in units of its variance. For noise alone, its mean is six.
 
 MEDIAN = float(chdtri(6, 0.5))
 """Median of this squared distance for noise alone."""
+
+FEWEST = 30
+"""Smallest number of poses of which some can be called wrong."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Rows of a log, each with its neighbours on both sides and the polynomial through them.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (K,)
+        Rows whose neighbours are near enough in time.
+    neighbours : ndarray, shape (K, NEIGHBOURS)
+        Rows of the neighbours.
+    weights : ndarray, shape (K, NEIGHBOURS)
+        Weights with which the values of the neighbours predict the value of the row.
+    """
+
+    rows: NDArray[np.intp]
+    neighbours: NDArray[np.intp]
+    weights: Array
+
+    @property
+    def variance(self) -> Array:
+        """Variance (K,) of a deviation by noise, in that of a value."""
+        return np.asarray(1.0 + np.sum(self.weights**2, axis=1))
+
+    def deviations(self, values: Array) -> Array:
+        """Return the deviations (K, n) of values (N, n) from what their neighbours predict."""
+        predicted = np.einsum("kq,kqn->kn", self.weights, values[self.neighbours])
+        return np.asarray(values[self.rows] - predicted)
+
+
+def windows_of(times: Array) -> Windows:
+    """Return the rows at times (N,), s, that have enough neighbours on either side."""
+    half = NEIGHBOURS // 2
+    rows = np.arange(half, max(len(times) - half, half))
+    if not len(rows):
+        return Windows(rows, np.zeros((0, NEIGHBOURS), np.intp), np.zeros((0, NEIGHBOURS)))
+    neighbours, powers, reached = _windows(times, rows)
+    base, along = _weights(powers[reached])
+    weights = np.einsum("kqp,kp->kq", base, along)
+    return Windows(rows[reached], neighbours[reached], weights)
+
+
+def wrong_poses(log: PoseLog, covariance: Array) -> NDArray[np.bool_]:
+    """Return which poses (N,) of a log are single gross errors.
+
+    covariance (6, 6): of a pose. None are where poses are too few to tell.
+    """
+    wrong = np.zeros(len(log.ok), dtype=bool)
+    good = np.flatnonzero(log.ok)
+    # An invalid covariance is refused later, with all that is known there.
+    valid = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0
+    if valid and len(good) >= FEWEST:
+        wrong[good[gross_errors(log.time[good], log.pose[good], covariance)]] = True
+    return wrong
 
 
 def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
@@ -156,14 +217,22 @@ def _predicted(white: Array, powers: Array, values: Array) -> tuple[Array, Array
     the predictions in units of their variance, and the mean squared distances (k,) of the other
     poses from the polynomials, per component and degree of freedom.
     """
-    base, triangle = np.linalg.qr(powers)
+    base, weights = _weights(powers)
     along = base.transpose(0, 2, 1) @ values
     left = values - base @ along
     freedom = white.shape[1] * (powers.shape[1] - powers.shape[2])
     leftover = np.sum(left**2, axis=(1, 2)) / freedom
-    # At the row itself all powers but the first are zero.
-    at_row = np.eye(powers.shape[2])[:, :1]
-    weights = np.linalg.solve(triangle.transpose(0, 2, 1), at_row)[:, :, 0]
     predicted = np.einsum("kp,kpc->kc", weights, along)
     variance = 1.0 + np.sum(weights**2, axis=1)
     return np.sum((white - predicted) ** 2, axis=1) / variance, leftover
+
+
+def _weights(powers: Array) -> tuple[Array, Array]:
+    """Return an orthonormal basis (k, q, p) of powers (k, q, p), and weights (k, p) along it.
+
+    The weighted sum of a polynomial's coefficients in the basis is its value at the row.
+    """
+    base, triangle = np.linalg.qr(powers)
+    # At the row itself all powers but the first are zero.
+    at_row = np.eye(powers.shape[2])[:, :1]
+    return base, np.linalg.solve(triangle.transpose(0, 2, 1), at_row)[:, :, 0]

@@ -100,9 +100,10 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
             goals=goals_table(data.result),
             missed=sum(not goal.passed for goal in goals),
             goal_count=len(goals),
-            warnings=[
-                _sentence(text) for text in data.result["identification"].get("warnings", [])
-            ],
+            **{
+                kind: [_sentence(text) for text in data.result["identification"].get(kind, [])]
+                for kind in ("notes", "warnings")
+            },
             first_look=[name for name in FIRST_LOOK if name in shown],
             sections=[build(data) for build in SECTIONS],
             pictures=shown,

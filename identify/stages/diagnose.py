@@ -42,7 +42,8 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
         files.content(name) for name in identified_files(run_folder, scenario.identification)
     ]
     problem = output_error_problem(records, side, scenario.identification)
-    found = diagnosis_from(problem, parameter_vector(side.robot, identification, "estimate"), own)
+    estimate = parameter_vector(side.robot, identification, "estimate")
+    found = diagnosis_from(problem, estimate, own, identification["nuisance_estimates"])
     save_result(run_folder.result, with_diagnosis(result, found))
     return found
 

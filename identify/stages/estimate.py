@@ -5,13 +5,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from dynamics import load_robot
 from identify.diagnosis.diagnose import diagnose
+from identify.errors import RecordError
 from identify.estimation import identification
 from identify.estimation.result import IdentificationResult
-from identify.files.atomic import write_files
+from identify.files.atomic import write_figure, write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
 from identify.files.run_folder import (
     RunFolder,
@@ -23,12 +25,14 @@ from identify.model.model_side import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.conditions import DRIFT, read_finding
+from identify.record.from_telemetry import GrossErrors
 from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import known_geometry
 from identify.record.model_runs import build_model_run, model_groups
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RunFiles, digest
+from identify.reporting.figures.logs import motion_figure
 from identify.scenario import Scenario, load_scenario
 from identify.stages.diagnose import ENTRY as DIAGNOSIS
 from identify.stages.diagnose import with_diagnosis
@@ -79,12 +83,22 @@ def identify_own(
 ) -> None:
     """Estimate the parameters from a user's own records, and write a run folder without the truth.
 
-    Nothing is written if the records are not suitable for an identification.
+    Nothing is written if the records are not suitable for an identification, other than a picture
+    of a log with too many gross errors.
 
     Raises the errors of `identify` and of `read_own_records`.
     """
     run_folder = RunFolder(folder)
-    contents, stated = read_own_records(list(paths))
+    try:
+        contents, stated = read_own_records(list(paths))
+    except GrossErrors as error:
+        picture = Path(f"{folder.name}-gross-errors.png")
+        good = error.log.ok
+        times, measured = error.log.time, error.log.pose
+        jumps = times[error.wrong]
+        figure = motion_figure(times[good], measured[good], np.zeros((0, 2)), jumps)
+        write_figure(picture, figure)
+        raise RecordError(f"{error}; {picture} shows them") from None
     scenario = stated.with_estimator_settings(settings)
     names = own_record_files(len(contents), scenario.identification)
     records = dict(zip(names, contents, strict=True))
@@ -130,9 +144,8 @@ def _identified_files(
     robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     diagnosis = None
-    # Causes are known only for records with joint commands, one per frame.
-    in_frames = result.drive.in_loop and not any(map(recording.is_timed, records.values()))
-    if in_frames and _is_missed(result):
+    # Causes are known only for records with joint commands.
+    if result.drive.in_loop and _is_missed(result):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnose(list(records.values()), result, robot, scenario)
             advance()

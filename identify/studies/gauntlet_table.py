@@ -80,7 +80,7 @@ _NEEDED = (
     "first_group",
     "troubles",
     "outside",
-    *(f"{name}_{place}" for place in (1, 2) for name in ("size", "named", "together")),
+    *(f"{name}_{place}" for place in (1, 2) for name in ("size", "named", "together", "alone")),
     "size_error_1",
     "size_error_2",
     "stopped",
@@ -114,7 +114,11 @@ def shares(cases: pd.DataFrame) -> list[Share]:
     within = errors.abs() <= 3.0
     right = {
         "one cause: it, or causes named together with it, first": (one["right_cause"], "≥ 95 %"),
-        "two causes: both among the first three": (two["right_cause"], "≥ 85 %"),
+        "two causes that each double the misfit: both among the first three": (
+            two[~(two[["alone_1", "alone_2"]] < DOUBLED).any(axis=1)]["right_cause"],
+            "≥ 85 %",
+        ),
+        "two causes of any size: both among the first three": (two["right_cause"], ""),
         "nothing wrong: nobody accused": (_right(cases, "none"), "≥ 95 %"),
         "outside the catalogue: none of these": (_right(cases, "outside"), "≥ 90 %"),
         "size of a fitted cause within three deviations": (within, "≥ 95 %"),

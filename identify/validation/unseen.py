@@ -124,7 +124,7 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
         return model_run(side.robot, side.settings, parameters, reference, latencies, lost)
     run = predicting_model(record, side).driven_by_commands()
     try:
-        return run.model_poses(parameters)
+        return run.simulate(parameters).pose
     except LoopFailure:
         return np.full_like(run.measured, np.nan)
 

@@ -23,6 +23,7 @@ from identify.estimation.prior import friction, model_guess
 from identify.estimation.scale_anchor import MEASURING, default_std, measured_parameter
 from identify.model.model_side import ModelSide, model_side
 from identify.record.conditions import COMMAND_TIME
+from identify.record.frame_times import GAP
 from identify.record.motion_lag import MotionLag
 from identify.record.own_record import (
     description_file,
@@ -31,10 +32,11 @@ from identify.record.own_record import (
     read_description,
     read_telemetry,
 )
-from identify.record.pose_noise import GAP, PoseNoise, Spectrum, pose_noise, spectrum
+from identify.record.pose_noise import Spectrum, pose_noise, spectrum
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import is_timed, poses, read, recorded_reference
 from identify.record.servo_delay import ServoDelay, servo_delay
+from identify.record.smoothness import wrong_poses
 from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification
@@ -81,14 +83,24 @@ class LoggedRun:
         return self.telemetry.poses.pose[self.telemetry.poses.ok]
 
     @cached_property
-    def noise(self) -> PoseNoise:
-        """Noise and jumps of the poses."""
+    def noise(self) -> Array:
+        """Standard deviation (6,) of the noise of the poses, m and rad."""
         return pose_noise(self.time, self.poses)
+
+    @cached_property
+    def jumps(self) -> Array:
+        """Times (J,) of the poses that reading the record would leave out as gross errors, s."""
+        log = self.telemetry.poses
+        std = self.noise if self.stated is None else self.stated
+        covariance = np.diag(std**2)
+        if log.covariance is not None:
+            covariance = log.covariance[log.ok].mean(axis=0)
+        return log.time[wrong_poses(log, covariance)]
 
     @cached_property
     def spectrum(self) -> Spectrum:
         """Spectrum of the poses."""
-        return spectrum(self.time, self.poses, np.nan_to_num(self.noise.std))
+        return spectrum(self.time, self.poses, np.nan_to_num(self.noise))
 
     @cached_property
     def lag(self) -> MotionLag:
@@ -155,7 +167,7 @@ class LoggedRun:
         """Return which groups (rank,) the poses can identify, as an identification judges them."""
         robot = self.side.robot
         guess = model_guess(robot, self.side.model, self.settings)
-        std = self.noise.std if self.stated is None else self.stated
+        std = self.noise if self.stated is None else self.stated
         assert run.pose_sensitivity is not None
         # Only frames near a measured pose count.
         near = np.searchsorted(self.grid, self.time).clip(0, len(run.pose_sensitivity) - 1)

@@ -16,7 +16,8 @@ from identify.estimation.base_parameters import structure
 from identify.files.dataset import POSE
 from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
-from identify.record.pose_noise import JUMPS, mean_rate
+from identify.record.frame_times import mean_rate
+from identify.record.from_telemetry import MOST_GROSS
 from identify.record.suspicions import joint_motion
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
@@ -29,9 +30,6 @@ NOISE = 2.0
 
 FROZEN = 0.01
 """Largest share of poses that are equal to the pose before in all digits."""
-
-JUMPED = 0.1
-"""Largest share of poses that jump."""
 
 FRAMES_A_PERIOD = 6.0
 """Smallest number of frames in a period of the highest frequency of a motion."""
@@ -159,7 +157,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         (slice(3, 6), "rad", 1e6, "urad"),
     ):
         name = "position noise" if unit == "m" else "orientation noise"
-        own = logged.noise.std[kind]
+        own = logged.noise[kind]
         value = _rms(own)
         listed = ", ".join(
             f"{axis} {scale * one:.3g}" for axis, one in zip(POSE[kind], own, strict=True)
@@ -176,18 +174,18 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         if stated is not None:
             text += f"; stated are {scale * stated:.3g} {word}, {value / stated:.2g} times that"
         yield Finding(name, ok, value, stated, unit, None, text)
-    jumps = logged.noise.time[logged.noise.jumped]
+    jumps = logged.jumps
     listed = ", ".join(f"{one:.4f}" for one in jumps[:LISTED])
     more = f" and {len(jumps) - LISTED} more" if len(jumps) > LISTED else ""
     yield Finding(
         "jumps",
-        len(jumps) <= JUMPED * len(logged.time),
+        len(jumps) <= MOST_GROSS * len(logged.time),
         len(jumps) / len(logged.time),
-        JUMPED,
+        MOST_GROSS,
         "1",
         None,
-        f"{len(jumps)} poses are more than {JUMPS:g} standard deviations beside their "
-        "neighbours" + (f", at {listed} s{more}" if len(jumps) else ""),
+        f"{len(jumps)} poses are far from the motion of their neighbours"
+        + (f", at {listed} s{more}" if len(jumps) else ""),
     )
 
 

@@ -58,13 +58,11 @@ def _pictures(logged: LoggedRun) -> dict[str, Picture]:
     telemetry = logged.telemetry
     commands = telemetry.commands
     robot = logged.side.robot
-    noise, spectrum = logged.noise, logged.spectrum
+    spectrum = logged.spectrum
     time, joints = joint_motion(telemetry, robot)
     return {
         "motion": Picture(
-            lambda: figures.motion_figure(
-                logged.time, logged.poses, logged.gaps, noise.time[noise.jumped]
-            ),
+            lambda: figures.motion_figure(logged.time, logged.poses, logged.gaps, logged.jumps),
             "Measured poses over time. Grey: no pose was measured. Vertical lines: poses that are "
             "far beside their neighbours.",
         ),
@@ -82,7 +80,7 @@ def _pictures(logged: LoggedRun) -> dict[str, Picture]:
         ),
         "spectrum": Picture(
             lambda: figures.spectrum_figure(
-                spectrum.frequency, spectrum.power, spectrum.highest_hz, noise.std
+                spectrum.frequency, spectrum.power, spectrum.highest_hz, logged.noise
             ),
             "Spectra of the poses. Dotted: the noise beside the neighbours. The vertical line is "
             "the frequency below which 99 % of the power lies.",

@@ -1,11 +1,14 @@
 """Runs under commands at any times, against runs on a grid of frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dynamics import load_robot
 from dynamics.closed_loop import (
     FrameTiming,
+    FrictionLaw,
     LoopSettings,
     Reference,
     ServoGains,
@@ -55,6 +58,10 @@ def test_events_at_frames_and_arrivals_of_commands_repeat_the_run_on_the_grid(
     settings = LoopSettings(SERVO, FrameTiming(RATE_HZ, latency_s, hold))
     commands = simulate_servo(robot, parameters, reference, settings).command
     known = differentiate_commands(robot, parameters, reference, settings, commands, by_start=True)
+    directions = np.random.default_rng(3).standard_normal((FRAMES, 6, 2))
+    moved = differentiate_commands(
+        robot, parameters, reference, settings, commands, directions=directions
+    )
     frames = np.arange(FRAMES) / RATE_HZ
     acting = frames + latency_s
     acting = acting[acting < frames[-1]]
@@ -73,6 +80,45 @@ def test_events_at_frames_and_arrivals_of_commands_repeat_the_run_on_the_grid(
     for name in ("pose_sensitivity", "start_sensitivity"):
         one, other = getattr(found, name)[rows], getattr(known, name)
         assert np.abs(one - other).max() < 1e-9 * np.abs(other).max()
+    # each row has the direction of the command that was sent last
+    last = np.searchsorted(acting, times, side="right") - 1
+    held = np.where((last >= 0)[:, None, None], directions[last], 0.0)
+    along = differentiate_commands(
+        *(robot, parameters, still(robot, len(times)), at_once, sent),
+        start=known.start,
+        times=times,
+        directions=held,
+    ).command_sensitivity[rows]
+    most = np.abs(moved.command_sensitivity).max()
+    assert np.abs(along - moved.command_sensitivity).max() < 1e-9 * most
+
+
+def test_commands_from_before_the_start_have_a_direction_of_their_own(robot, parameters):
+    """The derivative is the difference of two runs, without friction of joints that stick."""
+    smooth = FrictionLaw("smoothed", smoothing_velocity=0.1)
+    settings = LoopSettings(SERVO, FrameTiming(RATE_HZ), smooth)
+    known = simulate_servo(robot, parameters, moving(robot), settings)
+    times = np.arange(FRAMES) / RATE_HZ
+    sent = np.full((FRAMES, 6), np.nan)
+    sent[20::3] = known.command[20::3]
+    direction = np.random.default_rng(4).standard_normal((6, 1))
+    given = robot, parameters, still(robot, FRAMES), settings, sent
+    start = replace(known.start, commands=np.tile(known.start.commands, (2, 1)), latencies=None)
+    held = np.zeros((FRAMES, 6, 1))
+    held[:20] = direction
+    found = differentiate_commands(
+        *given, start=start, times=times, directions=held, start_directions=direction
+    ).command_sensitivity[:, :, 0]
+    more, less = (
+        simulate_commands(
+            *given,
+            start=replace(start, commands=start.commands + sign * 1e-5 * direction[:, 0]),
+            times=times,
+        ).pose
+        for sign in (1, -1)
+    )
+    assert np.abs(found).max() > 1e-3
+    assert np.abs(found - (more - less) / 2e-5).max() < 1e-6 * np.abs(found).max()
 
 
 def test_poses_at_any_times_are_those_of_a_grid_that_contains_them(robot, parameters):

@@ -245,19 +245,25 @@ def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, t
         assert min(misses) <= 1e-6, (move, change, misses)
 
 
-@pytest.mark.parametrize("hold", ["zero", "linear"])
-def test_a_run_is_differentiated_along_directions_of_its_commands(loop, hold):
+@pytest.mark.parametrize(
+    ("given", "hold"), [("commands", "zero"), ("commands", "linear"), ("feedforward", "zero")]
+)
+def test_a_run_is_differentiated_along_directions_of_its_commands(loop, given, hold):
     """The derivatives are differences of runs, and those by the parameters stay as they are."""
     settings = loop.settings(latency_s=1.3 / 60, hold=hold)
-    commands = loop.run(loop.reference(45), settings).command
+    reference = loop.reference(45)
+    commands = loop.run(reference, settings).command
+    if given == "feedforward":
+        commands = loop.robot.inverse_kinematics(reference.poses)
     directions = np.random.default_rng(2).standard_normal((45, 6, 3))
-    run = loop.run(45, settings, commands=commands, sensitivities=True, directions=directions)
-    plain = loop.run(45, settings, commands=commands, sensitivities=True)
+    more = {given: commands, "sensitivities": True}
+    run = loop.run(45, settings, directions=directions, **more)
+    plain = loop.run(45, settings, **more)
     np.testing.assert_array_equal(run.pose_sensitivity, plain.pose_sensitivity)
     for k in range(3):
         step = 1e-7 / np.abs(run.command_sensitivity[:, :, k]).max()
         ends = {
-            n: loop.run(45, settings, commands=commands + n * step * directions[:, :, k]).pose
+            n: loop.run(45, settings, **{given: commands + n * step * directions[:, :, k]}).pose
             for n in (-2, -1, 1, 2)
         }
         np.testing.assert_allclose(

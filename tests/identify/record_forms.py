@@ -1,5 +1,11 @@
-"""One experiment as laboratories log it: nine forms of its record, and their identification."""
+"""One experiment as laboratories log it: nine forms of its record, and their identification.
 
+The intervals of a form over some seeds, a line a seed, which processes can share:
+
+    python -m tests.identify.record_forms "begun in motion" 0 10
+"""
+
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
@@ -11,6 +17,7 @@ from dynamics.closed_loop import (
     Reference,
     simulate_commands,
 )
+from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.record.from_telemetry import record_of
 from identify.record.recording import poses, recorded_reference
@@ -223,3 +230,21 @@ def record_in(form, seed):
 @cache
 def true_parameters():
     return build_plant(scenario_of(), rss6()).parameters
+
+
+def held(form, seed):
+    """Intervals that hold and that there are, and the mean shift from the exact form."""
+    known = identify(record_in("exact", seed))
+    found = known if form == "exact" else identify(record_in(form, seed))
+    chosen = found.identifiable & known.identifiable
+    off = np.abs(found.estimate - true_parameters())[chosen] / found.std[chosen]
+    shift = np.mean((found.estimate - known.estimate)[chosen] / known.std[chosen])
+    return int(np.count_nonzero(off < 1.96)), int(np.count_nonzero(chosen)), float(shift)
+
+
+if __name__ == "__main__":
+    name, first, last = sys.argv[1:]
+    sys.stdout.write("form,seed,hold,intervals,shift\n")
+    for number in range(int(first), int(last)):
+        sys.stdout.write(",".join(map(str, (name, number, *held(name, number)))) + "\n")
+        sys.stdout.flush()

@@ -43,11 +43,15 @@ def calls(monkeypatch):
     return made
 
 
+NOTED = "note: the servo used wrong poses\nwarning: not white\nwarning: a b\n"
+
+
 def warned(result):
     """The result of a plant that the model cannot be."""
     result["identification"] |= {
         "noise_ratio": 1.356,
         "whiteness": {"p_value": 0.0},
+        "notes": ["the servo\nused wrong poses"],
         "warnings": ["not white", "a\nb"],
         "groups": {"platform.mass": {"identifiable": True}},
     }
@@ -73,7 +77,7 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
     for quiet in (True, False):
         assert command("identify", "--out", run_folder.path, *["--quiet"] * quiet) == 0
         out, err = capfd.readouterr()
-        assert err == "warning: not white\nwarning: a b\n"
+        assert err == NOTED
         assert [text in out for text in said] == 5 * [not quiet]
 
 
@@ -86,7 +90,7 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
         command("run", "quick", "--out", "mine", "--seed", 7, "--workers", 2, "--quiet", *settings)
         == 0
     )
-    assert capfd.readouterr() == ("", "warning: not white\nwarning: a b\n")
+    assert capfd.readouterr() == ("", NOTED)
     assert command("run", "--seed", 3) == 0
     (name, scenario, seed, folder, _, workers), default = calls
     assert (name, seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
@@ -97,7 +101,7 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
     )
     assert default[3].as_posix() == "runs/paper-3"
     out, err = capfd.readouterr()
-    assert err == "warning: not white\nwarning: a b\n"
+    assert err == NOTED
     missed = [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")]
     assert missed == [" residual variance / noise variance", " p value of the residuals"]
     assert (

@@ -97,9 +97,9 @@ def test_models_of_all_kinds_run_as_the_plant_did(hold):
     )
     found = identified_model(record, side_of(scenario))
     for one in (found, found.driven_by_commands()):
-        np.testing.assert_allclose(one.model_poses(truth()), run.pose, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(one.simulate(truth()).pose, run.pose, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(
-        model_on_record(side_of(scenario), truth(), record), found.model_poses(truth())
+        model_on_record(side_of(scenario), truth(), record), found.simulate(truth()).pose
     )
     states = np.hstack([run.pose, run.pose_rate, run.joint_integral])
     for part in segments(found.driven_by_commands()):
@@ -108,7 +108,7 @@ def test_models_of_all_kinds_run_as_the_plant_did(hold):
             again.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12
         )
     blind = identified_model(record.drop_vars("command_time"), side_of(scenario))
-    assert np.abs(blind.model_poses(truth()) - run.pose).max() > 1e-6
+    assert np.abs(blind.simulate(truth()).pose - run.pose).max() > 1e-6
 
 
 def test_spans_of_torques_miss_a_record_by_its_noise():

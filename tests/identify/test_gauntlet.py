@@ -83,6 +83,7 @@ def case(troubles, found, held=(True,) * 40):
         before=(False,) * 40,
         after=tuple(held),
         explained=True,
+        alone=(3.0,) * len(troubles),
         seconds=(1.0, 1.0),
     )
 
@@ -282,6 +283,8 @@ def test_shares_count_the_cases_that_they_are_about():
         {"troubles": 1, "trouble_1": 0, "right_cause": 0, "misfit": 1.5},
         {"troubles": 1, "trouble_1": 3, "right_cause": 0, "misfit": 3.0, "size_error_1": 2.0},
         {"troubles": 2, "trouble_1": 3, "trouble_2": 0, "stopped": 1, "right_cause": 0},
+        {"troubles": 2, "right_cause": 1, "misfit": 9.0, "alone_1": 8.0, "alone_2": 2.5},
+        {"troubles": 2, "right_cause": 0, "misfit": 8.0, "alone_1": 8.0, "alone_2": 1.1},
         {"troubles": 0, "right_cause": 1, "misfit": 1.0},
         {"troubles": 1, "outside": 1, "trouble_1": 15, "right_cause": 1, "misfit": 9.0},
     ]
@@ -289,7 +292,8 @@ def test_shares_count_the_cases_that_they_are_about():
     found = {one.what.split(":")[0]: (one.right, one.cases) for one in shares(cases_of(frame))}
     assert found == {
         "one cause": (1, 2),
-        "two causes": (0, 1),
+        "two causes that each double the misfit": (1, 2),
+        "two causes of any size": (1, 3),
         "nothing wrong": (1, 1),
         "outside the catalogue": (1, 1),
         "size of a fitted cause within three deviations": (1, 1),
@@ -321,7 +325,7 @@ def test_the_trouble_of_known_seeds_is_named_and_its_remedy_lets_the_intervals_h
     for seed, kind in enumerate(kinds):
         trouble = INSIDE[kind](lab(), rng(seed))
         made = recorded(scenario(), (trouble,), seed, 0)
-        done = run_case(case_module.Drawn(scenario(), (trouble,), made, 100 + seed, 0))
+        done = run_case(case_module.Drawn(scenario(), (trouble,), made, seed, 100 + seed, 0))
         assert judge(done) == "right intervals", (kind, str(done.diagnosis))
         assert np.isnan(done.size_errors[0]) or abs(done.size_errors[0]) < 4
         assert done.explained

@@ -349,3 +349,18 @@ def test_what_goes_with_a_table_is_checked_and_named(mine, old, new, says, capfd
     mine.with_suffix(".toml").unlink()
     assert command("identify", "--record", mine, "--out", "never", "--quiet") == NOT_DONE
     assert "cmmsim new record writes both" in one_line(capfd.readouterr().err)
+
+
+def test_a_log_with_too_many_gross_errors_is_refused_with_a_picture(
+    mine, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    table = pd.read_csv(mine)
+    table.loc[7::9, "measured_x_m"] += 5e-3
+    table.to_csv(mine, index=False)
+    assert command("identify", "--record", mine, "--out", "out", "--quiet") == NOT_DONE
+    said = one_line(capfd.readouterr().err)
+    assert "of 119 poses are far from the motion of their neighbours, at t = 0.117, " in said
+    assert "; out-gross-errors.png shows them" in said
+    assert (tmp_path / "out-gross-errors.png").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "out").exists()

@@ -545,3 +545,56 @@ def test_a_transform_among_others_and_arrays_without_a_stamp_are_read_from_a_bag
     array = bag.read("/cmd", ["log_time", "data[5]"])
     np.testing.assert_array_equal(array.numbers("data[5]"), 5 + np.arange(20))
     assert str(array.moments("log_time", "s", 60.0)[1]) == "1700000000.001005000"
+
+
+COVARIANCE_NAMES = [f"c{k}" for k in range(21)]
+
+OF_A_BODY = f"""
+[columns.measured]
+time = "t"
+position = ["x", "y", "z"]
+position_unit = "mm"
+orientation = ["rx", "ry", "rz"]
+convention = "rotation_vector"
+angle_unit = "deg"
+axes = ["x", "z", "y"]
+base_from_frame = [0.5, -0.25, 1.5, 0.1, 0.2, -2.5]
+body_from_platform = [0.01, 0.02, -0.125, 0.3, 0.0, 1.0]
+covariance = {COVARIANCE_NAMES}
+[columns.command]
+names = ["q0", "q1", "q2", "q3", "q4", "q5"]
+unit = "deg"
+"""
+
+
+def test_a_covariance_of_a_log_follows_its_poses_into_the_frame_of_the_robot(tmp_path):
+    """A left-handed log whose tracked body is shifted and turned a little in each of six ways."""
+    rng = np.random.default_rng(1)
+    step = 1e-4
+    shifts = np.vstack([np.zeros((1, 6)), step * np.eye(6)])
+    turned = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    vectors = (Rotation.from_rotvec(np.radians(shifts[:, 3:])) * turned).as_rotvec(degrees=True)
+    root = rng.standard_normal((6, 6))
+    covariance = root @ root.T
+    cells = np.tile(covariance[np.triu_indices(6)], (7, 1))
+    columns = [
+        np.arange(7)[:, None] / 60,
+        [100.0, 50.0, 30.0] + shifts[:, :3],
+        vectors,
+        cells,
+        np.zeros((7, 6)),
+    ]
+    names = ["t", "x", "y", "z", "rx", "ry", "rz", *COVARIANCE_NAMES]
+    table = pd.DataFrame(np.hstack(columns), columns=[*names, *(f"q{k}" for k in range(6))])
+    table.to_csv(tmp_path / "take.csv", index=False)
+    found = telemetry_of(described(tmp_path / "take.csv", OF_A_BODY)).poses
+    slopes = (found.pose[1:] - found.pose[0]).T / step
+    expected = slopes @ covariance @ slopes.T
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(found.covariance[0] - expected) < 1e-4 * scale).all()
+    table.loc[3, "c7"] = np.nan
+    table.to_csv(tmp_path / "take.csv", index=False)
+    with pytest.raises(
+        RecordError, match=r"take\.csv line 5: a covariance of a measured pose is em"
+    ):
+        telemetry_of(tmp_path / "take.csv")

@@ -57,11 +57,11 @@ def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
     same = np.append(run.robot.layout.converted(parameters[:count], layout), parameters[count:])
     there = replace(run, robot=full, payload=0 * same, payload_errors=np.zeros((len(same), 7)))
     exact = there.simulate(same, sensitivities=True).pose_sensitivity
-    base, found = run.model_poses(parameters), {}
+    base, found = run.simulate(parameters).pose, {}
     for cause in body_causes(problem, parameters, [run.simulate(parameters)]):
         if cause.group.endswith("of the platform"):
             size = 1e-3 if cause.unit == "m" else 1e-4
-            moved = cause.change(problem, size).runs[0].model_poses(parameters)
+            moved = cause.change(problem, size).runs[0].simulate(parameters).pose
             found[cause.name.split(", ")[1]] = (moved - base) / size
     assert sorted(found) == ["Ixy", "Ixz", "Iyz", "x", "y", "z"]
     for name, column in found.items():

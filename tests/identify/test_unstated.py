@@ -15,7 +15,16 @@ from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.commands.new import _of_a_workshop
 from identify.model.body_errors import body_error_stds, body_errors
-from tests.identify.synthetic import changed_robot_file, problem_of, quick, rss6, run_plant, truth
+from identify.record.timed_record import build_timed_record
+from tests.identify.synthetic import (
+    SIGMA,
+    changed_robot_file,
+    problem_of,
+    quick,
+    rss6,
+    run_plant,
+    truth,
+)
 
 WORKSHOP = {
     "model.centre_std": 0.03,
@@ -65,6 +74,48 @@ def test_standard_deviations_follow_the_sizes_of_bodies():
     assert not body_error_stds(robot, quick(**WORKSHOP).model, ())
 
 
+@pytest.mark.parametrize("kind", ["commands", "servo", "any times"])
+def test_the_effect_of_errors_is_the_difference_of_runs_with_them(kind):
+    """Where no joint sticks, so that differences of small errors converge."""
+    smooth = {"model.friction": "smoothed", "model.smoothing_velocity_rad_s": 0.05}
+    scenario = quick(**WORKSHOP, **smooth)
+    record, run = run_plant(scenario, 1, duration_s=2.1)
+    if kind == "any times":
+        times = record["time"].values
+        record = build_timed_record(
+            time=times[3:],
+            measured_pose=run.pose[3:],
+            measured_covariance=np.diag(SIGMA**2),
+            acting=times,
+            command=run.command,
+            scenario_toml=scenario.to_toml(),
+            robot="rss6",
+            frame_rate_hz=60.0,
+        ).assign_attrs(record.attrs)
+    model = replace(problem_of([record], scenario).runs[0], groups=None)
+    model = model.driven_by_commands() if kind == "commands" else model
+    model = replace(model, bodies=body_errors(model, truth()))
+    count = len(model.common.body_std)
+    found = model.modes(truth())[:, :, -count:]
+
+    def difference(place, size):
+        ends = []
+        for sign in (1, -1):
+            errors = np.zeros(len(model.errors_had))
+            errors[place - count] = sign * size
+            ends.append(model.having(errors).simulate(truth()).pose)
+        return (ends[0] - ends[1]) / (2 * size)
+
+    shown = 0
+    for place in range(count):
+        exact = (4 * difference(place, 0.05) - difference(place, 0.1)) / 3
+        most = np.abs(exact).max()
+        shown += most > 1e-6
+        # changes of commands below 1e-10 rad count as none
+        assert np.abs(found[:, :, place] - exact).max() < 1e-6 * most + 1e-10, place
+    assert shown > 10
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("driven", [True, False], ids=["commands", "servo"])
 def test_an_error_acts_as_the_parameter_that_the_model_lacks(driven):
@@ -80,7 +131,7 @@ def test_an_error_acts_as_the_parameter_that_the_model_lacks(driven):
     there = replace(
         run, robot=full, common=none, payload=0 * same, payload_errors=np.zeros((len(same), 7))
     )
-    base = run.model_poses(parameters)
+    base = run.simulate(parameters).pose
     shown = []
     for place, (name, std) in enumerate(run.common.body_std.items()):
         parameter = name.partition("_")[0].partition(".")[2]
@@ -91,9 +142,9 @@ def test_an_error_acts_as_the_parameter_that_the_model_lacks(driven):
         errors[place] = 1.0
         moved = np.array(same)
         moved[layout.names.index(parameter)] = std
-        exact = there.model_poses(moved) - base
+        exact = there.simulate(moved).pose - base
         able = replace(run, bodies=body_errors(run, parameters))
-        found = able.having(errors).model_poses(parameters) - base
+        found = able.having(errors).simulate(parameters).pose - base
         off = np.sqrt(np.mean((found - exact) ** 2) / np.mean(exact**2))
         assert off < 0.06, (name, off)
         shown.append(name)

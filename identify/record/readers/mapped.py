@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.files.dataset import POSE
 from identify.record.columns import (
     ANGLES,
     FRAMES,
@@ -26,6 +28,7 @@ from identify.record.columns import (
     Log,
     PoseColumns,
 )
+from identify.record.csv_record import symmetric
 from identify.record.readers.bags import Bag, is_bag
 from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
@@ -81,7 +84,9 @@ class _Reader:
         moments = self._moments(stream, measured, measured.time)
         start = moments[0]
         poses, ok = _poses(stream, measured)
-        log = PoseLog(_since(moments, start), _near_home(poses, robot), ok, stream.rows)
+        covariances = _covariances(stream, measured, poses, robot)
+        near = _near_home(poses, robot)
+        log = PoseLog(_since(moments, start), near, ok, stream.rows, covariances)
         commands = self._commands(columns, start, robot)
         _check_overlap(log, commands)
         return Telemetry(log, commands, self._reference(columns, start, robot))
@@ -158,7 +163,8 @@ def _shared(own: Log, measured: PoseColumns) -> Log:
 
 
 def _pose_names(log: PoseColumns) -> list[str]:
-    return [*log.position, *log.orientation, *([] if log.ok is None else [log.ok])]
+    more = [] if log.ok is None else [log.ok]
+    return [*log.position, *log.orientation, *more, *(log.covariance or [])]
 
 
 def _since(moments: Iterable[Decimal], start: Decimal) -> Array:
@@ -197,6 +203,48 @@ def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
     poses[ok, :3] = base[1] + base[0].apply(moved + frame.apply(body[1]))
     poses[ok, 3:] = whole.as_euler("XYZ")
     return poses, ok
+
+
+def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -> Array | None:
+    """Return the covariances (N, 6, 6) of poses (N, 6), NaN where lost. None: no columns have them.
+
+    Small shifts and turns of the tracked body, in axes of the log, move the platform as twists do.
+    """
+    if log.covariance is None:
+        return None
+    cells = np.stack([stream.numbers(name) for name in log.covariance], axis=1)
+    good = np.isfinite(poses).all(axis=1)
+    missing = np.flatnonzero(good & ~np.isfinite(cells).all(axis=1))
+    if len(missing):
+        raise RecordError(
+            f"{stream.rows.place(int(missing[0]))}: a covariance of a measured pose is empty or "
+            "not finite"
+        )
+    found = np.full((len(poses), 6, 6), np.nan)
+    own = _matrices(cells[good])
+    units = np.repeat([LENGTHS[log.position_unit], ANGLES[log.angle_unit]], 3)
+    axes = _axes(log.axes)
+    base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
+    turn = base[0].as_matrix() @ axes
+    # turns are axial vectors, which mirrored axes reverse
+    moved = block_diag(turn, np.linalg.det(axes) * turn) * units
+    whole = Rotation.from_euler("XYZ", poses[good, 3:])
+    lever = (whole * body[0].inv()).apply(body[1])
+    twists = np.tile(moved, (len(own), 1, 1))
+    twists[:, :3] += np.cross(moved[3:].T, lever[:, None]).transpose(0, 2, 1)
+    slopes = np.stack([robot.pose_rate(poses[good], one) for one in np.moveaxis(twists, 2, 0)], 2)
+    found[good] = slopes @ own @ slopes.transpose(0, 2, 1)
+    return found
+
+
+def _matrices(cells: Array) -> Array:
+    """Return the matrices (N, 6, 6) of the columns (N, k) of a covariance."""
+    count = cells.shape[1]
+    if count == len(POSE):
+        return np.asarray(cells[:, :, None] ** 2 * np.eye(count))
+    if count == len(POSE) ** 2:
+        return cells.reshape(-1, len(POSE), len(POSE))
+    return symmetric(cells)
 
 
 def _axes(names: Sequence[str]) -> Array:

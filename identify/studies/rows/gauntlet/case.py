@@ -64,6 +64,9 @@ class Case:
         Whether each interval contains the truth, with the plain model and after the remedy.
     explained : bool
         True if noise explains what the remedied model leaves of its record.
+    alone : tuple of float
+        Of two troubles, the misfit of the plain model where only this one is there, over that by
+        noise. NaN where the model cannot be identified.
     seconds : tuple of float
         Time of the first identification and of the diagnosis, s.
     """
@@ -76,6 +79,7 @@ class Case:
     before: tuple[bool, ...]
     after: tuple[bool, ...]
     explained: bool
+    alone: tuple[float, ...]
     seconds: tuple[float, float]
 
 
@@ -83,13 +87,14 @@ class Case:
 class Drawn:
     """Troubles of a case, and its record.
 
-    again: seed of the record after something was mended. trajectory: seed of the exciting
-    trajectory.
+    number, again: seeds of the record, and of the record after something was mended. trajectory:
+    seed of the exciting trajectory.
     """
 
     scenario: Scenario
     troubles: tuple[Trouble, ...]
     made: Recorded
+    number: int
     again: int
     trajectory: int
 
@@ -114,7 +119,7 @@ def drawn(scenario: Scenario, seed: np.random.SeedSequence, wrong: Wrong, trajec
                 raise
         else:
             break
-    return Drawn(scenario, troubles, made, again, trajectory)
+    return Drawn(scenario, troubles, made, record, again, trajectory)
 
 
 def run_case(case: Drawn) -> Case:
@@ -157,6 +162,7 @@ def run_case(case: Drawn) -> Case:
         before=before,
         after=after,
         explained=explained,
+        alone=misfits_alone(case),
         seconds=seconds,
     )
 
@@ -232,6 +238,24 @@ def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[boo
     except (IdentifyError, DynamicsError):
         return (), False
     return intervals_hold(result, made.plant), result.explained
+
+
+def misfits_alone(case: Drawn) -> tuple[float, ...]:
+    """Return how much each of two troubles alone raises the misfit, see `Case.alone`."""
+    if len(case.troubles) < 2:
+        return ()
+    known = case.scenario.with_overrides({"identification.method": "command_driven"})
+    plain = Setup(known, loaded=robot_named(known.robot)).robot
+    found = []
+    for one in case.troubles:
+        try:
+            made = recorded(known, [one], case.number, case.trajectory)
+            misfit = identify(made.record, plain, known).driven_misfit
+        except (IdentifyError, DynamicsError):
+            found.append(float("nan"))
+        else:
+            found.append(misfit.found / misfit.expected)
+    return tuple(found)
 
 
 def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:

@@ -35,6 +35,7 @@ COLUMNS = {
             ("named", "1", "place of the finding that names it, 0 if none does,"),
             ("together", "1", "1 if named as one that cannot be told from another, statement"),
             ("size_error", "1", "error of the size in its standard deviations"),
+            ("alone", "1", "misfit beside nothing else, for two troubles,"),
         )
     },
     "stopped": Column("1", "1 if experiment or identification stopped with an error"),
@@ -97,6 +98,8 @@ def figures(case: Case) -> Row:
     """Return the figures of a finished case. Those that it does not have are missing."""
     found = case.diagnosis
     row: dict[str, Any] = {"stopped": 0.0}
+    for place, alone in enumerate(case.alone, start=1):
+        row[f"alone_{place}"] = alone
     each = zip(case.named, case.together, case.size_errors, strict=True)
     for place, (named, together, error) in enumerate(each, start=1):
         row |= {
