@@ -25,7 +25,7 @@ EXPLAINS = 0.3
 
 
 def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tuple[str, ...]:
-    """Return a hint for each record at any times that a clock of its commands explains better.
+    """Return a hint for each record at any times that a separate clock of its commands explains.
 
     warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
     """
@@ -54,7 +54,7 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
         offset = 1e3 * errors[run.common.all_names.index(CLOCK_OFFSET)]
         of_record = f" of record {number}" if len(runs) > 1 else ""
         hints.append(
-            f"the commands{of_record} seem to act {offset:.2f} ms after their times, which takes "
+            f"the commands{of_record} seem to act {offset:.2f} ms after their times, which reduces "
             f"the mean squared residual from {misfit:.4g} to {remaining:.4g}: let their clock be "
             "estimated (timing.clock_offset_std_s)"
         )

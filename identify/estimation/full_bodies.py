@@ -59,6 +59,7 @@ def _outside(robot: Robot, estimate: Array, covariance: Array) -> list[str]:
         off = float(np.linalg.norm(centre))
         if off <= reach:
             continue
+        # Derivative of the distance with respect to the mass and the first moments.
         slope = np.append(-off, centre / off) / mass
         std = float(np.sqrt(slope @ covariance[own, own] @ slope))
         if off - reach > OUTSIDE_STDS * std:

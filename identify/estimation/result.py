@@ -190,8 +190,8 @@ class IdentificationResult:
         -------
         pandas.DataFrame
             Columns unit, initial, estimate, std, identifiable, and the ends low and high of the
-            95 % interval. With the truth there are also the columns true and holds. The column
-            holds states whether the interval contains the truth.
+            95 % interval. With the truth there are also the columns `true` and `holds`. The column
+            `holds` states whether the interval contains the truth.
 
         Raises
         ------

@@ -164,8 +164,8 @@ def _shares(found: dict[str, Any]) -> str:
 def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the model with the measurement on the exciting trajectory.
 
-    The columns are before and after identification. For a run that repeats the experiment of the
-    paper, its table 3 is given beside them.
+    The columns are the errors before and after the identification. For a run that repeats the
+    experiment of the paper, the paper's table 3 is given beside them.
     """
     before = _rms(rms_row(result.get("before")))
     after = _rms(rms_row(result.get("after")))
@@ -208,9 +208,9 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
 
 
 def prediction_table(result: dict[str, Any]) -> Table:
-    """Compare the plant's predicted deviation from the identified model with the actual deviation.
+    """Compare the predicted with the actual deviation of the true robot from the predicted poses.
 
-    The rows are the validation trajectories.
+    There are two rows for each validation trajectory.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):

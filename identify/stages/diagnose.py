@@ -25,8 +25,8 @@ ENTRY = "diagnosis"
 def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     """Diagnose the identified model of a run folder, and store the diagnosis in result.json.
 
-    Raises RecordError if the result is incomplete or was made of another record, and the errors of
-    `identify.diagnose`.
+    own: causes of the user's own, which are tried as well. Raises RecordError if the result is
+    incomplete or was made of another record, and the errors of `identify.diagnose`.
     """
     run_folder = RunFolder(folder)
     run_folder.require("scenario.toml", "experiment.nc", "result.json")
