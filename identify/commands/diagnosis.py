@@ -111,26 +111,32 @@ def budget(
       cmmsim budget runs/quick-0
     """
     with interruptible_imports():
-        from identify.files.run_folder import save_files
+        from identify.files.run_folder import load_result, save_files
         from identify.reporting.figures.estimates import budget_figure
+        from identify.reporting.figures.style import drawn
         from identify.stages.run_budget import error_budget
 
     RunFolder(run).require("scenario.toml", "experiment.nc", "covariance.nc", "result.json")
     context.with_resource(lock_folder(run))
     found = error_budget(run)
     folder = RunFolder(run).budget
-    files: dict[str, Any] = {"budget.png": budget_figure(found), "budget.json": found.to_dict()}
+    files: dict[str, Any] = {
+        "budget.png": drawn(lambda: budget_figure(found)),
+        "budget.json": found.to_dict(),
+    }
     files["budget.csv"] = found.to_dataframe().to_csv(index=False)
     save_files(folder, files)
-    tell(found.to_dict(), json, quiet, lambda: _print_budget(found, folder))
+    entries = load_result(RunFolder(run).result)["identification"]["parameters"]
+    identified = [name for name, entry in entries.items() if entry["identifiable"]]
+    tell(found.to_dict(), json, quiet, lambda: _print_budget(found, identified, folder))
 
 
 GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
 """First of three entries of a pose whose mean variance is a column of the table."""
 
 
-def _print_budget(found: "Budget", folder: Path) -> None:
-    """Print what each source adds, the largest first."""
+def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
+    """Print what each source adds to poses and identified parameters, the largest first."""
     import numpy as np
 
     columns = []
@@ -138,32 +144,24 @@ def _print_budget(found: "Budget", folder: Path) -> None:
         if first in found.quantities:
             place = found.quantities.index(first)
             columns.append(1e6 * np.sqrt(np.maximum(found.variances[place : place + 3].mean(0), 0)))
-    own = [k for k, name in enumerate(found.quantities) if not name.startswith(POSES)]
-    shares = 100 * found.shares[own]
-    means = shares.mean(axis=0)
+    shares = 100 * found.shares[[found.quantities.index(name) for name in identified]]
+    means = shares.mean(axis=0) if identified else np.zeros(len(found.sources))
     order = np.argsort(-(columns[-2] if len(columns) == 4 else means), kind="stable")
     rows = []
     for source in order:
-        worst = int(np.argmax(shares[:, source]))
-        said = f"{found.quantities[own[worst]]} {shares[worst, source]:.3g} %"
+        most = identified[int(np.argmax(shares[:, source]))] if means[source] else ""
         numbers = [f"{column[source]:.3g}" for column in columns]
-        rows.append(
-            (found.words[source], *numbers, f"{means[source]:.3g}", said if means[source] else "")
-        )
+        rows.append((found.words[source], *numbers, f"{means[source]:.3g}", most))
     combined = [f"{np.sqrt(np.sum(column**2)):.3g}" for column in columns]
-    rows.append(("combined", *combined, "100", ""))
+    rows.append(("combined", *combined, f"{means.sum():.3g}", ""))
     titles = ("pose\num", "pose\nurad", "predicted\num", "predicted\nurad")[: len(columns)]
-    header = ("source", *titles, "parameters\n%", "most in")
+    header = ("source", *titles, "share\n%", "most in")
     print_table(
         header,
         rows,
         ("source", "most in"),
         "what each source adds to the standard uncertainty",
         "the squares sum up to that of the combined one; poses: root mean square of three axes; "
-        "parameters: mean share of the variance",
+        "share: mean share of the variances of identified parameters",
     )
     typer.echo(f"table and picture: {folder}")
-
-
-POSES = ("pose.", "prediction.")
-"""Beginnings of the names of quantities that are poses."""

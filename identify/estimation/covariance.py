@@ -173,8 +173,8 @@ def estimate_uncertainty(
     # This removes asymmetry due to rounding.
     covariance = (covariance + covariance.T) / 2
     sources = {kind: units @ part @ units.T for kind, part in by_scores.items()}
-    place, _ = problem.anchor.row(problem.guess.layout)
-    for kind, rows in ((GUESS, problem.guess.rows), (ANCHOR, place)):
+    guessed, anchored = np.split(known_rows, [len(problem.guess.rows)])
+    for kind, rows in ((GUESS, guessed), (ANCHOR, anchored)):
         if len(rows):
             sources[kind] = _information(rows @ units[:size] @ units.T)
     sources |= covariance_by_kind(firsts, units @ units[size:].T @ drawn)

@@ -147,6 +147,7 @@ CASES = {
     "diagnose": Case(
         "diagnose {place}/run", ("run",), ("identify.stages.diagnose.diagnosis_from",)
     ),
+    "budget": Case("budget {place}/run", ("run",)),
     "report": Case("report --out {place}/run", ("run",), REPORT),
     "estimators": Case(
         "estimators --out {place}/run --only warm_start",
@@ -207,6 +208,7 @@ CASES = {
         ),
     ),
     "export mjcf": Case("export mjcf ups6 --out {place}/new/ups6.xml"),
+    "export urdf": Case("export urdf ups6 --out {place}/new/ups6.urdf"),
     "import mjcf": Case("import mjcf {made}/ups6.xml --out {place}/new/mine.toml"),
     "import urdf": Case(
         "import urdf {made}/robot.urdf --closures {made}/robot.yaml --out {place}/new/mine.toml"

@@ -1,0 +1,135 @@
+"""The error budget: its parts sum up to what is stated, and are what an error of a source does."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from identify.errors import RecordError
+from identify.estimation.budget import CORRELATED, SOURCES, budget_of
+from identify.estimation.identification import identify
+from identify.files.dataset import read_covariance, read_sources, write_covariance
+from identify.files.run_folder import RunFolder, load_result
+from identify.model.model_side import model_side
+from identify.progress import SilentProgress
+from identify.record.provenance import RunFiles, store_robot
+from identify.record.recording import write_runs
+from identify.reporting.run_result import parameter_vector
+from identify.stages.run_budget import error_budget
+from identify.validation.prediction import predicted_runs
+from tests.identify.commands import command, one_line
+from tests.identify.synthetic import quick, recorded_run_folder, rss6, run_plant, truth_of
+
+DOUBTS = {
+    "excitation.duration_s": 3.0,
+    "model.joint_zero_std_rad": 1e-4,
+    "model.command_scale_std": 1e-3,
+    "timing.latency_std_s": 1e-4,
+}
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory):
+    """The folder of a run whose clocks and drives are known only so well, with an unseen run."""
+    scenario = quick(**DOUBTS)
+    made = run_plant(scenario, 3, duration_s=3.0)
+    store_robot(made[0], rss6())
+    folder = recorded_run_folder(tmp_path_factory.mktemp("budget"), scenario, made)
+    assert command("identify", "--out", folder.path, "--quiet") == 0
+    record, plant = run_plant(scenario, 4, duration_s=2.0, trajectory_seed=5)
+    store_robot(record, rss6())
+    write_runs(folder.validation, [(record, truth_of(plant))])
+    return folder
+
+
+def test_the_squares_sum_up_to_every_variance_that_is_stated(identified):
+    budget = error_budget(identified.path)
+    found = dict(zip(budget.quantities, budget.std, strict=True))
+    names, covariance = read_covariance(identified.covariance)
+    robot = rss6()
+    stated = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
+    for name in robot.layout.names:
+        assert found[name] == pytest.approx(stated[name], rel=1e-9)
+    entry = load_result(identified.result)["identification"]
+    side = model_side(robot, quick(**DOUBTS))
+    (record,) = RunFiles(identified).validation
+    (prediction,) = predicted_runs(
+        side,
+        [record],
+        parameter_vector(robot, entry, "estimate"),
+        covariance,
+        0,
+        SilentProgress(),
+        entry["nuisance_estimates"],
+    )
+    rms = np.sqrt(np.mean(prediction.std**2, axis=0))
+    predicted = [found[f"prediction.{name}"] for name in ("x", "y", "z", "alpha", "beta", "gamma")]
+    np.testing.assert_allclose(predicted, rms, rtol=1e-9)
+    assert {"noise", "zeros", "scale", "latency", "anchor", "guess", "motion"} <= {*budget.sources}
+    assert set(budget.sources) <= SOURCES.keys()
+    assert CORRELATED not in budget.sources
+
+
+def test_the_command_writes_table_picture_and_numbers_that_agree(identified, capfd):
+    assert command("budget", identified.path) == 0
+    said = capfd.readouterr().out
+    assert "drives: zeros of the joints" in said
+    assert "combined" in said
+    folder = RunFolder(identified.path).budget
+    whole = json.loads((folder / "budget.json").read_text())
+    with (folder / "budget.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for name, entry in whole.items():
+        own = [row for row in rows if row["quantity"] == name]
+        squares = sum(float(row["added"]) ** 2 for row in own)
+        assert squares == pytest.approx(entry["combined"] ** 2, rel=1e-9)
+        assert sum(float(row["share"]) for row in own) == pytest.approx(float(bool(own)), abs=1e-9)
+        assert [float(row["share"]) for row in own] == sorted(
+            (float(row["share"]) for row in own), reverse=True
+        )
+    assert (folder / "budget.png").stat().st_size > 10_000
+
+
+def test_what_the_anchor_adds_is_what_its_error_does_to_the_estimate():
+    """By a second identification, from an anchor that is off by its standard deviation."""
+    scenario = quick(**{"identification.method": "command_driven"})
+    record = run_plant(scenario, 3, duration_s=3.0)[0]
+    result = identify(record, scenario=scenario)
+    attributes = {**record.attrs}
+    attributes["scale_anchor_value"] += attributes["scale_anchor_std"]
+    moved = identify(record.assign_attrs(attributes), scenario=scenario)
+    part = np.sqrt(np.diag(result.sources["anchor"]))[: len(result.names)]
+    change = np.abs(moved.estimate - result.estimate)
+    seen = part > 1e-3 * result.std
+    assert seen.sum() > 5
+    np.testing.assert_allclose(change[seen], part[seen], rtol=0.05)
+    budget = result.budget()
+    np.testing.assert_allclose(budget.std, result.std, rtol=1e-9)
+    assert budget.to_dataframe().query("quantity == 'platform.mass'")["source"].iloc[0] == (
+        SOURCES["anchor"].words
+    )
+
+
+def test_covariances_between_sources_have_a_row_of_their_own():
+    budget = budget_of(
+        ["x"], ["m"], {"rig": np.array([4.0]), "teaching": np.array([1.0])}, np.array([3.0])
+    )
+    assert budget.sources == ("rig", "teaching", CORRELATED)
+    assert budget.std == pytest.approx(np.sqrt(3.0))
+    added = budget.to_dataframe().set_index("source")["added"]
+    assert added[SOURCES[CORRELATED].words] == pytest.approx(-np.sqrt(2.0))
+
+
+def test_a_run_of_an_older_version_and_parts_that_do_not_sum_up_are_refused(
+    identified, tmp_path, capfd
+):
+    files = RunFiles(identified)
+    covariance = files.covariance
+    write_covariance(tmp_path / "covariance.nc", rss6().layout, covariance[:67, :67])
+    with pytest.raises(RecordError, match="has no sources of its covariance, because an older"):
+        read_sources(tmp_path / "covariance.nc", covariance[:67, :67])
+    with pytest.raises(RecordError, match="the sources of the covariance do not sum up to it"):
+        read_sources(identified.covariance, covariance + np.diag(1e-6 * np.diag(covariance)))
+    assert command("budget", tmp_path / "none") != 0
+    assert "no run folder" in one_line(capfd.readouterr().err)
