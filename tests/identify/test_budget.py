@@ -15,11 +15,21 @@ from identify.model.model_side import model_side
 from identify.progress import SilentProgress
 from identify.record.provenance import RunFiles, store_robot
 from identify.record.recording import write_runs
+from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting.run_result import parameter_vector
-from identify.stages.run_budget import error_budget
+from identify.stages.run_budget import error_budget, pose_budget
 from identify.validation.prediction import predicted_runs
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import quick, recorded_run_folder, rss6, run_plant, truth_of
+from tests.identify.synthetic import (
+    SHORT,
+    SIGMA,
+    quick,
+    recorded_run_folder,
+    rss6,
+    run_plant,
+    short_run,
+    truth_of,
+)
 
 DOUBTS = {
     "excitation.duration_s": 3.0,
@@ -109,6 +119,26 @@ def test_what_the_anchor_adds_is_what_its_error_does_to_the_estimate():
     assert budget.to_dataframe().query("quantity == 'platform.mass'")["source"].iloc[0] == (
         SOURCES["anchor"].words
     )
+
+
+def test_cameras_and_teaching_add_to_the_measured_pose_what_the_record_states():
+    """Also where they are correlated, and where the identification takes them as exact."""
+    record = short_run()[0].copy()
+    rng = np.random.default_rng(2)
+    names = ("taught.platform.x_m", "left.focal_length_px", "right.focal_length_px")
+    changes = 1e-6 * rng.standard_normal((record.sizes["time"], 6, 3))
+    for between in (0.0, 0.5):
+        covariance = np.array([[1.0, between, 0.0], [between, 1.0, 0.3], [0.0, 0.3, 2.0]])
+        store_common_errors(record, CommonErrors(names, changes, covariance))
+        budget = pose_budget(record, model_side(rss6(), SHORT))
+        stated = changes @ covariance @ changes.transpose(0, 2, 1)
+        whole = SIGMA**2 + np.diagonal(stated.mean(axis=0))
+        np.testing.assert_allclose(budget.std**2, whole, rtol=1e-9)
+        own = np.diagonal(
+            (changes[..., 1:] @ covariance[1:, 1:] @ changes[..., 1:].swapaxes(1, 2)).mean(0)
+        )
+        np.testing.assert_allclose(budget.variances[:, budget.sources.index("rig")], own, rtol=1e-9)
+        assert ("teaching" in budget.sources, CORRELATED in budget.sources) == (True, between > 0)
 
 
 def test_covariances_between_sources_have_a_row_of_their_own():
