@@ -178,7 +178,7 @@ ONCE = """
 const ask = HTMLCanvasElement.prototype.getContext;
 let asked = 0;
 HTMLCanvasElement.prototype.getContext = function (kind, more) {
-  if (kind.startsWith("webgl") && (asked += 1) > 1) return null;
+  if (kind.includes("webgl") && (asked += 1) > 1) return null;
   return ask.call(this, kind, more);
 };
 """
