@@ -7,6 +7,7 @@ import math
 import re
 import warnings
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -257,6 +258,23 @@ def test_what_does_not_move_is_not_drawn():
         ]
         assert len(seen) == ellipses
     assert len(paths.path_figure(TIME, poses).axes) == 2
+
+
+def test_times_along_a_path_do_not_touch_even_where_it_crosses_itself():
+    turns = np.linspace(0, 2 * np.pi, 200)
+    poses = np.zeros((200, 6))
+    for column, (times, shift) in enumerate(((1, 0.1), (2, 0), (3, 0.3), (2, 0), (3, 1), (1, 2))):
+        poses[:, column] = 1e-2 * np.sin(times * turns + shift)
+    poses[100:, :3] *= 0.05  # the second half is a knot at the start
+    for moves in (range(6), (0, 1, 5)):
+        only = np.zeros_like(poses)
+        only[:, moves] = poses[:, moves]
+        figure = paths.path_figure(np.linspace(0, 10, 200), only)
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            boxes = [text.get_window_extent() for text in axes.texts]
+            assert len(boxes) >= 4
+            assert [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])] == []
 
 
 def test_ellipses_hold_95_percent_of_drawn_errors():

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from numpy.typing import NDArray
 from scipy.special import chdtri
@@ -73,6 +74,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
     marks = np.searchsorted(
         elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9
     )
+    drawn: list[tuple[Any, Array]] = []
     for place, (columns, name, unit) in enumerate(halves, start=1):
         solid = len(columns) == 3
         axes: Any = figure.add_subplot(
@@ -81,7 +83,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
         path = 1e3 * (poses[:, columns] - poses[0, columns])
         if len(columns) == 1:
             path = np.column_stack([time, path])
-        _draw_path(axes, path, marks, time)
+        _draw_path(axes, path, marks)
         labels = [f"{COMPONENTS[i]} [{unit}]" for i in columns]
         for axis, label in zip(
             "xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False
@@ -94,11 +96,14 @@ def path_figure(time: Array, poses: Array) -> Figure:
         else:
             figure.subplots_adjust(left=0.12, bottom=0.16)
             axes.set_aspect("equal" if len(columns) == 2 else "auto", adjustable="datalim")
+        drawn.append((axes, path))
+    for axes, path in drawn:
+        _label_times(axes, path, marks, time)
     return figure
 
 
-def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Draw a path (N, 2) or (N, 3) with marked times, and its start as a square."""
+def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_]) -> None:
+    """Draw a path (N, 2) or (N, 3) with marks, and its start as a square."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(
         *path[marks[1:]].T,
@@ -109,10 +114,44 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> 
         markerfacecolor=PAPER,
     )
     axes.plot(*path[:1].T, linestyle="none", marker="s", color=RED, markersize=6)
-    lift = 0.03 * np.ptp(path, axis=0)
-    for k in marks:
+
+
+LABEL = 6.5
+"""Size of a label of a time, points."""
+
+AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
+"""Directions from a mark in which its label is tried."""
+
+
+def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
+    """Write the time beside each mark of a path, where no other label or mark is.
+
+    A label for which there is no room is left out.
+    """
+    axes.figure.draw_without_rendering()
+    flat = path[marks]
+    if path.shape[1] == 3:
+        flat = np.column_stack(proj3d.proj_transform(*flat.T, axes.get_proj())[:2])
+    places = axes.transData.transform(flat) * 72 / axes.figure.dpi
+    taken = [(place - 2.0, place + 2.0) for place in places]
+    for k, place, at in zip(marks, places, flat, strict=True):
         label = "start" if k == marks[0] else f"{time[k] - time[0]:.3g} s"
-        axes.text(*(path[k] + lift), label, fontsize=6.5, color=RED if k == marks[0] else INK)
+        half = np.array([0.31 * LABEL * len(label), 0.6 * LABEL])
+        for step in (step for far in (3.0, 9.0, 15.0) for step in AROUND * (far + half)):
+            low, high = place + step - half, place + step + half
+            if all((low > other).any() or (high < one).any() for one, other in taken):
+                taken.append((low, high))
+                axes.annotate(
+                    label,
+                    at,
+                    step,
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    fontsize=LABEL,
+                    color=RED if k == marks[0] else INK,
+                )
+                break
 
 
 def _plain_box(axes: Axes3D) -> None:
