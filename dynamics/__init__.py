@@ -18,8 +18,8 @@ Every error that a user can cause is a DynamicsError. Names are imported at thei
 and Numba take a second to load, and the help of the command line does not need them.
 
 Conventions: SI units and rad. A pose is [x y z alpha beta gamma] with
-R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. The paper calls
-the crank the wrench.
+R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. A wrench is
+[force, moment]; the paper uses this word for the crank.
 """
 
 from importlib import import_module
@@ -52,8 +52,8 @@ if not TYPE_CHECKING:  # otherwise, a type checker would accept every name
         if name == "closed_loop":
             return import_module("dynamics.closed_loop")
         if name not in _HOME:
-            said = f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
-            raise AttributeError(said)
+            message = f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
+            raise AttributeError(message)
         return getattr(import_module(_HOME[name]), name)
 
     def __dir__() -> list[str]:

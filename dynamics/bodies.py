@@ -34,7 +34,7 @@ class Part(NamedTuple):
 
 
 BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-"""Placement of the base: origin, axes, spin."""
+"""Row of the base, as the rows of `rigid_body.jacobians.placements`: origin, axes, spin."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class DrawnParts(NamedTuple):
 class FunctionBuffers(NamedTuple):
     """Memory for the inputs and outputs of a robot's functions.
 
-    `at` (6 + g,) has a pose and the constants of the functions. `moving` (12 + g,) has a pose, a
-    twist and these constants. `reach` (2, n) has joint coordinates and reach margins, and
+    `at` (6 + g,) has a pose and the g constants of the functions. `moving` (12 + g,) has a pose, a
+    twist and the same constants. `reach` (2, n) has joint coordinates and reach margins, and
     `placements` is (bodies, 15).
     """
 
@@ -114,6 +114,7 @@ class Parts:
         ends = np.array([part.segment.rod for part in self.all])
         self._drawn = DrawnParts(self._rows, before, self._offset, self._centre, ends)
         chart = geometry.chart
+        # entries of the pose that the platform cannot change; NaN for the others
         self._held = np.where(chart.basis.any(axis=1), np.nan, chart.home)
 
     def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
@@ -123,15 +124,16 @@ class Parts:
         """
         robot.check_reach(pose)
         moving = np.zeros(6) if twist is None else twist
-        found = np.empty((len(self.all) + 1, 15))
-        found[:-1] = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows]
-        found[-1] = BASE
-        axes = found[:, 3:12].reshape(-1, 3, 3)
-        origin = found[:, :3]
+        rows = np.empty((len(self.all) + 1, 15))
+        rows[:-1] = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows]
+        rows[-1] = BASE
+        axes = rows[:, 3:12].reshape(-1, 3, 3)
+        origin = rows[:, :3]
+        # the origin of a part is its joint, and that of a placement is the centre of mass
         origin[:-1] += (
             axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None]
         )[..., 0]
-        return Frames(origin, axes, found[:, 12:])
+        return Frames(origin, axes, rows[:, 12:])
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
         """Ends (parts, 2, 3) of the rods that draw the parts, in the axes of the base, m.
@@ -140,23 +142,23 @@ class Parts:
         """
         # importing Numba takes time
         from dynamics.compiled.kernel import chosen
-        from dynamics.rod_kernels import place_rods
+        from dynamics.rod_kernels import place_parts
 
         at = np.array(floats("pose", pose, (6,)))
         functions = robot.functions
         kinematics = functions["inverse_kinematics"]
         placements = functions["placements"]
-        fixed = placements.constants
-        bodies = placements.outputs[0][0]
-        room = FunctionBuffers(
-            at=np.concatenate((at, fixed)),
-            moving=np.concatenate((at, np.zeros(6), fixed)),
+        constants = placements.constants
+        body_count = placements.outputs[0][0]
+        buffers = FunctionBuffers(
+            at=np.concatenate((at, constants)),
+            moving=np.concatenate((at, np.zeros(6), constants)),
             reach=np.empty((2, robot.layout.joints)),
-            placements=np.empty((bodies, 15)),
+            placements=np.empty((body_count, 15)),
         )
         ends = np.empty((len(self.all), 2, 3))
-        where = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
-        if not chosen(place_rods, True)(*where, self._drawn, room, ends):
+        inputs = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
+        if not chosen(place_parts, True)(*inputs, self._drawn, buffers, ends):
             # raises the error with the reason
             robot.check_reach(at)
         return ends

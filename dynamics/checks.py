@@ -98,8 +98,8 @@ def real(
         result = float(value)
     except OverflowError:
         result = np.inf
-    within = (least is None or result >= least) and (above is None or result > above)
-    if not (within and np.isfinite(result)):
+    in_range = (least is None or result >= least) and (above is None or result > above)
+    if not (in_range and np.isfinite(result)):
         raise error(f"{name} is {result}{unit}, must be finite{' and' if limit else ''}{limit}")
     return result
 
@@ -150,13 +150,13 @@ def shown(value: object) -> str:
 
 
 def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
-    """Return True if a shape is the wanted shape."""
+    """Return True if a shape is the wanted shape, in which "N" means any length."""
     pairs = zip(shape, wanted, strict=False)
-    return len(shape) == len(wanted) and all(want in ("N", got) for got, want in pairs)
+    return len(shape) == len(wanted) and all(want in ("N", length) for length, want in pairs)
 
 
 def _shapes_text(shapes: Sequence[Shape]) -> str:
-    """Shapes as text."""
+    """Shapes as text, such as "(6,) or (N, 6)"."""
     return " or ".join(
         f"({one[0]},)" if len(one) == 1 else f"({', '.join(map(str, one))})" for one in shapes
     )
@@ -195,11 +195,11 @@ class Within:
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
         # A field can also have narrower limits of its own.
-        shown = handler(schema)
+        inner = handler(schema)
         return {
-            **shown,
-            "minimum": max(least, shown.get("minimum", least)),
-            "maximum": min(self.most, shown.get("maximum", self.most)),
+            **inner,
+            "minimum": max(least, inner.get("minimum", least)),
+            "maximum": min(self.most, inner.get("maximum", self.most)),
         }
 
 
@@ -224,9 +224,9 @@ def check_inertia_forms(value: object) -> object:
 
 
 def within(quantity: Any) -> Within:
-    """Range of a quantity, for numbers that are not fields of a model."""
-    found: Within = get_args(quantity)[1]
-    return found
+    """Range of a quantity such as `Length`, for numbers that are not fields of a model."""
+    limits: Within = get_args(quantity)[1]
+    return limits
 
 
 Mass = Annotated[float, Within(1e-12, 1e6, "kg", zero=True)]
@@ -246,6 +246,6 @@ Force = Annotated[float, Within(1e-12, 1e9, "N m or N", zero=True)]
 Damping = Annotated[float, Within(1e-12, 1e9, "N m s/rad or N s/m", zero=True)]
 Gain = Annotated[float, Within(1e-9, 1e12, "", zero=True)]
 Ratio = Annotated[float, Within(1e-16, 1e12, "", zero=True)]
-"""Number without a unit: a share, a tolerance or a count."""
+"""Number without a unit: a fraction, a tolerance or a count."""
 Frequency = Annotated[float, Within(1e-6, 1e6, "Hz or rad/s")]
 Duration = Annotated[float, Within(1e-9, 1e6, "s", zero=True)]

@@ -1,9 +1,10 @@
-"""Closed loops of a robot with deviations of its geometry: its poses, and their derivatives.
+"""Poses that close the loops of a robot whose geometry deviates, and their derivatives.
 
-The gaps of the loops (`rigid_body.jacobians.loop_closure`) also depend on the geometric numbers.
-They are zero at a pose, and the derivatives of the pose follow implicitly:
+The gaps of the loops (`rigid_body.jacobians.loop_closure`) depend on the coordinates q of the
+platform and on the geometric numbers. They are zero at a closed pose, from which follows
 
-    d(q)/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
+
+    dq/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 
 One compiled function serves all geometries near a nominal one. A search over geometries therefore
 compiles nothing.
@@ -26,7 +27,10 @@ from dynamics.rigid_body.jacobians import loop_closure
 
 @dataclass(frozen=True)
 class Closure:
-    """Loops of geometries that differ from a nominal geometry by deviations (g,), m and rad."""
+    """Loops of the geometries near a nominal one, with n joints and m coordinates.
+
+    A geometry is given by its g deviations from the nominal geometric numbers, m and rad.
+    """
 
     nominal: RobotGeometry
 
@@ -35,14 +39,14 @@ class Closure:
 
         Raises ConvergenceError for the first row whose loops do not close.
         """
-        found = self.nearest(joints, deviations, start)
-        if not np.isfinite(found).all():
-            row = int(np.argmin(np.isfinite(found).all(axis=1)))
+        poses = self.nearest(joints, deviations, start)
+        if not np.isfinite(poses).all():
+            row = int(np.argmin(np.isfinite(poses).all(axis=1)))
             raise ConvergenceError(
                 f"no pose near {row_text(start[row], 4)} closes the loops with the joint "
                 f"coordinates {row_text(joints[row], 4)} of pose {row + 1}"
             )
-        return found
+        return poses
 
     def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
         """The same as `poses`, with NaN for rows whose loops do not close."""
@@ -50,9 +54,9 @@ class Closure:
         def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
             return self._function(poses, theta, deviations[None])[:2]
 
-        found, _ = close_loops(gaps, self.nominal.chart, joints, start)
-        found[~(np.abs(gaps(found, joints)[0]).max(axis=(1, 2)) < CLOSED)] = np.nan
-        return found
+        closed, _ = close_loops(gaps, self.nominal.chart, joints, start)
+        closed[~(np.abs(gaps(closed, joints)[0]).max(axis=(1, 2)) < CLOSED)] = np.nan
+        return closed
 
     def derivatives(
         self, poses: np.ndarray, joints: np.ndarray, deviations: np.ndarray

@@ -1,4 +1,4 @@
-"""Reading of files from users, within limits. Other files are refused with a one-line message.
+"""Reading of files from users, within limits. Files beyond them are refused with a short message.
 
 The limits far exceed what a person writes. They are low enough that any file of at most a megabyte
 is read or refused within seconds.
@@ -50,13 +50,11 @@ _TEXTS = re.compile(
     """,
     re.DOTALL | re.VERBOSE,
 )
-"""Strings and comments in TOML. Each match extends to its end, so that a search takes
-linear time.
-"""
+"""Strings and comments in TOML. Matches do not backtrack, so that a search takes linear time."""
 
 
 def is_name(name: str) -> bool:
-    """Tell whether a name can be used as a file name."""
+    """Return True if a name can be used as a file name."""
     return bool(re.fullmatch(NAME, name)) and len(name) <= LONGEST_NAME
 
 
@@ -94,10 +92,10 @@ def read_bytes(
     Raises `error_class`, with the reason, for a file that cannot be read or is too large.
     """
     try:
-        place = Path(path)
-        if place.exists() and not (place.is_file() or place.is_dir()):
+        file_path = Path(path)
+        if file_path.exists() and not (file_path.is_file() or file_path.is_dir()):
             raise error_class(f"cannot read {source}: it is not a regular file")
-        with place.open("rb") as file:
+        with file_path.open("rb") as file:
             content = file.read(largest + 1)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or error
@@ -148,16 +146,16 @@ def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str
 
 def _fault(content: dict[str, Any]) -> str:
     """Text on the first entry of a content that exceeds the limits, or an empty text."""
-    left: list[tuple[Any, int]] = [(content, 0)]
-    while left:
-        value, depth = left.pop()
+    pending: list[tuple[Any, int]] = [(content, 0)]
+    while pending:
+        value, depth = pending.pop()
         if depth > DEEPEST:
             return f"keys, tables or lists more than {DEEPEST} deep"
         if isinstance(value, dict):
-            left += [(key, depth) for key in value]
-            left += [(one, depth + 1) for one in value.values()]
+            pending += [(key, depth) for key in value]
+            pending += [(one, depth + 1) for one in value.values()]
         elif isinstance(value, list):
-            left += [(one, depth + 1) for one in value]
+            pending += [(one, depth + 1) for one in value]
         elif isinstance(value, str) and _UNWANTED.search(value):
             return f"a control character in {value[:60]!r}"
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:

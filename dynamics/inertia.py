@@ -61,10 +61,10 @@ def physical_inertias(
     Raises UnphysicalInertiaError, with bodies and values, if one must be changed and
     `allow_changes` is False.
     """
-    given = layout.bodies_of(np.array(parameters, dtype=float))
+    stated = layout.bodies_of(np.array(parameters, dtype=float))
     broken = {
         body: fault
-        for body, row in zip(layout.bodies, given, strict=True)
+        for body, row in zip(layout.bodies, stated, strict=True)
         if (fault := body_fault(row, SMALLEST))
     }
     if broken and not allow_changes:
@@ -73,23 +73,21 @@ def physical_inertias(
             "allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to use the "
             "nearest inertias that engines accept"
         )
-    values = given.copy()
+    values = stated.copy()
     changes = dict[str, str]()
     for index, body in enumerate(layout.bodies):
         if body in broken:
             if layout.full[index]:
-                values[index] = nearest_body(given[index], 2 * SMALLEST)
+                values[index] = nearest_body(stated[index], 2 * SMALLEST)
             else:
                 kind = layout.kinds[index]
-                values[index, CENTRED] = _repaired(kind, given[index, CENTRED])
-            changes[body] = _difference(given[index], values[index])
+                values[index, CENTRED] = _repaired(kind, stated[index, CENTRED])
+            changes[body] = _difference(stated[index], values[index])
     return BodyInertias(values, changes)
 
 
 def grouped(texts: dict[str, str]) -> list[str]:
-    """Texts by body as lines `body, body: text`, with one line for all bodies with the same
-    text.
-    """
+    """Texts by body as lines `body, body: text`. Bodies with the same text share a line."""
     bodies: dict[str, list[str]] = {}
     for body, text in texts.items():
         bodies.setdefault(text, []).append(body)
@@ -112,9 +110,7 @@ def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
 
 
 def _one_kept(x: float, y: float, kept: float) -> list[float]:
-    """Moments x, y and `kept`, of which x and y are changed to values that a rigid body can
-    have.
-    """
+    """Moments x, y and `kept` of a rigid body, of which x and y are changed."""
     if x + y < kept:
         half = (kept - x - y) / 2 + ROUNDING * kept
         return [x + half, y + half, kept]
@@ -122,7 +118,7 @@ def _one_kept(x: float, y: float, kept: float) -> list[float]:
 
 
 def _two_kept(z: float, x: float, y: float) -> list[float]:
-    """Moments z, x and y, of which z is changed to a value that a rigid body can have."""
+    """Moments z, x and y of a rigid body, of which z is changed."""
     slack = ROUNDING * (x + y)
     return [min(max(z, abs(x - y) + slack), x + y - slack), x, y]
 
@@ -132,9 +128,9 @@ def _nearest_moments(moments: np.ndarray) -> np.ndarray:
     largest = int(np.argmax(moments))
     excess = 2 * moments[largest] - moments.sum()
     if excess > 0:
-        share = excess / 3 + ROUNDING * moments[largest]
-        moments = moments + share
-        moments[largest] -= 2 * share
+        third = excess / 3 + ROUNDING * moments[largest]
+        moments = moments + third
+        moments[largest] -= 2 * third
     return moments
 
 
@@ -145,10 +141,12 @@ def _difference(before: np.ndarray, after: np.ndarray) -> str:
 
 
 STATES = 300
+"""Number of random states at which accelerations are compared."""
+
 TRAVEL_RATE = 1.0
 """Standard deviation of joint rates, in travel limits per second."""
 
-TRAVEL_GAIN = 10.0
+TRAVEL_ACCELERATION = 10.0
 """Standard deviation of joint accelerations, in travel limits per second squared."""
 
 
@@ -162,17 +160,17 @@ def acceleration_changes(
     separately, over the states of `travel_states`. Raises ParameterError for parameters outside
     their range.
     """
-    own = robot.layout.check(parameters)
+    checked = robot.layout.check(parameters)
     layout = robot.layout
-    state = travel_states(robot, own)
-    before = robot.forward_dynamics(*state, own).reshape(-1, 2, 3)
+    state = travel_states(robot, checked)
+    before = robot.forward_dynamics(*state, checked).reshape(-1, 2, 3)
     effects = {}
     for index, body in enumerate(layout.bodies):
-        other = own.copy()
+        changed = checked.copy()
         rows = layout.body_slices[index]
-        other[rows] = layout.rigid_of(inertias)[rows]
-        if not np.array_equal(other, own):
-            change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
+        changed[rows] = layout.rigid_of(inertias)[rows]
+        if not np.array_equal(changed, checked):
+            change = robot.forward_dynamics(*state, changed).reshape(-1, 2, 3) - before
             # sizes are zero if the platform cannot rotate
             sizes = np.linalg.norm(before, axis=2)
             effects[body] = float(
@@ -186,10 +184,10 @@ def travel_states(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Random poses within the travel limit, twists, both (STATES, 6), and torques (STATES, n).
 
-    They are always the same for a robot.
+    The states are the same at every call.
     """
     rng = np.random.default_rng(0)
-    free = robot.geometry.chart.basis
+    basis = robot.geometry.chart.basis
     joints = robot.layout.joints
     at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
@@ -201,14 +199,14 @@ def travel_states(
             * rng.uniform(0, 1, (STATES, 1))
             * rng.uniform(-1, 1, (STATES, joints))
         )
-        drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ free.T
+        drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ basis.T
         pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
     pose = pose[:STATES]
     drawn = robot.travel_limit * rng.standard_normal((2, STATES, joints, 1))
-    twist, gain = (
-        np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T
+    twist, acceleration = (
+        np.linalg.solve(robot.joint_jacobian(pose) @ basis, rates)[..., 0] @ basis.T
         for rates in drawn
     )
     twist = TRAVEL_RATE * twist
-    gain = TRAVEL_GAIN * gain
-    return pose, twist, robot.inverse_dynamics(pose, twist, gain, parameters)
+    acceleration = TRAVEL_ACCELERATION * acceleration
+    return pose, twist, robot.inverse_dynamics(pose, twist, acceleration, parameters)

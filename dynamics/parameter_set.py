@@ -24,6 +24,7 @@ class Strict(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _know_every_key(cls, values: object) -> object:
+        """Raise ValueError, with the valid keys, for an unknown key."""
         unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
         if unknown:
             raise ValueError(
@@ -33,11 +34,11 @@ class Strict(BaseModel):
 
 
 class BodyInertia(Strict):
-    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2.
+    """Mass, kg, and moments of inertia about the body's own axes, kg m^2.
 
     A full body also has the first moments of its mass, kg m, and products of inertia, kg m^2. All
-    its moments and products are about the reference point of the body. Each is one value, or a list
-    with one value per leg.
+    moments and products are about the reference point of the body, which is the centre of mass of a
+    body without first moments. Each entry is one value, or a list with one value per leg.
     """
 
     mass: Mass | list[Mass]
@@ -53,7 +54,7 @@ class BodyInertia(Strict):
 
 
 class Friction(Strict):
-    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints.
+    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the actuated joints.
 
     Each is one value, or a list with one value per leg.
     """
@@ -63,7 +64,7 @@ class Friction(Strict):
 
 
 class PassiveFriction(Strict):
-    """Dry friction, N m, and viscous friction, N m s/rad, of the passive joints at one place."""
+    """Dry friction, N m, and viscous friction, N m s/rad, of one passive joint of every leg."""
 
     coulomb: Force | None = None
     viscous: Damping | None = None
@@ -143,10 +144,10 @@ EXACT = Unstated(centre_std=0.0, product_std=0.0, passive_viscous_std=0.0)
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Named parameter set.
+    """Parameter set of a robot.
 
-    `dynamic` (p,) is in the order of `Robot.parameter_names`. `joint_pid` (3,) has lp, li, ld, or
-    (3 n,) those of each joint, one after another.
+    `dynamic` (p,) is in the order of `Robot.parameter_names`. `joint_pid` has lp, li, ld: (3,) if
+    all joints share them, or (3 n,) joint by joint.
     """
 
     dynamic: np.ndarray
@@ -166,6 +167,7 @@ def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Par
     """
 
     def per_leg(key: str, value: float | list[float], count: int) -> list[float]:
+        """One value for each of `count` legs."""
         expanded = value if isinstance(value, list) else [value] * count
         if len(expanded) != count:
             raise RobotFileError(
@@ -174,15 +176,15 @@ def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Par
         return expanded
 
     kinds = [kind.name for kind in layout.kinds]
-    given = {"platform": values.platform, **(values.model_extra or {})}
-    if set(given) != set(kinds):
-        wrong = sorted(set(given) ^ set(kinds))
+    inertias = {"platform": values.platform, **(values.model_extra or {})}
+    if set(inertias) != set(kinds):
+        wrong = sorted(set(inertias) ^ set(kinds))
         valid = ", ".join([*dict.fromkeys(kinds), "joint", "joint_pid"])
         raise RobotFileError(
             f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}"
         )
     bodies = np.empty((len(kinds), len(FULL_INERTIAL)))
-    for kind, inertia in given.items():
+    for kind, inertia in inertias.items():
         rows = [row for row, name_of in enumerate(kinds) if name_of == kind]
         bodies[rows] = np.transpose(
             [per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()]
@@ -215,7 +217,10 @@ def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Par
 
 
 def _check_bodies(set_name: str, bodies: np.ndarray, layout: ParameterLayout) -> None:
-    """Raise RobotFileError for full bodies (bodies, 10) that cannot exist, or that are centred."""
+    """Raise RobotFileError for a full body (10,) that cannot exist.
+
+    Raises it also for a centred body that has first moments or products of inertia.
+    """
     for body, full, row in zip(layout.bodies, layout.full, bodies, strict=True):
         where = f"parameters.{set_name}: {body}"
         if full and (fault := body_fault(row)):

@@ -1,6 +1,6 @@
 """Dynamic parameters of a robot: names, order, units and physical range (Xi of eq. 25).
 
-The paper calls the driven arm of a leg its wrench. Here it is the crank.
+The driven arm of a leg, which the paper calls wrench, is the crank.
 """
 
 from collections.abc import Sequence
@@ -18,16 +18,19 @@ from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL, INERTIAL, MOM
 
 PLATFORM = Body("platform", MOMENTS)
 JOINT_PID = ("lp", "li", "ld")
-
+"""Gains of the joint PID (eq. 31)."""
 
 SIGNED = (*FIRST_MOMENTS, *PRODUCTS)
 """Inertial parameters that may be negative."""
 
 ALL_TEN = list(range(len(FULL_INERTIAL)))
+"""Places of all parameters of a full body."""
+
 CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
 """Places of the parameters of a centred body among those of a full body."""
 
 PASSIVE_LAWS = ("coulomb", "viscous")
+"""Kinds of friction of a passive joint, each with one parameter."""
 
 LANES = 8
 """Number of derivatives that are computed at once."""
@@ -37,8 +40,8 @@ def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:
     """Number of columns for the derivatives of one quantity, rounded up to a multiple of LANES.
 
     There is one column for each parameter, for the length of a step, and for each entry of a start
-    state. Whether or not joints share their gains, there is a column for each gain of each joint:
-    the compiled code is then the same.
+    state. Each joint has columns for gains of its own, even if all joints share them, so that the
+    compiled code is the same.
     """
     parameters = rigid + (2 + len(JOINT_PID)) * joints
     start = 3 * coordinates + joints
@@ -47,11 +50,11 @@ def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RigidGroups:
-    """The k groups (k, r) of a robot's r inertial parameters. Its motion depends only on them.
+    """Groups of inertial parameters through which alone they affect the motion.
 
-    Each group is a linear combination of the parameters. `pivots` (k,) are the indices of one
-    parameter of each group, in ascending order. This parameter has the coefficient 1 in its group
-    and 0 in all other groups.
+    `combinations` (k, r) has the coefficients of the r parameters in each of the k groups. `pivots`
+    (k,) are the indices of one parameter of each group, in ascending order. This parameter has the
+    coefficient 1 in its group and 0 in all other groups.
     """
 
     pivots: np.ndarray
@@ -119,10 +122,7 @@ class ParameterLayout:
 
     @cached_property
     def signed(self) -> np.ndarray:
-        """True for each dynamic parameter (p,) that may be negative.
-
-        These are the first moments and the products of inertia.
-        """
+        """True for each dynamic parameter (p,) that may be negative, which are those in SIGNED."""
         return np.isin([name.split(".")[1] for name in self.dynamic_names], SIGNED)
 
     @cached_property
@@ -152,7 +152,7 @@ class ParameterLayout:
         return self.dynamic_names + self.joint_pid_names
 
     def derivatives(self, coordinates: int) -> int:
-        """Number of columns for the derivatives of one number of the loop."""
+        """Number of columns for the derivatives of one quantity. See `room_for_derivatives`."""
         return room_for_derivatives(len(self.rigid_names), self.joints, coordinates)
 
     @property
@@ -204,10 +204,10 @@ class ParameterLayout:
 
     def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
         """Inertial parameters (..., bodies, 10) of all bodies as full bodies."""
-        found = np.zeros((*rigid.shape[:-1], len(self.bodies), len(FULL_INERTIAL)))
-        for body, own in enumerate(self.body_slices):
-            found[..., body, ALL_TEN if self.full[body] else CENTRED] = rigid[..., own]
-        return found
+        full_bodies = np.zeros((*rigid.shape[:-1], len(self.bodies), len(FULL_INERTIAL)))
+        for body, rows in enumerate(self.body_slices):
+            full_bodies[..., body, ALL_TEN if self.full[body] else CENTRED] = rigid[..., rows]
+        return full_bodies
 
     def rigid_of(self, bodies: np.ndarray) -> np.ndarray:
         """Inertial parameters (..., r) of full bodies (..., bodies, 10).
@@ -268,8 +268,8 @@ class ParameterLayout:
         return unit_of(name, self.prismatic)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Split parameters into inertial parameters, dry friction, viscous friction, and
-        lp, li, ld of each joint (n, 3).
+        """Split parameters into those of the equation of motion, dry friction (n,), viscous
+        friction (n,), and lp, li, ld of each joint (n, 3).
         """
         return (
             values[self.rigid],
@@ -305,9 +305,9 @@ class ParameterLayout:
 
 
 def may_be_absent(name: str) -> bool:
-    """Return True for a parameter that is zero for a robot whose layout does not have it.
+    """Return True for a parameter that some layouts of a robot do not have, where it is zero.
 
-    These are first moments and products of inertia, and the friction of passive joints.
+    Such are first moments and products of inertia, and the friction of passive joints.
     """
     joint, _, entry = name.rpartition(".")
     return entry in SIGNED or joint.endswith(PASSIVE_JOINT.format(""))
@@ -331,7 +331,7 @@ def parameter_layout(
     own_gains: bool = False,
     passive: Sequence[str] = (),
 ) -> ParameterLayout:
-    """Layout of a robot with these legs.
+    """Layout of the parameters of a robot with given legs.
 
     The platform is first. The first bodies of all legs follow, and then their second bodies. `full`
     are the names of the bodies or kinds of bodies with ten inertial parameters, such as link2 or
@@ -340,19 +340,19 @@ def parameter_layout(
 
     Raises ParameterError, with the valid names, for an unknown name.
     """
-    found: list[tuple[int, Body]] = []
+    leg_bodies: list[tuple[int, Body]] = []
     for place in range(max(len(leg.bodies) for leg in legs)):
-        found += [
+        leg_bodies += [
             (number, leg.bodies[place])
             for number, leg in enumerate(legs)
             if place < len(leg.bodies)
         ]
     of_leg = [
-        tuple(1 + k for k, (owner, _) in enumerate(found) if owner == number)
+        tuple(1 + k for k, (owner, _) in enumerate(leg_bodies) if owner == number)
         for number in range(len(legs))
     ]
-    names = ("platform", *(f"{body.name}{number + 1}" for number, body in found))
-    kinds = (PLATFORM, *(body for _, body in found))
+    names = ("platform", *(f"{body.name}{number + 1}" for number, body in leg_bodies))
+    kinds = (PLATFORM, *(body for _, body in leg_bodies))
     valid = {"all", *names, *(kind.name for kind in kinds)}
     if unknown := [name for name in full if name not in valid]:
         raise ParameterError(

@@ -1,4 +1,4 @@
-"""Pseudo-inertia of a rigid body, which states whether a body can exist.
+"""Pseudo-inertia of a rigid body, which shows whether the body can exist.
 
 With the second moments Sigma (3, 3) of the mass, the first moment s and the mass m, the
 pseudo-inertia is
@@ -24,15 +24,15 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 def pseudo_inertia(bodies: np.ndarray) -> np.ndarray:
     """Pseudo-inertia (..., 4, 4) of full bodies (..., 10)."""
-    found = np.zeros((*bodies.shape[:-1], 4, 4))
+    pseudo = np.zeros((*bodies.shape[:-1], 4, 4))
     moments = bodies[..., 4:7]
     half = moments.sum(axis=-1, keepdims=True) / 2
-    found[..., range(3), range(3)] = half - moments
+    pseudo[..., range(3), range(3)] = half - moments
     for place, (row, column) in enumerate(PAIRS, 7):
-        found[..., row, column] = found[..., column, row] = -bodies[..., place]
-    found[..., :3, 3] = found[..., 3, :3] = bodies[..., 1:4]
-    found[..., 3, 3] = bodies[..., 0]
-    return found
+        pseudo[..., row, column] = pseudo[..., column, row] = -bodies[..., place]
+    pseudo[..., :3, 3] = pseudo[..., 3, :3] = bodies[..., 1:4]
+    pseudo[..., 3, 3] = bodies[..., 0]
+    return pseudo
 
 
 def inertial_parameters(pseudo: np.ndarray) -> np.ndarray:
@@ -141,10 +141,9 @@ def body_fault(body: np.ndarray, smallest: float = 0.0) -> str:
 
 
 def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
-    """Text on a principal moment that exceeds the sum of the other two.
+    """Text on a principal moment that exceeds the sum of the other two, or an empty text.
 
-    It may exceed the sum by the share `rounding`. The text is empty if a rigid body can have the
-    moments.
+    A relative excess of at most `rounding` is allowed.
     """
     largest = max(moments, key=moments.__getitem__)
     others = [name for name in moments if name != largest]

@@ -107,9 +107,8 @@ class Robot(RobotDynamics):
         ----------
         name : str
             inverse_kinematics, joint_jacobian, pose_jacobian, mass_matrix, coriolis_matrix,
-            gravity_wrench, friction_wrench, regressor, inverse_dynamics or forward_dynamics.
-            Friction has a sign function. friction_wrench, inverse_dynamics and forward_dynamics
-            are therefore smooth only if no joint is at rest, and so is regressor.
+            gravity_wrench, friction_wrench, regressor, inverse_dynamics or forward_dynamics. The
+            last four are not smooth where a joint is at rest, because of the sign of its friction.
 
         Returns
         -------
@@ -258,24 +257,25 @@ class Robot(RobotDynamics):
 
     @lru_cache(maxsize=64)  # noqa: B019 - users ask for the same few forms of a few robots
     def _in_form(self, **form: Any) -> Robot:
-        """Robot with another form of its parameters, which are fields of its geometry.
+        """Robot with another form of its parameters. `form` are fields of its geometry.
 
-        It is kept, because results such as base parameters are kept by robot.
+        The robot is cached, because results such as base parameters are cached by robot.
         """
         geometry = replace(self.geometry, **form)
-        own = self.layout
-        other = geometry.layout
-        if other == own:
+        layout = self.layout
+        new_layout = geometry.layout
+        if new_layout == layout:
             return self
         sets = {
             name: ParameterSet(
-                own.converted(given.dynamic, other), own.converted_gains(given.joint_pid, other)
+                layout.converted(old.dynamic, new_layout),
+                layout.converted_gains(old.joint_pid, new_layout),
             )
-            for name, given in self.parameter_sets.items()
+            for name, old in self.parameter_sets.items()
         }
-        # a robot with functions of its own keeps such functions, which are faster than shared ones
-        own_functions = self.functions_of is self.geometry
-        nominal = None if own_functions else replace(self.functions_of, **form)
+        # functions of the robot's own geometry are faster than those shared by `moved`
+        has_own_functions = self.functions_of is self.geometry
+        nominal = None if has_own_functions else replace(self.functions_of, **form)
         return Robot(RobotDescription(self.name, geometry, sets), nominal)
 
     def with_passive_friction(self, names: Sequence[str]) -> Robot:
@@ -308,7 +308,7 @@ class Robot(RobotDynamics):
         return self._in_form(passive_friction=tuple(names))
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
-        """Robot with another geometry with the same kinds of legs. It has its own functions.
+        """Robot with another geometry, with the same kinds of legs, and functions of its own.
 
         Parameters
         ----------

@@ -217,7 +217,7 @@ class RobotDynamics(RobotKinematics):
         Returns
         -------
         ndarray, shape (6,) or (N, 6)
-            Time derivative of the twist.
+            Time derivative of the twist, m/s^2 and rad/s^2.
 
         Raises
         ------
@@ -264,7 +264,7 @@ class RobotDynamics(RobotKinematics):
         (6,)
         """
         poses = rows("pose", pose, 6)
-        # With the exact sign function, friction is zero at rest.
+        # with the exact sign function, friction is zero at rest
         rest = np.zeros_like(poses)
         return self.inverse_dynamics(poses, rest, rest, parameters)
 

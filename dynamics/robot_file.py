@@ -17,7 +17,7 @@ from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.parameter_set import Parameters, ParameterSet, Strict, Unstated, parameter_set
 
-MOST_COMPLAINTS = 24
+MOST_FAULTS = 24
 """Largest number of faults in a message: four for each of six legs."""
 
 
@@ -67,8 +67,8 @@ class RobotFile(Strict):
     )
     unstated: Unstated = Field(
         Unstated(),
-        description="standard deviations of what centred bodies and passive joints without "
-        "friction are taken to be; 0 for bodies and joints that are exactly so",
+        description="standard deviations of the centred bodies from bodies with ten parameters, "
+        "and of passive joints from joints without friction; 0 if they are exact",
     )
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
         description="a table for each leg; with a family also a single table, in which each key "
@@ -87,6 +87,7 @@ class RobotFile(Strict):
     @model_validator(mode="before")
     @classmethod
     def _by_family(cls, values: Any) -> Any:
+        """Complete the legs and the chart by those of the family. Raises ValueError."""
         if not isinstance(values, dict) or "legs" not in values:
             return values
         name = values.get("family")
@@ -162,7 +163,7 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
 
 
 def plural(name: str) -> str:
-    """Key of the column of a field of legs, if the values are vectors."""
+    """Key of the column of a field, such as `slider_axes` for `slider_axis`."""
     if name.endswith("axis"):
         return name.removesuffix("axis") + "axes"
     return name + "s" if name.endswith(("joint", "direction")) else name
@@ -245,6 +246,7 @@ def parsed_robot(text: str, source: str) -> RobotDescription:
 
 
 def _geometry(content: RobotFile) -> RobotGeometry:
+    """Geometry of a robot file. Raises RobotFileError."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -284,10 +286,10 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    """Faults with their places, in one line. A fault that several legs have is stated once."""
+    """Faults and their places in one line. A fault of several legs is stated once."""
     legs: dict[str, list[str]] = {}
-    found = error.errors()
-    for item in found[:MOST_COMPLAINTS]:
+    faults = error.errors()
+    for item in faults[:MOST_FAULTS]:
         place = list(item["loc"])
         who = ""
         if len(place) > 1 and place[0] == "legs":
@@ -298,9 +300,9 @@ def _one_line(error: ValidationError) -> str:
         if last.startswith("list[" if not isinstance(item["input"], list) else "function-"):
             continue  # pydantic also reports the alternative that the value was not meant for
         place = [part for part in place if not str(part).startswith(("list[", "function-"))]
-        said = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
+        parts = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
         got = "" if item["type"] in ("value_error", "missing") else f", got {shown(item['input'])}"
-        legs.setdefault(": ".join(filter(None, said)) + got, []).append(who)
+        legs.setdefault(": ".join(filter(None, parts)) + got, []).append(who)
     lines = [": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items()]
-    more = len(found) - MOST_COMPLAINTS
+    more = len(faults) - MOST_FAULTS
     return "; ".join(lines + ([f"and {more} more"] if more > 0 else []))

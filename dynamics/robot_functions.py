@@ -45,7 +45,7 @@ CASADI = {
 def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
     """Compiled functions of a geometry, shared by all robots with this geometry.
 
-    Robots have no reference to them, and can thus be pickled.
+    Robots do not store these functions, and can thus be pickled.
     """
     return compiled_functions(
         geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT
@@ -54,7 +54,7 @@ def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
 
 @lru_cache(maxsize=4)
 def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
-    """Compiled functions of all geometries near a nominal one. The last input is the deviations."""
+    """Compiled functions of all geometries near a nominal one, whose last input is deviations."""
     movable = MovableGeometry(nominal)
     key = b"movable" + nominal.digest
     return compiled_functions(
@@ -81,7 +81,7 @@ def _functions_by_name(geometry: RobotGeometry) -> dict[str, ca.Function]:
 @lru_cache(maxsize=64)
 def casadi_function(geometry: RobotGeometry, name: str) -> ca.Function:
     """CasADi function of a geometry, with named inputs and outputs as in `CASADI`."""
-    found = _functions_by_name(geometry)[name]
+    function = _functions_by_name(geometry)[name]
     inputs, outputs = (names.split() for names in CASADI[name])
-    given = [ca.SX.sym(one, found.size1_in(k)) for k, one in enumerate(inputs)]
-    return ca.Function(name, given, found.call(given), inputs, outputs)
+    symbols = [ca.SX.sym(one, function.size1_in(k)) for k, one in enumerate(inputs)]
+    return ca.Function(name, symbols, function.call(symbols), inputs, outputs)

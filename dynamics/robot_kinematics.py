@@ -139,7 +139,7 @@ class RobotKinematics(RobotPlatform):
         joints = self.inverse_kinematics(self.home_pose) if theta is None else theta
         joints = floats("theta", joints, (self.layout.joints,))
         count = whole("starts", starts, DynamicsError, least=1)
-        drawn = whole("seed", seed, DynamicsError, least=0)
+        seed = whole("seed", seed, DynamicsError, least=0)
         geometry = self.geometry
         # radius of the search about the centre of the base joints
         centre = geometry.base_joints.mean(axis=0)
@@ -147,7 +147,7 @@ class RobotKinematics(RobotPlatform):
         reach = np.linalg.norm(legs, axis=1).max()
         radius = float(np.linalg.norm(geometry.base_joints - centre, axis=1).max() + reach)
         return forward_kinematics.assembly_modes(
-            self.functions, geometry.chart, joints, centre, radius, count, drawn
+            self.functions, geometry.chart, joints, centre, radius, count, seed
         )
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:

@@ -20,12 +20,13 @@ from dynamics.parameter_set import ParameterSet
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions
 
-# With a larger condition number, all digits are lost. Usual robots have about 1e2.
 CONDITION_LIMIT = 1e10
+"""Condition number of a Jacobian beyond which digits are lost. Usual robots have about 1e2."""
 
 CHART_TOLERANCE = 1e-9
-"""Largest part of a pose or twist outside the chart that counts as rounding: m, rad, m/s or
-rad/s.
+"""Largest deviation of a pose or twist from the allowed ones that counts as rounding.
+
+It is in m, rad, m/s or rad/s.
 """
 
 
@@ -33,8 +34,9 @@ class RobotPlatform:
     """Names, poses, twists and reach of a robot. See `Robot`."""
 
     def __init__(self, description: RobotDescription, nominal: RobotGeometry | None = None) -> None:
-        """Make a robot from its description, with the functions of a nearby nominal
-        geometry, if given.
+        """Make a robot from its description.
+
+        If a nearby geometry `nominal` is given, its functions are used.
         """
         check_type("description", description, RobotDescription, RobotFileError)
         self.name = description.name
@@ -58,7 +60,7 @@ class RobotPlatform:
 
     @property
     def travel_limit(self) -> float:
-        """Largest magnitude of a joint coordinate allowed, rad or m."""
+        """Largest allowed magnitude of a joint coordinate, rad or m."""
         return self.geometry.travel_limit
 
     @property
@@ -140,7 +142,7 @@ class RobotPlatform:
         Returns
         -------
         ndarray, shape (6,) or (N, 6)
-            Twist [h_dot, omega] in the axes of the base.
+            Twist [h_dot, omega] in the axes of the base, m/s and rad/s.
 
         Raises
         ------
@@ -167,7 +169,7 @@ class RobotPlatform:
         Returns
         -------
         ndarray, shape (6,) or (N, 6)
-            Time derivative of the twist.
+            Time derivative of the twist, m/s^2 and rad/s^2.
 
         Raises
         ------
@@ -194,7 +196,7 @@ class RobotPlatform:
         Returns
         -------
         ndarray, shape (6,) or (N, 6)
-            Time derivative of the pose.
+            Time derivative of the pose, m/s and rad/s.
 
         Raises
         ------
@@ -209,10 +211,10 @@ class RobotPlatform:
         array([1., 1., 1., 1., 1., 1.])
         """
         poses = rows("pose", pose, 6)
-        turned = np.abs(np.cos(poses[..., 4]))
-        if not (turned > 1 / CONDITION_LIMIT).all():
+        cosine = np.abs(np.cos(poses[..., 4]))
+        if not (cosine > 1 / CONDITION_LIMIT).all():
             raise SingularPoseError(
-                f"Euler rates are singular at beta = +-pi/2: |cos(beta)| is {turned.min():.3g}"
+                f"Euler rates are singular at beta = +-pi/2: |cos(beta)| is {cosine.min():.3g}"
             )
         return self._call("pose_rate", poses, rows("twist", twist, 6))[..., 0]
 
@@ -320,28 +322,26 @@ class RobotPlatform:
     def _twists(self, name: str, value: ArrayLike) -> np.ndarray:
         """Twists as an array, checked that the platform can have them."""
         twists = rows(name, value, 6)
-        free = self.geometry.chart.basis
-        self._check_chart(name, twists, twists - twists @ free @ free.T)
+        basis = self.geometry.chart.basis
+        self._check_chart(name, twists, twists - twists @ basis @ basis.T)
         return twists
 
-    def _check_chart(self, name: str, given: np.ndarray, forbidden: np.ndarray) -> None:
+    def _check_chart(self, name: str, values: np.ndarray, forbidden: np.ndarray) -> None:
         """Raise ChartError if the platform cannot have a pose or twist."""
         if np.abs(forbidden).max(initial=0.0) <= CHART_TOLERANCE:
             return
         names = ", ".join(self.coordinate_names)
-        off = np.atleast_2d(forbidden)
-        entry = int(np.argmax(np.abs(off).max(axis=0)))
-        row = int(np.argmax(np.abs(off[:, entry])))
+        deviations = np.atleast_2d(forbidden)
+        entry = int(np.argmax(np.abs(deviations).max(axis=0)))
+        row = int(np.argmax(np.abs(deviations[:, entry])))
         raise ChartError(
             f"the platform of {self.name} moves in {names} only: {name} "
-            f"{row_text(np.atleast_2d(given)[row])} is {off[row, entry]:.3g} off in "
+            f"{row_text(np.atleast_2d(values)[row])} is {deviations[row, entry]:.3g} off in "
             f"{POSE_NAMES[entry]}"
         )
 
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
-        """Output of a function: (rows, columns), or with one more axis if an argument is a
-        batch.
-        """
+        """Output (rows, columns) of a function, or (N, rows, columns) if an argument is a batch."""
         batched = [argument.shape[0] for argument in arguments if argument.ndim == 2]
         if len(set(batched) - {1}) > 1:
             shapes = ", ".join(str(argument.shape) for argument in arguments)
@@ -349,8 +349,8 @@ class RobotPlatform:
         results = self.functions[name](*[np.atleast_2d(argument) for argument in arguments])
         values = results[output]
         if output == 0 and not np.isfinite(values).all():
-            said = ", ".join(row_text(argument) for argument in arguments)
+            inputs_text = ", ".join(row_text(argument) for argument in arguments)
             raise SingularPoseError(
-                f"{name} is not finite for {said}: singular pose or mass matrix"
+                f"{name} is not finite for {inputs_text}: singular pose or mass matrix"
             )
         return values if batched else values[0]

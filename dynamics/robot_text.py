@@ -93,9 +93,9 @@ def _parameters(values: ParameterSet, layout: ParameterLayout) -> list[str]:
     kinds = [kind.name for kind in layout.kinds]
     lines = []
     for kind in dict.fromkeys(kinds):
-        own = [row for row, name in enumerate(kinds) if name == kind]
-        names = FULL_INERTIAL if any(layout.full[row] for row in own) else INERTIAL
-        columns = {name: bodies[own, FULL_INERTIAL.index(name)] for name in names}
+        rows = [row for row, name in enumerate(kinds) if name == kind]
+        names = FULL_INERTIAL if any(layout.full[row] for row in rows) else INERTIAL
+        columns = {name: bodies[rows, FULL_INERTIAL.index(name)] for name in names}
         lines.append(_table(kind, columns))
     passive: dict[str, list[str]] = {}
     for name, value in zip(layout.passive_names, values.dynamic[layout.passive], strict=True):
@@ -129,8 +129,8 @@ def _table(name: str, columns: dict[str, np.ndarray]) -> str:
 
 def _line(name: str, values: Mapping[str, object]) -> str:
     """Line with a table."""
-    said = ", ".join(f"{key} = {_value(value)}" for key, value in values.items())
-    return f"{name} = {{ {said} }}"
+    entries = ", ".join(f"{key} = {_value(value)}" for key, value in values.items())
+    return f"{name} = {{ {entries} }}"
 
 
 def _key(name: str) -> str:

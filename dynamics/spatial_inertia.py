@@ -18,7 +18,7 @@ import casadi as ca
 
 MOMENTS = ("Ixx", "Iyy", "Izz")
 INERTIAL = ("mass", *MOMENTS)
-"""Inertial parameters of a centred body: kg, and kg m^2 about its own axes."""
+"""Inertial parameters of a centred body: mass, kg, and moments about its own axes, kg m^2."""
 
 FIRST_MOMENTS = ("mcx", "mcy", "mcz")
 PRODUCTS = ("Ixy", "Ixz", "Iyz")
@@ -43,10 +43,10 @@ class SpatialInertia:
     inertia: ca.SX
 
     def load(self, acceleration: ca.SX, spin: ca.SX, spin_rate: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Force and moment (3,) for a motion.
+        """Force (3,), N, and moment (3,), N m, for a motion.
 
-        `acceleration` (3,) is that of the reference point minus gravity, and `spin` (3,) is the
-        angular velocity.
+        `acceleration` (3,) is that of the reference point minus gravity. `spin` (3,) is the angular
+        velocity, and `spin_rate` (3,) its time derivative.
         """
         force = self.mass * acceleration
         moment = self.inertia @ spin_rate + ca.cross(spin, self.inertia @ spin)
@@ -84,7 +84,7 @@ class SpatialInertia:
             turned = ca.skew(spin) @ first
             of_forces -= centre_map.T @ (first @ spin_rate + turned @ spin_map)
             of_moments += spin_map.T @ first @ centre_rate
-            # These two terms cancel in C times the velocities, and make M_dot - 2 C skew-symmetric.
+            # these two terms cancel in C times the velocities, and make M_dot - 2 C skew-symmetric
             swept = ca.skew(ca.cross(self.first_moment, velocity))
             of_moments += spin_map.T @ (turned @ centre_map + swept @ spin_map)
         return of_forces, of_moments
@@ -96,7 +96,8 @@ def spatial_inertia(
     """Inertia of a body with axes (3, 3), as columns, in the axes of the base.
 
     `parameters` are those of a centred body (4,) or of a full body (10,). `working` are the moments
-    of a centred body that do work. The others would only add rounding errors.
+    of a centred body that do work. Its other moments are set to zero, because they would only add
+    rounding errors.
     """
     if parameters.numel() == len(INERTIAL):
         moments = [parameters[k] if name in working else 0 for k, name in enumerate(INERTIAL) if k]

@@ -77,7 +77,7 @@ class WorkspaceMeasures:
     def _condition(self, matrices: np.ndarray) -> np.ndarray:
         """Condition numbers of matrices, NaN out of reach."""
         result = np.full(len(matrices), np.nan)
-        # NumPy raises an error for matrices with NaN.
+        # NumPy raises an error for matrices with NaN
         result[self.reachable] = np.linalg.cond(matrices[self.reachable])
         return result
 
@@ -96,8 +96,8 @@ class WorkspaceMeasures:
 class Extreme:
     """Point of a motion that is nearest to a limit.
 
-    It has its value, the limit, and its row. `time` is in s, and NaN if no times are given. `leg`
-    is 1 to n, and None if the value belongs to no single leg.
+    `row` is the row of the motion. `time` is in s, and NaN if no times are given. `leg` is 1 to n,
+    and None if the value belongs to no single leg.
     """
 
     value: float
@@ -124,7 +124,7 @@ class MotionExtremes:
 def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     """Measures of poses (N, 6), or of one pose (6,) as N = 1.
 
-    Poses out of reach give NaN and a negative reach margin. Raises ShapeError.
+    Raises ShapeError.
     """
     check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(robot.charted(pose))
@@ -142,14 +142,14 @@ def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
     """Measures of poses for random joint coordinates within the travel limit.
 
     Each pose is searched from home. Coordinates without a pose are omitted, so that there can be
-    fewer rows than samples. The result is always the same for a robot.
+    fewer rows than samples.
     """
     limit = robot.travel_limit
-    # The seed is fixed: a report of a robot must not change from run to run.
+    # the seed is fixed, because a report of a robot must not change from run to run
     joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
     start = np.tile(robot.home_pose, (samples, 1))
-    found = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
-    return measure(robot, found.pose[found.converged])
+    solution = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
+    return measure(robot, solution.pose[solution.converged])
 
 
 def check_motion(
@@ -172,7 +172,7 @@ def check_motion(
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):
         raise ShapeError("a motion needs at least one pose, got none")
-    moments = np.full(len(poses), np.nan) if times is None else _increasing(times, len(poses))
+    instants = np.full(len(poses), np.nan) if times is None else _increasing(times, len(poses))
     travel_margin = real("travel_margin", travel_margin, TravelError, least=0)
     least_leverage = real("least_leverage", least_leverage, DynamicsError, least=0)
     most_condition = real("most_condition", most_condition, DynamicsError, least=1)
@@ -181,13 +181,13 @@ def check_motion(
     def extreme(values: np.ndarray, limit: float, pick: Callable[..., np.intp]) -> Extreme:
         row, *leg = (int(index) for index in np.unravel_index(pick(values), values.shape))
         return Extreme(
-            float(values[row, *leg]), limit, row, float(moments[row]), leg[0] + 1 if leg else None
+            float(values[row, *leg]), limit, row, float(instants[row]), leg[0] + 1 if leg else None
         )
 
     def check(
-        worst: Extreme, within: bool, kind: type[DynamicsError], quantity: str, relation: str
+        worst: Extreme, is_allowed: bool, kind: type[DynamicsError], quantity: str, relation: str
     ) -> None:
-        if not within:
+        if not is_allowed:
             when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
             who = f" of leg {worst.leg}" if worst.leg else ""
             raise kind(
@@ -225,12 +225,12 @@ def check_motion(
 
 
 def _increasing(times: ArrayLike, count: int) -> np.ndarray:
-    """Times (N,) that increase, NaN where there are none. Raises ShapeError."""
-    moments = floats("times", times, (count,))
-    back = np.flatnonzero(np.diff(moments) <= 0)
+    """Times (count,) that increase. Raises ShapeError."""
+    values = floats("times", times, (count,))
+    back = np.flatnonzero(np.diff(values) <= 0)
     if len(back):
         row = int(back[0]) + 1
         raise ShapeError(
-            f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s"
+            f"times must increase, but times[{row}] = {values[row]} s follows {values[row - 1]} s"
         )
-    return moments
+    return values

@@ -39,11 +39,11 @@ See `identify.estimators.estimator`.
 
 
 LAWS = {
-    "pid": "dynamics.control.law:pid",
+    "pid": "dynamics.control.law_interface:pid",
     "feedforward": "dynamics.control.feedforward:feedforward",
     "computed_torque": "dynamics.control.computed_torque:computed_torque",
 }
-"""Laws that make a robot follow a motion, see `dynamics.control.law`."""
+"""Laws that make a robot follow a motion, see `dynamics.control.law_interface`."""
 
 
 def check_choice(

@@ -27,8 +27,9 @@ class CommandSchedule(NamedTuple):
 
     The spans of frame k are first[k] to first[k + 1]. The other arrays have one entry per span.
     `command` is the number of the frame that issued the command; it is negative before the start.
-    `ramp` is the share of the way from the previous command that is done at the beginning of the
-    span; 1 is the whole way. `duration` is in s, and `steps` is the number of integration steps.
+    `ramp` is the fraction of the ramp from the previous command that is done at the beginning of
+    the span; at 1, the command is constant. `duration` is in s, and `steps` is the number of
+    integration steps.
     """
 
     first: np.ndarray
@@ -68,8 +69,8 @@ def _schedule(
     steps_per_frame: int,
 ) -> CommandSchedule:
     earlier = [_delay(s, period) for s in before]
-    # the oldest command from before the run that can still arrive during the run
-    oldest = -max(whole for whole, _ in earlier) - 2
+    # the first command has a number so low that it arrives, and its ramp ends, before the run
+    oldest = -max(delay_frames for delay_frames, _ in earlier) - 2
     delays = [earlier[max(0, len(earlier) + n)] for n in range(oldest, 0)]
     delays += (
         [_delay(latency, period)] * frames
@@ -77,7 +78,7 @@ def _schedule(
         else [_delay(s, period) for s in latencies]
     )
     issued = enumerate(delays, oldest)
-    arrivals = _in_order([(frame + whole, rest) for frame, (whole, rest) in issued])
+    arrivals = _in_order([(frame + late, rest) for frame, (late, rest) in issued])
     ramp_ends = [(frame + 1, rest) for frame, rest in arrivals] if linear else []
     # spans begin at frames, at arrivals of commands, and at ends of ramps
     begins = sorted(
@@ -106,7 +107,9 @@ def _schedule(
         ramp=_fixed(ramp, float),
         duration=_fixed(duration, float),
         steps=_fixed(
-            [max(1, ceil(s / period * steps_per_frame - 1e-9)) for s in duration], np.intc
+            # the small number keeps rounding errors from adding a step
+            [max(1, ceil(s / period * steps_per_frame - 1e-9)) for s in duration],
+            np.intc,
         ),
     )
 
@@ -118,14 +121,15 @@ SAME_S = 1e-9
 def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run whose frames are at given times.
 
-    Commands issued before the run count as one period apart, the last one a period before the run.
+    Commands from before the run are taken as one period apart, the last one a period before the
+    run.
     """
     timing = problem.settings.timing
     times = problem.frame_times
     assert problem.written is not None
     period = problem.period
-    given = problem.start.latencies
-    before = np.array([timing.latency_s]) if given is None else given
+    start_latencies = problem.start.latencies
+    before = np.array([timing.latency_s]) if start_latencies is None else start_latencies
     late = np.full(len(times), timing.latency_s) if problem.latencies is None else problem.latencies
     # the oldest command from before the run also stands for all earlier ones
     old = np.arange(-len(before), 0)
@@ -140,7 +144,7 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     inside = np.concatenate([arrivals, arrivals + period] if linear else [arrivals])
     inside = inside[(inside > times[0]) & (inside < times[-1])]
     begins = np.unique(np.concatenate([times, inside]))
-    # an instant just before another one would only cost a step
+    # of two instants that count as one, only a frame or the later one begins a span
     kept = np.append(np.diff(begins) > SAME_S, True) | np.isin(begins, times)
     begins = begins[kept]
     newest = np.maximum(np.searchsorted(arrivals, begins, side="right") - 1, 0)
@@ -158,9 +162,7 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
 
 
 def acting_times(issued: np.ndarray, latencies: np.ndarray) -> np.ndarray:
-    """Times (frames,), s, at which commands act, for the times (frames,), s, at which they are
-    issued.
-    """
+    """Times (frames,) at which commands act, from those at which they are issued, s."""
     return np.array(_in_order((issued + latencies).tolist()), dtype=float)
 
 
@@ -174,11 +176,12 @@ def _delay(latency: float, period: float) -> Instant:
 
     The remainder is rounded, so that commands that arrive together have equal instants.
     """
-    whole = floor(latency / period + 1e-9)
-    return whole, max(0.0, round(latency - whole * period, 13))
+    frames = floor(latency / period + 1e-9)
+    return frames, max(0.0, round(latency - frames * period, 13))
 
 
 def _fixed(values: object, kind: type) -> np.ndarray:
+    """Read-only array."""
     array: np.ndarray = np.array(values, dtype=kind)
     array.setflags(write=False)
     return array

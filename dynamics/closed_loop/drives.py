@@ -107,16 +107,16 @@ class JointLaw(NamedTuple):
         """
         command, integral = self.held(torque, angle)
         by_gains = np.zeros((len(torque), len(JOINT_PID)))
-        none = gain_columns(by_gains, own_gains)
-        still = np.hstack([np.zeros_like(by_dynamic), none])
+        no_gains = gain_columns(by_gains, own_gains)
+        zeros = np.hstack([np.zeros_like(by_dynamic), no_gains])
         if self.integrates:
             li = self.li[:, None]
             by_gains = angle[:, None] * self.lx_by / li
             by_gains[:, 1] -= integral / self.li
-            return still, np.hstack([by_dynamic / li, gain_columns(by_gains, own_gains)])
+            return zeros, np.hstack([by_dynamic / li, gain_columns(by_gains, own_gains)])
         by_gains[:, 0] = (angle - command) / self.lp
         by_dynamic = by_dynamic / self.lp[:, None]
-        return np.hstack([by_dynamic, gain_columns(by_gains, own_gains)]), still
+        return np.hstack([by_dynamic, gain_columns(by_gains, own_gains)]), zeros
 
 
 def gain_columns(by_gains: np.ndarray, own_gains: bool) -> np.ndarray:
@@ -151,7 +151,8 @@ class Drives:
     command_scale : float
         Ratio s of the received to the sent commands.
     joint_zeros : tuple of float
-        Zero z of each joint, rad or m: what the joint reads too little. The default is no error.
+        Zero error z of each joint, rad or m: its true coordinate minus its reading. The default is
+        no error.
     command_step : float, optional
         Step q of the received commands, rad or m. The default is no steps.
 
@@ -201,9 +202,9 @@ class Drives:
             real("step of the commands", self.command_step, SimulationError, above=0)
 
     def zeros(self, joints: int) -> np.ndarray:
-        """Zero of each of a number of joints (n,), rad or m.
+        """Zero error of each joint (n,), rad or m.
 
-        Raises SimulationError if there are zeros of another number of joints.
+        Raises SimulationError if the drives have zeros of another number of joints.
         """
         if self.joint_zeros and len(self.joint_zeros) != joints:
             raise SimulationError(
@@ -212,9 +213,9 @@ class Drives:
         return np.array(self.joint_zeros) if self.joint_zeros else np.zeros(joints)
 
     def interface(self, joints: int) -> dict[str, float | np.ndarray]:
-        """Scale, step (0: none) and zeros (n,) of the received commands, in the form of kernels.
+        """Scale, step (0: none) and zeros (n,) of the received commands, for kernels.
 
-        Torques are commanded without an interface in between.
+        Drives that take torques receive them unchanged.
         """
         received = PID if self.torques else self
         return {
@@ -244,8 +245,8 @@ def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = No
     reads = np.array([float(gain in READS[name]) for gain in JOINT_PID])
     lp, li, ld = np.moveaxis(np.where(reads, gains, 0.0), -1, 0)
     if name != "cascade":
-        none = np.zeros_like(lp)
-        return JointLaw(lp, li, ld, none, 1.0, np.zeros_like(gains), reads, filter_time or 0.0)
+        zero = np.zeros_like(lp)
+        return JointLaw(lp, li, ld, zero, 1.0, np.zeros_like(gains), reads, filter_time or 0.0)
     lx = li * ld / lp
     return JointLaw(lp, li, ld, lx, 0.0, np.stack([-lx / lp, ld / lp, li / lp], axis=-1), reads)
 

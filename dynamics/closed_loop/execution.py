@@ -61,8 +61,9 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     commands = problem.commands
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
-    memory, record, plan, *_held = _set_up(problem, commands, compiled)
-    do = chosen(run_frames, compiled)
+    # the functions are kept until the run ends; see `_set_up`
+    memory, record, plan, *_functions = _set_up(problem, commands, compiled)
+    run_kernel = chosen(run_frames, compiled)
     # arrays instead of records, because passing a record costs Numba 8 us at every frame
     arrays = [part if part.ndim else part.base for part in memory]
     measured = np.full((frames, 6), np.nan)
@@ -76,7 +77,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
                 # the exception of a user's function is raised unchanged, with the frame as a note
                 error.add_note(f"at frame {first} of the closed loop")
                 raise
-        status, frame = do(*arrays, plan, record, first, last)
+        status, frame = run_kernel(*arrays, plan, record, first, last)
         if status:
             raise failure(problem, status, frame, memory.now, record)
     return _result(problem, record, measured, memory.now)
@@ -86,10 +87,10 @@ def run_repeats(
     problem: LoopProblem, noises: np.ndarray, compiled: bool = True
 ) -> list[ClosedLoopRun | LoopFailure]:
     """Do one run for each noise (runs, frames, 6) of the ideal sensor."""
-    found: list[ClosedLoopRun | LoopFailure] = []
-    for some in np.split(noises, range(LANES, len(noises), LANES)):
-        found += _run_together(problem, some, compiled)
-    return found
+    results: list[ClosedLoopRun | LoopFailure] = []
+    for group in np.split(noises, range(LANES, len(noises), LANES)):
+        results += _run_together(problem, group, compiled)
+    return results
 
 
 def _run_together(
@@ -101,10 +102,10 @@ def _run_together(
     runs = len(noises)
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
     # the noise of all runs is in one array, of which each run reads its own rows
-    every = _with_noise(problem, noises.reshape(-1, 6))
-    memory, record, plan, own, *_held = _set_up(every, commands, compiled, runs)
+    stacked = _with_noise(problem, noises.reshape(-1, 6))
+    memory, record, plan, functions, *_servo = _set_up(stacked, commands, compiled, runs)
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
-        memory.task[name] = own[name].address
+        memory.task[name] = functions[name].address
     lanes = empty("lanes", sizes)
     at = np.zeros((runs, 5), memory.evaluations.dtype)
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
@@ -113,17 +114,16 @@ def _run_together(
     # lanes without a run use the first state, so that their numbers are valid
     lanes.states = np.tile(memory.now.state[: 2 * sizes.coordinates], (LANES, 1)).T
     chosen(run_lanes, compiled)(memory.task, now, at, memory.tangent, plan, record, lanes)
-    found: list[ClosedLoopRun | LoopFailure] = []
+    results: list[ClosedLoopRun | LoopFailure] = []
+    unmeasured = np.full((frames, 6), np.nan)
     for lane, noise in enumerate(noises):
         rows = slice(lane * frames, (lane + 1) * frames)
-        one = type(record)(*[array[rows] for array in record])
+        run_record = type(record)(*[array[rows] for array in record])
         if status := int(now[lane].status):
-            found.append(failure(problem, status, int(now[lane].frame), now[lane], one))
+            results.append(failure(problem, status, int(now[lane].frame), now[lane], run_record))
         else:
-            found.append(
-                _result(_with_noise(problem, noise), one, np.full((frames, 6), np.nan), now[lane])
-            )
-    return found
+            results.append(_result(_with_noise(problem, noise), run_record, unmeasured, now[lane]))
+    return results
 
 
 def _set_up(
@@ -143,34 +143,34 @@ def _set_up(
 
 def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -> ClosedLoopRun:
     """Record of a run that was completed."""
-    found: dict[str, Any] = {
+    fields: dict[str, Any] = {
         name: array if array.size else None for name, array in record._asdict().items()
     }
-    found |= _poses(problem, found, measured)
+    fields |= _poses(problem, fields, measured)
     time = problem.frame_times.copy()
     events = int(now.events)
-    return ClosedLoopRun(time=time, **found, events=events, start=problem.start)
+    return ClosedLoopRun(time=time, **fields, events=events, start=problem.start)
 
 
-def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
+def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
     """Poses for the coordinates that the kernels have recorded."""
     chart = problem.robot.geometry.chart
     poses = {
-        "pose": chart.pose(found["pose"]),
-        "pose_rate": chart.lifted(found["pose_rate"]),
+        "pose": chart.pose(recorded["pose"]),
+        "pose_rate": chart.lifted(recorded["pose_rate"]),
         "measured": measured,
     }
     if problem.ideal is not None:
         noise = problem.ideal.noise
-        poses["measured"] = chart.pose(found["measured"])
-        poses["measured"][~found["measured_ok"]] = np.nan
+        poses["measured"] = chart.pose(recorded["measured"])
+        poses["measured"][~recorded["measured_ok"]] = np.nan
         if noise is not None and problem.sizes.coordinates < 6:
             poses["measured"] += chart.forbidden(
                 chart.pose(np.zeros(problem.sizes.coordinates)) + noise
             )
     for name in ("pose_sensitivity", "start_sensitivity", "command_sensitivity"):
-        if found[name] is not None:
-            poses[name] = chart.lifted(found[name], axis=1)
+        if recorded[name] is not None:
+            poses[name] = chart.lifted(recorded[name], axis=1)
     return poses
 
 
@@ -196,15 +196,15 @@ def _consult(
         state = now["state"]
         pose = chart.pose(state[:size])
         rate = chart.lifted(state[size : 2 * size]).copy()
-        given = (
+        value = (
             sensor.measure(frame, time, pose, rate)
             if isinstance(sensor, RateSensor)
             else sensor(frame, time, pose)
         )
-        record.measured_ok[frame] = given is not None
+        record.measured_ok[frame] = value is not None
         what = "value returned by the pose sensor"
         measured[frame] = (
-            np.nan if given is None else floats(what, given, (6,), error=SimulationError)
+            np.nan if value is None else floats(what, value, (6,), error=SimulationError)
         )
         record.measured[frame] = chart.coordinates(measured[frame])
     controller = problem.controller
@@ -231,15 +231,15 @@ def _with_noise(problem: LoopProblem, noise: np.ndarray) -> LoopProblem:
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
-    """Arrays that a run reads."""
+    """Arrays that a run reads, as the kernels need them."""
     ideal = problem.ideal or IDEAL
     start = problem.start
     chart = problem.robot.geometry.chart
     sizes = problem.sizes
-    slope = start.joint_integral_sensitivity
-    still = np.zeros((sizes.joints, sizes.parameters))
-    by_command = still if start.command_sensitivity is None else start.command_sensitivity
-    given = {
+    of_integral = start.joint_integral_sensitivity
+    zeros = np.zeros((sizes.joints, sizes.parameters))
+    by_command = zeros if start.command_sensitivity is None else start.command_sensitivity
+    arrays = {
         "reference": chart.coordinates(problem.reference.poses),
         "reference_rate": chart.coordinates(problem.reference.rates),
         "commands": commands,
@@ -249,11 +249,13 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if ideal.lost is None else np.ascontiguousarray(ideal.lost),
         "noise": np.zeros((0, 0)) if ideal.noise is None else chart.coordinates(ideal.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": (still if slope is None else slope)[:, problem.columns],
+        "start_integral_sensitivity": (zeros if of_integral is None else of_integral)[
+            :, problem.columns
+        ],
         "start_servo_sensitivity": _servo_sensitivity(problem, by_command)[:, problem.columns],
         "start_command_sensitivity": by_command[:, problem.columns],
     }
-    views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
+    views = {name: np.ascontiguousarray(array).view() for name, array in arrays.items()}
     # Numba compiles kernels for each array type, so all arrays have the same type: read-only
     for view in views.values():
         view.flags.writeable = False
@@ -278,7 +280,7 @@ def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarr
 def _fill(
     memory: Memory,
     problem: LoopProblem,
-    own: dict[str, MachineFunction],
+    functions: dict[str, MachineFunction],
     servo_jacobian: MachineFunction,
     addresses: dict[str, int],
 ) -> None:
@@ -289,9 +291,9 @@ def _fill(
     sizes = problem.sizes
     settings = problem.settings
     for name in MACHINE_CODE:
-        task[name] = own[name].address
-    for name, found in addresses.items():
-        task[name] = found
+        task[name] = functions[name].address
+    for name, kernel_address in addresses.items():
+        task[name] = kernel_address
     task.servo_jacobian = servo_jacobian.address
     rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
     law = settings.drives.joint_law(gains)
@@ -315,9 +317,9 @@ def _fill(
     task.rigid = rigid  # with elastic joints, without the inertia of the motors
     # indices of the parameters of rigid bodies that have a column of derivatives
     columns = problem.columns
-    shown = len(problem.columns) - 2 * sizes.joints - sizes.gains
-    task.shown = shown
-    task.pivots[:shown] = columns[:shown]
+    rigid_columns = len(problem.columns) - 2 * sizes.joints - sizes.gains
+    task.shown = rigid_columns
+    task.pivots[:rigid_columns] = columns[:rigid_columns]
     rest = np.zeros(sizes.joints)
     filtered = (
         rest[: sizes.filters]
@@ -342,14 +344,14 @@ def _fill(
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
     # the last inputs of a function are parameters and geometric numbers, which never change
-    for inputs, function, fixed in (
-        (now.known.inputs, own["equation_of_motion"], rigid),
+    for inputs, function, constants in (
+        (now.known.inputs, functions["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
-        (now.stages.inputs, own["stage_derivatives"], rigid),
-        (now.stopping.inputs, own["stop_derivatives"], rigid),
-        (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
+        (now.stages.inputs, functions["stage_derivatives"], rigid),
+        (now.stopping.inputs, functions["stop_derivatives"], rigid),
+        (now.pose_and_rate, functions["rate_map_derivative"], rigid[:0]),
     ):
-        last = np.concatenate([fixed, function.constants])
+        last = np.concatenate([constants, function.constants])
         end = sum(function.inputs)
         inputs[end - len(last) : end].T[...] = last
     # the motors come last in the state
@@ -366,10 +368,10 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
     """Addresses of the kernels that other kernels call by address, by name."""
     memory = empty_memory(sizes)
     arguments = memory.task, memory.now, memory.evaluations[0], memory.tangent, 0
-    lines = {kernel: getattr(kernel, "py_func", kernel) for kernel in CALLED}
+    functions = {kernel: getattr(kernel, "py_func", kernel) for kernel in CALLED}
     return {
-        line.__name__: address(kernel if compiled else line, *arguments)
-        for kernel, line in lines.items()
+        function.__name__: address(kernel if compiled else function, *arguments)
+        for kernel, function in functions.items()
     }
 
 

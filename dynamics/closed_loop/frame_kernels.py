@@ -218,8 +218,8 @@ def apply_command(
 ) -> None:
     """Let a command act.
 
-    `ramp` is the share of the way from the previous command to this one that is already done. A
-    share of 1 is the whole way.
+    `ramp` is the fraction of the ramp from the previous command that is already done. At 1, the
+    command is constant.
     """
     now.ramping = ramp < 1
     for i in range(len(now.command)):
@@ -292,11 +292,11 @@ def run_frames(
     first: int,
     last: int,
 ) -> tuple[int, int]:
-    """Run the frames from `first` up to, but not including, `last`. Return the status and its
-    frame.
+    """Run the frames from `first` up to, but not including, `last`.
 
-    The memory is passed as arrays of one record each. Passing a record from Python costs Numba 8
-    us, and a run that Python measures calls this function at every frame.
+    Returns the status and the frame that has it. The memory is passed as arrays of one record each,
+    because passing a record from Python takes 8 us, and a run with a sensor in Python calls this
+    function at every frame.
     """
     task = tasks[0]
     now = nows[0]

@@ -93,6 +93,7 @@ class FrictionLaw:
         least: float | None = None,
         unit: str = "",
     ) -> None:
+        """Raise SimulationError unless a constant is given for its law, and for no other."""
         value = getattr(self, constant)
         if self.name == law:
             real(
@@ -201,10 +202,10 @@ class JointElasticity:
         crank.
         """
         self._check_motors(robot, parameters)
-        free = robot.geometry.chart.basis
+        basis = robot.geometry.chart.basis
         n = robot.layout.joints
-        jacobian = robot.joint_jacobian(pose) @ free
-        mass = free.T @ robot.mass_matrix(pose, parameters[robot.layout.dynamic]) @ free
+        jacobian = robot.joint_jacobian(pose) @ basis
+        mass = basis.T @ robot.mass_matrix(pose, parameters[robot.layout.dynamic]) @ basis
         carried = mass - self.motor_inertia * jacobian.T @ jacobian
         per_inertia = np.zeros((2 * n, 2 * n))
         per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
@@ -226,11 +227,12 @@ class JointElasticity:
         )
 
     def _check_motors(self, robot: Robot, parameters: np.ndarray) -> None:
+        """Raise SimulationError if a motor has more inertia than the body that includes it."""
         layout = robot.layout
         bodies = layout.bodies_of(parameters)
         driven = [
-            leg.driven_inertia(bodies[of[0]])
-            for leg, of in zip(robot.geometry.legs, layout.of_leg, strict=True)
+            leg.driven_inertia(bodies[rows[0]])
+            for leg, rows in zip(robot.geometry.legs, layout.of_leg, strict=True)
         ]
         least = int(np.argmin(driven))
         if self.motor_inertia >= driven[least]:
@@ -238,14 +240,15 @@ class JointElasticity:
             unit = "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
                 f"motor inertia is {self.motor_inertia:g} {unit}, must be below the "
-                f"{driven[least]:.3g} {unit} of {name} about its axis, which include it"
+                f"{driven[least]:.3g} {unit} of {name} including its motor"
             )
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """Matrix (2 n, 2 n) of the springs between bodies and motors.
+    """Matrix (2 n, 2 n) of stiffnesses, or of dampings, of the coordinates of bodies and motors.
 
-    `at_motor` (n,) are the springs between the motors and the base.
+    `spring` is that between each body and its motor, and `at_motor` (n,) are those between the
+    motors and the base.
     """
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

@@ -1,7 +1,7 @@
-"""Kernels for several runs of one model at once. Each run is one lane, with its own measurements.
+"""Kernels for several runs of one model at once, each in one lane of the processor's vectors.
 
-Every run has its own modes, events and steps. The equation of motion, which all runs need again and
-again, is computed for all lanes together.
+Every run has its own measurements, modes, events and steps. The equation of motion takes most of
+the time, and is computed for all lanes together.
 """
 
 import numpy as np

@@ -11,11 +11,11 @@ def factorise(matrix: Array, size: int, factor: Array) -> None:
     """Factorise a symmetric matrix (size, size). See `accelerations.factored`."""
     for i in range(size):
         for j in range(i + 1):
-            left = matrix[i, j]
+            rest = matrix[i, j]
             for k in range(j):
-                left -= factor[i, k] * factor[k, j]
-            factor[j, i] = left
-            factor[i, j] = left * factor[j, j] if i > j else 1 / left
+                rest -= factor[i, k] * factor[k, j]
+            factor[j, i] = rest
+            factor[i, j] = rest * factor[j, j] if i > j else 1 / rest
 
 
 @part

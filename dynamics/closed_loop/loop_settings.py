@@ -12,7 +12,9 @@ from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 
 MAX_DELAY_FRAMES = 60
+"""Largest latency of a command, frames."""
 MAX_STEPS_PER_FRAME = 10_000
+"""Largest number of integration steps in a frame."""
 
 Hold = Literal["zero", "linear"]
 
@@ -234,7 +236,7 @@ class Reference:
     Parameters
     ----------
     poses, rates : array_like, shape (frames, 6)
-        Poses and pose rates at at least two frames.
+        Poses, m and rad, and pose rates, m/s and rad/s, of two frames or more.
 
     Raises
     ------

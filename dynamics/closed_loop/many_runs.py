@@ -158,7 +158,7 @@ def simulate_batch(
         True returns derivatives with respect to the parameters, as
         `closed_loop.differentiate_servo` does.
     start_sensitivities : bool
-        True returns these and the derivatives with respect to the start state.
+        True returns derivatives with respect to the parameters and the start state.
     workers : int, optional
         Number of threads. The default is one per core. Results do not depend on it.
 
@@ -189,25 +189,25 @@ def simulate_batch(
     shapes: tuple[Shape, Shape] = (width,), ("N", width)
     checked = floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False)
     vectors = np.atleast_2d(checked)
-    given = _listed("references", references, Reference)
-    begins: Sequence[StartState | None] = [None]
+    motions = _listed("references", references, Reference)
+    start_states: Sequence[StartState | None] = [None]
     if starts is not None:
-        begins = _listed("starts", starts, StartState)
+        start_states = _listed("starts", starts, StartState)
     by_start = flag("start_sensitivities", start_sensitivities, SimulationError)
     differentiated = flag("sensitivities", sensitivities, SimulationError) or by_start
-    lengths = (len(vectors), len(given), len(begins))
+    lengths = (len(vectors), len(motions), len(start_states))
     count = max(lengths)
     if not set(lengths) <= {1, count}:
-        of_starts = "" if starts is None else f" and {len(begins)} start states"
+        of_starts = "" if starts is None else f" and {len(start_states)} start states"
         raise SimulationError(
-            f"got {len(vectors)} parameter vectors and {len(given)} references{of_starts}; each "
+            f"got {len(vectors)} parameter vectors and {len(motions)} references{of_starts}; each "
             "number must be 1 or the number of runs"
         )
 
     def one(index: int) -> ClosedLoopRun:
         vector = vectors[index % len(vectors)]
-        reference = given[index % len(given)]
-        start = begins[index % len(begins)]
+        reference = motions[index % len(motions)]
+        start = start_states[index % len(start_states)]
         if differentiated:
             return differentiate_servo(
                 robot, vector, reference, settings, start=start, by_start=by_start
@@ -252,25 +252,22 @@ def _repeat(
     """Do a run of a problem for each noise. Raises SimulationError."""
     shape: Shape = ("N", problem.frames, 6)
     noises = floats("noises", noises, shape, error=SimulationError)
-    chosen = flag("compiled", compiled, SimulationError)
+    use_kernels = flag("compiled", compiled, SimulationError)
     # importing Numba takes time
     from dynamics.closed_loop.execution import run_repeats
 
-    return run_repeats(problem, noises, chosen)
+    return run_repeats(problem, noises, use_kernels)
 
 
 def _cores() -> int:
-    """Number of cores that this process may use.
-
-    If that is unknown, it is the number of all cores.
-    """
+    """Number of cores that this process may use, or of all cores if that is unknown."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[Item]:
-    """List of one item or of many. Raises SimulationError."""
+    """List of the items, or of the one item that is given. Raises SimulationError."""
     if isinstance(given, kind):
         return [given]
     check_type(name, given, Sequence, SimulationError)

@@ -2,8 +2,8 @@
 
 Each joint slips in one direction (mode +1 or -1) or sticks (mode 0). The drives give the torque of
 each joint for its command; see `drives` for the formula. A stuck joint has the friction torque that
-makes its acceleration zero. Which joints at rest stick follows from a problem of bounded friction
-torques. For friction and elastic joints see `joints`.
+makes its acceleration zero. A joint at rest sticks if this torque is below its breakaway torque.
+For friction and elastic joints see `joints`.
 """
 
 import numpy as np
@@ -163,7 +163,10 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
 
 @entry
 def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Compute all terms at the state and time of an evaluation that do not depend on the modes."""
+    """Compute all terms at the state and time of an evaluation that do not depend on the modes.
+
+    `d` and `k` are not used: all kernels that are called by address have the same arguments.
+    """
     status = know_motion(task, now.known, at.state[:])
     if status == OK:
         take_known(now.known, at)
@@ -236,12 +239,12 @@ def push(task: Record, now: Record, at: Record) -> None:
         motors = len(at.slope) - 2 * count
         copy(at.velocity[:], at.slope[motors : motors + count])
         for i in range(count):
-            left = at.net_torque[i] - at.spring[i]
-            at.slope[motors + count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
+            excess = at.net_torque[i] - at.spring[i]
+            at.slope[motors + count + i] = excess / task.motor_inertia if now.mode[i] != 0 else 0.0
             # a stuck motor does not turn, because its friction balances the remaining torque
             if now.mode[i] == 0:
-                at.stick_force[i] = left
-                at.net_torque[i] -= left
+                at.stick_force[i] = excess
+                at.net_torque[i] -= excess
 
 
 @kernel
@@ -325,8 +328,8 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     # the motors of elastic joints are not coupled
     if task.stiffness > 0:
         for i in joints:
-            left = at.torque[i] - at.spring[i]
-            now.mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
+            remaining = at.torque[i] - at.spring[i]
+            now.mode[i] = 0 if abs(remaining) < breakaway(task, i) else 1 if remaining >= 0 else -1
     if task.stiffness > 0 or len(joints) == 0:
         return OK
     hold_compliance(task, at, joints, 0)
@@ -342,14 +345,14 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     for _ in range(1000):
         change = 0.0
         for s in range(len(joints)):
-            push = dot(at.jacobian[joints[s]], free) + at.bias_acceleration[joints[s]]
+            acceleration = dot(at.jacobian[joints[s]], free) + at.bias_acceleration[joints[s]]
             for r in range(len(joints)):
-                push -= at.compliance[s, r] * at.force[r]
+                acceleration -= at.compliance[s, r] * at.force[r]
             # each joint gets the friction torque that would stop it, up to its limit
             limit = breakaway(task, joints[s])
-            wanted = min(max(at.force[s] + push / at.compliance[s, s], -limit), limit)
-            change = max(change, abs(wanted - at.force[s]))
-            at.force[s] = wanted
+            force = min(max(at.force[s] + acceleration / at.compliance[s, s], -limit), limit)
+            change = max(change, abs(force - at.force[s]))
+            at.force[s] = force
         if change < 1e-15:
             break
     for s in range(len(joints)):

@@ -68,8 +68,8 @@ class Sizes:
 class LoopProblem:
     """Checked arguments of one run, with its start state.
 
-    Frames are a period apart, or at `times` (frames,). At these, only the frames `written`
-    (frames,) issue a command, and the other rows of `commands` repeat the command before.
+    Frames are one period apart, or at `times` (frames,), s. With `times`, only frames for which
+    `written` (frames,) is True issue a command, and other rows of `commands` repeat the one before.
     """
 
     robot: Robot
@@ -130,7 +130,7 @@ class LoopProblem:
     @cached_property
     def sizes(self) -> Sizes:
         """Sizes of the robot's equation of motion."""
-        motion, known = (
+        motion, servo_motion = (
             robot.functions["equation_of_motion"] for robot in (self.robot, self.servo_robot)
         )
         return Sizes(
@@ -140,7 +140,9 @@ class LoopProblem:
             filters=motion.outputs[2][0] if self.settings.drives.filter_time else 0,
             gains=len(self.robot.layout.joint_pid_names),
             geometry=max(
-                MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(known.constants)
+                MOST_NUMBERS * motion.outputs[2][0],
+                len(motion.constants),
+                len(servo_motion.constants),
             ),
         )
 
@@ -222,10 +224,10 @@ def with_derivatives(
     directions: np.ndarray | None = None,
     start_directions: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Problem with derivatives, also along directions (frames, n, k) of its commands.
+    """Problem with derivatives, also along k directions (frames, n, k) of its commands.
 
-    start_directions (n, k): those of the commands from before the start. Raises SimulationError for
-    elastic joints, and for directions that do not fit.
+    `start_directions` (n, k) are those of the commands from before the start. Raises
+    SimulationError for elastic joints, and for directions of a wrong shape or number.
     """
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
@@ -233,16 +235,18 @@ def with_derivatives(
         raise SimulationError(
             "derivatives exist only for rigid joints: pass settings with elasticity=None"
         )
-    by_start = flag("by_start", by_start, SimulationError)
-    found = dataclasses.replace(
-        problem, sensitivities=True, start_sensitivities=by_start, groups=groups
+    derived = dataclasses.replace(
+        problem,
+        sensitivities=True,
+        start_sensitivities=flag("by_start", by_start, SimulationError),
+        groups=groups,
     )
     if directions is None:
-        return found
-    most = 0 if found.start_sensitivities else most_directions(problem.robot, groups)
+        return derived
+    most = 0 if derived.start_sensitivities else most_directions(problem.robot, groups)
     shape = problem.frames, problem.robot.layout.joints
     moved, before = checked_directions(directions, start_directions, shape, most)
-    return dataclasses.replace(found, directions=moved, start_directions=before)
+    return dataclasses.replace(derived, directions=moved, start_directions=before)
 
 
 def _problem(
@@ -274,8 +278,8 @@ def _problem(
         _check_latencies(settings.timing, "latency of frame", latencies)
     if start is None:
         # bytes, because arrays cannot be keys of a cache
-        known = parameters.tobytes(), reference.poses[0].tobytes()
-        start = _at_rest(robot, *known, settings, servo_robot, feedforward is not None)
+        key = parameters.tobytes(), reference.poses[0].tobytes()
+        start = _at_rest(robot, *key, settings, servo_robot, feedforward is not None)
     else:
         _check_start(robot, parameters, settings, start)
     problem = LoopProblem(

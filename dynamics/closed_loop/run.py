@@ -15,26 +15,27 @@ class ClosedLoopRun:
     """Record of a run, one row per frame.
 
     The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). The start state has s =
-    3 m + n entries, in the order of `StartState`. Fields without a value in this run are None.
+    3 m + n entries, in the order of `StartState`. Fields that the run does not have are None. Poses
+    are in m and rad, joints in rad or m.
 
     Attributes
     ----------
     time : ndarray, shape (frames,)
         Time, s.
     pose, pose_rate : ndarray, shape (frames, 6)
-        True pose and its time derivative.
+        True pose and its time derivative per second.
     torque : ndarray, shape (frames, n)
         Actuator torque or force, N m or N.
     command : ndarray, shape (frames, n)
-        Command that was issued, rad or m, or torque.
+        Issued command: a coordinate, rad or m, or a torque (N m or N) if drives take torques.
     measured : ndarray, shape (frames, 6)
         Measured pose, NaN if the measurement was lost.
     measured_ok : ndarray of bool, shape (frames,)
         False if the measurement was lost.
     joint_integral : ndarray, shape (frames, n)
-        Integral of the drives at the beginning of the frame.
+        Integral of the error of each drive, rad s or m s, at the beginning of the frame.
     servo_integral : ndarray, shape (frames, m)
-        Integral of the servo at the beginning of the frame.
+        Integral of the servo's error, m s or rad s, at the beginning of the frame.
     pose_sensitivity : ndarray, shape (frames, 6, p)
         Derivatives of the poses with respect to the parameters.
     start_sensitivity : ndarray, shape (frames, 6, s)
@@ -42,11 +43,11 @@ class ClosedLoopRun:
     command_sensitivity : ndarray, shape (frames, 6, k)
         Derivatives of the poses along k directions of the commands.
     end_sensitivity, end_start_sensitivity : ndarray, shapes (s, p) and (s, s)
-        The same derivatives of the state at the last frame.
+        Derivatives of the state at the last frame with respect to parameters and start state.
     motor_angle, motor_rate : ndarray, shape (frames, n)
-        Angle and rate of the motors of elastic joints.
+        Coordinate of the motors of elastic joints, and its rate.
     filtered_rate : ndarray, shape (frames, n)
-        Filtered rates of the errors in drives with a filter.
+        Rates of the errors in drives with a filter, after the filter.
     events : int
         Number of stick-slip events.
     start : StartState
@@ -93,10 +94,11 @@ class ClosedLoopRun:
         )
 
     def state_at(self, frame: int) -> StartState:
-        """State at a frame. A run that starts from it repeats the remaining frames of this run.
+        """State at a frame, from which a new run repeats the remaining frames of this run.
 
-        If latencies differ, the new run also needs the latencies of the earlier commands. Raises
-        SimulationError for a frame that the run does not have, or that follows a lost measurement.
+        If each frame has its own latency, the new run also needs those of the earlier commands.
+        Raises SimulationError for a frame that the run does not have, or that follows a lost
+        measurement.
         """
         frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
         if frame == 0:
@@ -124,7 +126,7 @@ class ClosedLoopRun:
 class LoopFailure(SimulationError):
     """Early end of a run at a frame.
 
-    `saturated` is the number of earlier frames in which an actuator was at its largest torque.
+    `saturated` is the number of frames before the failure with a saturated actuator.
     """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:
@@ -134,6 +136,9 @@ class LoopFailure(SimulationError):
 
 
 def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
-    """Number of frames with a torque (frames, n) at the limit, N m or N. None means no limit."""
+    """Number of frames in which a torque (frames, n) is at the limit, N m or N.
+
+    None means no limit.
+    """
     # the kernels limit torques up to rounding errors
     return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

@@ -22,14 +22,14 @@ from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.closed_loop.problem import LoopProblem, Sizes
 from dynamics.parameters import LANES, room_for_derivatives
 
-LINE = 64
+CACHE_LINE = 64
 """Bytes in a line of the processor's cache."""
 
 
 class Plan(NamedTuple):
     """Arrays that a run reads at its frames, with one row per frame.
 
-    Arrays that are not given have no rows.
+    Optional arrays that are missing have no rows.
     """
 
     reference: np.ndarray
@@ -136,8 +136,8 @@ def integers(names: str, *dimensions: str) -> Fields:
     return Fields(names, "i8", dimensions)
 
 
-def part(name: str) -> Fields:
-    """Field that is itself a record, with the layout of its name."""
+def record_field(name: str) -> Fields:
+    """Field that is itself a record, whose layout has the same name."""
     return Fields(name, "record", ())
 
 
@@ -148,7 +148,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         integers("response stage_derivatives stop_derivatives rate_map_derivative"),
         integers("slope_derivative servo_jacobian"),
         integers("evaluate_terms evaluate decide_modes stop_joints slope_tangent stop_tangent"),
-        # what the run computes, and who measures
+        # switches: derivatives, servo with the robot's geometry, measurements from Python
         integers("sensitivities servo_knows measured"),
         # law of the drives, with its gains
         reals("lp li ld lx", "joint"),
@@ -169,13 +169,13 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         integers("pivots", "rigid"),
         reals("rigid", "rigid"),
         reals("coulomb viscous", "joint"),
-        part("friction"),
+        record_field("friction"),
     ),
     "now": (
-        part("stages"),
-        part("known"),
-        part("served"),
-        part("stopping"),
+        record_field("stages"),
+        record_field("known"),
+        record_field("served"),
+        record_field("stopping"),
         # joints: -1, 0 (stuck) or 1 for the direction of slip; the numbers of the stuck joints
         integers("mode stuck", "joint"),
         # counters and switches
@@ -340,12 +340,11 @@ def empty_memory(sizes: Sizes) -> Memory:
 
 
 def empty(name: str, sizes: Sizes) -> Any:
-    """Record filled with zeros that begins at the beginning of a cache line.
+    """Record filled with zeros that begins at the beginning of a line of the processor's cache.
 
-    A vector instruction on its fields then accesses one line of the processor's cache instead of
-    two.
+    A vector instruction on its fields then accesses one line instead of two.
     """
     kind = record_type(name, sizes)
-    room = np.zeros(kind.itemsize + LINE, np.uint8)
-    first = -room.ctypes.data % LINE
-    return room[first : first + kind.itemsize].view(kind)[0]
+    space = np.zeros(kind.itemsize + CACHE_LINE, np.uint8)
+    first = -space.ctypes.data % CACHE_LINE
+    return space[first : first + kind.itemsize].view(kind)[0]

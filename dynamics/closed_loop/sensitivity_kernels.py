@@ -40,8 +40,10 @@ from dynamics.compiled.kernel import (
 )
 from dynamics.parameters import LANES
 
+# Runge-Kutta method: time of each stage as a fraction of the step, and weight of its slope
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+# index of the evaluation at the end of a step
 END = 4
 # rate of the margin, rad/s^2 or N m/s, below which the time of an event has no derivative
 NO_APPROACH = 1e-9
@@ -51,13 +53,13 @@ NO_APPROACH = 1e-9
 def ask_derivatives(now: Record, at: Record, k: int) -> None:
     """Copy an evaluation to stage `k` of the inputs of `differentiate_stages`."""
     size = len(at.bias)
-    given = now.stages.inputs
+    inputs = now.stages.inputs
     for j in range(2 * size):
-        given[j, k] = at.state[j]
+        inputs[j, k] = at.state[j]
     for j in range(size):
-        given[2 * size + j, k] = at.slope[size + j]
+        inputs[2 * size + j, k] = at.slope[size + j]
     for i in range(len(now.mode)):
-        given[3 * size + i, k] = at.net_torque[i]
+        inputs[3 * size + i, k] = at.net_torque[i]
 
 
 @kernel
@@ -69,27 +71,27 @@ def differentiate_stages(task: Record, now: Record) -> None:
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
     """Copy the values, beside the equation of motion, that all columns of a slope need."""
-    known = now.stages
+    stages = now.stages
     size = len(at.bias)
     for i in range(size):
         for j in range(size):
-            known.factor[i, j, k] = at.factor[i, j]
+            stages.factor[i, j, k] = at.factor[i, j]
     filtering = task.filter_time > 0
     for i in range(len(now.mode)):
         mode = now.mode[i]
         slips = now.mode[i] != 0
         law = follows_law(task, at, i)
-        known.by_error[i, k] = law * (task.lp[i] + task.lx[i])
-        known.by_integral[i, k] = law * task.li[i]
-        known.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld[i]
-        known.damping[i, k] = 0.0 if filtering else law * task.ld[i]
+        stages.by_error[i, k] = law * (task.lp[i] + task.lx[i])
+        stages.by_integral[i, k] = law * task.li[i]
+        stages.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld[i]
+        stages.damping[i, k] = 0.0 if filtering else law * task.ld[i]
         if slips:
-            known.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(
+            stages.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(
                 task.friction, at.velocity[i], mode
             )
         for j in range(size):
-            known.jacobian[i, j, k] = at.jacobian[i, j]
-            known.pushing[i, j, k] = at.jacobian[i, j] if slips else 0.0
+            stages.jacobian[i, j, k] = at.jacobian[i, j]
+            stages.pushing[i, j, k] = at.jacobian[i, j] if slips else 0.0
 
 
 @kernel
@@ -132,7 +134,11 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
 
 @kernel
 def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes of filtered rates, which precede the torques in `d.k[k]`."""
+    """Differentiate the slopes of filtered rates, which precede the torques in `d.k[k]`.
+
+    The derivative of the velocity of a crank with respect to the pose is half of `crank_by_rate`,
+    the derivative of its acceleration with respect to the pose rate.
+    """
     size = len(at.bias)
     count = len(now.mode)
     width = now.width
@@ -157,22 +163,25 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit."""
+    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit.
+
+    For the factor 0.5 see `filtered_tangent`.
+    """
     size = len(at.bias)
     width = now.width
-    known = now.stages
+    stages = now.stages
     for i in range(len(now.mode)):
         if winds_up(task, at, i):
             lp = task.shown + 2 * len(now.mode) + task.gain_step * i
             row = d.k[k, 2 * size + i]
-            share = task.lx[i] / task.li[i]
+            ratio = task.lx[i] / task.li[i]
             fill(row, 0.0)
             for j in range(size):
-                add_row(0.5 * share * known.crank_by_rate[i, j, k], d.trial[j], row, width)
-                add_row(share * at.jacobian[i, j], d.trial[size + j], row, width)
+                add_row(0.5 * ratio * stages.crank_by_rate[i, j, k], d.trial[j], row, width)
+                add_row(ratio * at.jacobian[i, j], d.trial[size + j], row, width)
             for gain in range(3):
                 row[lp + gain] += task.lx_by[i, gain] / task.li[i] * at.velocity[i]
-            row[lp + 1] -= share / task.li[i] * at.velocity[i]
+            row[lp + 1] -= ratio / task.li[i] * at.velocity[i]
 
 
 @entry
@@ -186,7 +195,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     size = len(at.bias)
     count = len(now.mode)
     width = now.width
-    known = now.stages
+    stages = now.stages
     pose = d.trial[:size]
     rate = d.trial[size : 2 * size]
     acceleration = d.k[k, size : 2 * size]
@@ -198,7 +207,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
             add_row(at.time, d.command_slope[i], d.acting[i], width)
             add_row(now.command_slope[i], d.stage_time[:], d.acting[i], width)
     fixed_state_tangent(task, now, at, d, k)
-    call_columns(task.slope_derivative, known.by_pose[0, 0, k:], d.trial, d.k[k], width)
+    call_columns(task.slope_derivative, stages.by_pose[0, 0, k:], d.trial, d.k[k], width)
     if task.filter_time > 0:
         filtered_tangent(task, now, at, d, k)
     if task.torque_limit > 0:
@@ -209,8 +218,8 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     clear(d.force[:], width)
     for s in range(len(stuck)):
         for j in range(size):
-            add_row(known.crank_by_pose[stuck[s], j, k], pose[j], d.force[s], width)
-            add_row(known.crank_by_rate[stuck[s], j, k], rate[j], d.force[s], width)
+            add_row(stages.crank_by_pose[stuck[s], j, k], pose[j], d.force[s], width)
+            add_row(stages.crank_by_rate[stuck[s], j, k], rate[j], d.force[s], width)
             add_row(at.jacobian[stuck[s], j], acceleration[j], d.force[s], width)
     give_back(at, d, len(stuck), acceleration, width)
     for s in range(len(stuck)):
@@ -332,8 +341,8 @@ def step_tangent(
         try_tangent(now, d)
         if k > 0:
             move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:], 0)
-            late = len(d.trial)
-            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - late], late)
+            first = len(d.trial)
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - first], first)
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
         invoke(task.slope_tangent, task, now, at[k], d, k)
@@ -350,26 +359,26 @@ def step_tangent(
 def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Differentiate the stop of joints, which changed the pose rate by `now.change`.
 
-    At them M change = -J^T impulse (`at.force`) and J rate = 0 hold, which are differentiated.
+    Differentiated are M change = -J^T impulse (`at.force`), and J rate = 0 of the stopped joints.
     """
     size = len(at.bias)
     width = now.width
-    known = now.stopping
+    stopping = now.stopping
     stuck = now.stuck[: count_stuck(now)]
     pose = d.x[:size]
     rate = d.x[size : 2 * size]
-    copy(now.state[:size], known.inputs[:size])
-    copy(now.change[:], known.inputs[size : 2 * size])
-    impulse = known.inputs[2 * size : 2 * size + len(now.mode)]
+    copy(now.state[:size], stopping.inputs[:size])
+    copy(now.change[:], stopping.inputs[size : 2 * size])
+    impulse = stopping.inputs[2 * size : 2 * size + len(now.mode)]
     fill(impulse, 0.0)
     for s in range(len(stuck)):
         impulse[stuck[s]] = -at.force[s]
-    call(task.stop_derivatives, known.inputs, known.by_pose)
+    call(task.stop_derivatives, stopping.inputs, stopping.by_pose)
     clear(d.moved[:], width)
     for i in range(size):
         for k in range(task.shown):
-            d.moved[i, k] = -known.columns[i, task.pivots[k]]
-    add_product(-1.0, known.by_pose, pose, d.moved[:], width)
+            d.moved[i, k] = -stopping.columns[i, task.pivots[k]]
+    add_product(-1.0, stopping.by_pose, pose, d.moved[:], width)
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):
         add_row(1.0, d.moved[j], rate[j], width)

@@ -127,8 +127,8 @@ def simulate_commands(
         Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
         of NaN issues no command.
     times : ndarray, shape (frames,), optional
-        Increasing times of the frames, s. The default is equal periods from zero on. The rate of a
-        command is its change in one period of the timing.
+        Increasing times of the frames, s. The default is equal periods from zero on. The drives
+        take the change from the command before, over one period of the timing, as the rate.
 
     Returns
     -------
@@ -225,17 +225,17 @@ def differentiate_servo(
     robot, parameters, reference, settings, start, feedforward, latencies, compiled
         As for `simulate_servo`. The joints must be rigid.
     sensor : IdealSensor
-        Ideal sensor. Its measured poses depend on the parameters, which is differentiated, too.
+        Ideal sensor. Derivatives include the effect of the parameters on the measured poses.
     by_start : bool
         True returns derivatives with respect to the start state, too.
     groups : RigidGroups, optional
         Groups of inertial parameters on which the motion depends. Derivatives are then computed
         only for the pivots of the groups and for all other parameters, which is faster.
-        `groups.of_all` extends them to all parameters. This is not valid with a start whose own
-        sensitivities do not depend on the groups alone.
+        `groups.of_all` extends them to all parameters. Groups are not valid with a start whose own
+        sensitivities depend on more than the groups.
     directions : ndarray, shape (frames, n, k), optional
-        Directions of the feedforward along which the poses are differentiated, too, at most
-        `most_directions`. They are not combined with `by_start`.
+        Directions of the feedforward along which the poses are also differentiated, at most
+        `most_directions`. They cannot be combined with `by_start`.
 
     Returns
     -------

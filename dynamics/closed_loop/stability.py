@@ -28,8 +28,8 @@ SLOWEST_HZ = 0.5
 MOST_GAIN = 100.0
 """Largest factor of the gains in the search for the limit of stability."""
 
-STEP = 1.1
-"""Ratio of consecutive values in these searches. The limit is then found by bisection."""
+SEARCH_RATIO = 1.1
+"""Ratio of consecutive values in both searches, before bisection finds the limit."""
 
 
 def frame_map(
@@ -41,7 +41,7 @@ def frame_map(
     measured at the last frame, the servo integrals, and the commands that have not yet arrived, the
     latest first. Raises the same errors as `closed_loop.equilibrium`.
     """
-    return _frame_map(_near_rest(robot, parameters, pose, settings.drives), settings)
+    return _state_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
 def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.ndarray) -> float:
@@ -64,59 +64,64 @@ def pose_response(
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
-    map_, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
-    one = np.eye(len(map_))
+    state_map, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
+    identity = np.eye(len(state_map))
     period = 1 / settings.timing.frame_rate_hz
 
     def response(frequency: float) -> np.ndarray:
-        return np.linalg.solve(np.exp(1j * frequency * period) * one - map_, by_desired)[:size]
+        shift = np.exp(1j * frequency * period)
+        return np.linalg.solve(shift * identity - state_map, by_desired)[:size]
 
     return response
 
 
-def _frame_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
+def _state_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
+    """Map (s, s) of `frame_map`."""
     return _with_desired(robot, settings)[:, : -robot.jacobian.shape[1]]
 
 
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """Frame map (s, s), and the effect (s, m) of the desired coordinates at the frame."""
+    """Map (s, s) of `frame_map`, then the effect (s, m) of the desired coordinates at the frame.
+
+    Every quantity in this function is a matrix that acts on the state and the desired coordinates.
+    """
     joints, size = robot.jacobian.shape
     timing = settings.timing
     period = 1 / timing.frame_rate_hz
     servo = _servo(robot, settings)
-    # the small number keeps a latency of whole frames from rounding down to one frame less
-    whole = floor(timing.latency_s / period + 1e-9)
-    rest = max(0.0, timing.latency_s - whole * period)
+    # the small number keeps rounding errors from shortening a latency by one frame
+    late_frames = floor(timing.latency_s / period + 1e-9)
+    late_s = max(0.0, timing.latency_s - late_frames * period)
     inner = len(robot.motion) - 3 * joints
-    kept = whole + 2
-    states = inner + 2 * size + kept * joints
+    held_count = late_frames + 2
+    states = inner + 2 * size + held_count * joints
     start = np.eye(states, states + size)
     desired = np.eye(size, states + size, states)
     coordinates = start[:size] - desired
     integral = start[inner + size : inner + 2 * size]
-    seen = np.vstack([coordinates, start[inner : inner + size], integral])
+    servo_inputs = np.vstack([coordinates, start[inner : inner + size], integral])
     # without an integral, the demand of the servo at rest is zero, and so is its derivative
     turning = robot.turning if settings.servo.ki else 0 * robot.turning
     turned = turning @ start[:size]
-    commands = [servo @ seen + turned, *np.split(start[inner + 2 * size :], kept)]
+    commands = [servo @ servo_inputs + turned, *np.split(start[inner + 2 * size :], held_count)]
     state = start[:inner]
-    # within a frame, the older command acts until the newer one arrives after `rest`
-    for age, begin, end in ((whole + 1, 0.0, rest), (whole, rest, period)):
+    # within a frame, the older command acts until the newer one arrives after `late_s`
+    for age, begin, end in ((late_frames + 1, 0.0, late_s), (late_frames, late_s, period)):
         newer = commands[age]
-        older = commands[age + 1] if age + 1 <= kept else commands[age]
+        older = commands[age + 1] if age + 1 <= held_count else commands[age]
         ramp = (
-            (begin + (period - rest if age > whole else -rest)) / period
+            (begin + (period - late_s if age > late_frames else -late_s)) / period
             if timing.hold == "linear"
             else 1.0
         )
         slope = (newer - older) / period
-        at_once = older + ramp * (newer - older)
+        at_begin = older + ramp * (newer - older)
         moving = slope if timing.hold == "linear" else 0 * slope
         scale = settings.drives.command_scale
         state = expm(robot.motion * (end - begin))[:inner] @ np.vstack(
-            [state, scale * at_once, scale * moving, scale * slope]
+            [state, scale * at_begin, scale * moving, scale * slope]
         )
-    return np.vstack([state, coordinates, integral - period * coordinates, *commands[:kept]])
+    return np.vstack([state, coordinates, integral - period * coordinates, *commands[:held_count]])
 
 
 def spectral_radius(
@@ -167,15 +172,15 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
     arguments = robot, parameters, settings, pose
     radius = spectral_radius(*arguments)
     hz = settings.timing.frame_rate_hz
-    said = (
+    eigenvalue_text = (
         f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, must be "
         "below 1"
     )
     if radius < 1:
-        return f"{said}: it is stable near the start, and becomes unstable far from it"
+        return f"{eigenvalue_text}: it is stable near the start, and becomes unstable far from it"
     rate = lowest_frame_rate(*arguments)
-    instead = f"stable from {rate:.3g} Hz on" if rate > 0 else "stable at no frame rate"
-    return f"{said}: the loop is unstable at {hz:g} Hz, and {instead}"
+    elsewhere = f"stable from {rate:.3g} Hz on" if rate > 0 else "stable at no frame rate"
+    return f"{eigenvalue_text}: the loop is unstable at {hz:g} Hz, and {elsewhere}"
 
 
 class _NearRest(NamedTuple):
@@ -192,19 +197,21 @@ class _NearRest(NamedTuple):
 
 
 def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: Drives) -> _NearRest:
+    """Robot near rest at a pose (6,). Raises the same errors as `closed_loop.equilibrium`."""
     parameters = checked_loop_parameters(robot, parameters, drives.law)
     check_start_pose(robot, parameters, pose)
     jacobian = robot.coordinate_jacobian(pose)
     law = drives.joint_law(robot.layout.split(parameters)[3])
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
-    held = law.held(holding, robot.inverse_kinematics(pose))[0]
-    demand = np.linalg.solve(jacobian, drives.sent(held))
+    command = law.held(holding, robot.inverse_kinematics(pose))[0]
+    demand = np.linalg.solve(jacobian, drives.sent(command))
     (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
     return _NearRest(_joint_loop(robot, parameters, pose, law), jacobian, turning)
 
 
 def _radius(robot: _NearRest, settings: LoopSettings) -> float:
-    return float(np.abs(np.linalg.eigvals(_frame_map(robot, settings))).max())
+    """Largest magnitude of the eigenvalues of the map from frame to frame."""
+    return float(np.abs(np.linalg.eigvals(_state_map(robot, settings))).max())
 
 
 def _joint_loop(
@@ -286,11 +293,12 @@ def torque_motion(
     by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, rest, rest, holding, rigid)
     damped = by_rate + jacobian.T @ (viscous[:, None] * jacobian)
     push = np.linalg.solve(mass, jacobian.T)
-    below = -np.linalg.solve(mass, np.hstack([by_pose, damped]))
-    return np.vstack([np.eye(len(q), 2 * len(q), len(q)), below]), push
+    accelerations = -np.linalg.solve(mass, np.hstack([by_pose, damped]))
+    return np.vstack([np.eye(len(q), 2 * len(q), len(q)), accelerations]), push
 
 
 def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
+    """Outputs of a function of the robot for one set of inputs."""
     return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
 
 
@@ -306,9 +314,9 @@ def last_stable(
     stable = radius(start) < 1
     value = start
     end = stable_end if stable else other_end
-    step = STEP if end > start else 1 / STEP
-    while (value < end) == (step > 1):
-        following = value * step
+    ratio = SEARCH_RATIO if end > start else 1 / SEARCH_RATIO
+    while (value < end) == (ratio > 1):
+        following = value * ratio
         if (radius(following) < 1) != stable:
             low = value
             high = following

@@ -11,47 +11,36 @@ from dynamics.closed_loop.loop_settings import ServoGains
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
-OPTIONAL = (
-    *(
-        "joint_integral_sensitivity",
-        "command_sensitivity",
-        "motor_angle",
-        "motor_rate",
-        "filtered_rate",
-    ),
-    "latencies",
-)
-
 
 @dataclass(frozen=True)
 class StartState:
     """State of the loop at the first frame, before that frame is measured.
 
-    The robot has n joints, m coordinates and p parameters. `start_sensitivity` has the derivatives
-    with respect to the first four entries, in which coordinates replace poses.
+    The robot has n joints, m coordinates and p parameters. `ClosedLoopRun.start_sensitivity` has
+    derivatives with respect to the first four entries, in which coordinates replace poses.
 
     Parameters
     ----------
     pose, pose_rate : array_like, shape (6,)
-        Pose of the platform and its time derivative.
+        Pose of the platform, m and rad, and its time derivative.
     joint_integral : array_like, shape (n,)
-        Integral of the drives, rad s or m s.
+        Integral of the error of each drive, rad s or m s.
     servo_integral : array_like, shape (m,)
-        Integral of the servo, m s and rad s.
+        Integral of the servo's error, m s and rad s.
     commands : array_like, shape (k, n)
-        Commands issued before this frame, rad or m. The oldest is first. It also stands for all
-        earlier commands.
+        Commands issued before this frame, rad or m, the oldest first. The oldest also stands for
+        all earlier commands.
     last_measured : array_like, shape (6,)
-        Pose measured one frame before.
+        Pose measured one frame before, m and rad.
     joint_integral_sensitivity, command_sensitivity : array_like, shape (n, p), optional
         Derivatives of the joint integral and of the commands with respect to the parameters. The
         default is zero. The derivatives of the servo integral follow from those of the commands.
     motor_angle, motor_rate : array_like, shape (n,), optional
-        State of the motors of elastic joints.
+        Coordinate of the motors of elastic joints, rad or m, and its rate.
     filtered_rate : array_like, shape (n,), optional
-        Filtered rates of the errors in drives with a filter. The default is zero.
+        Rates of the errors in drives with a filter, after the filter. The default is zero.
     latencies : array_like, shape (k,), optional
-        Latencies of the commands issued before, s. The default is the latency of the timing.
+        Latencies of `commands`, s. The default is the latency of the timing.
 
     Raises
     ------
@@ -84,8 +73,8 @@ class StartState:
         shapes = poses | dict.fromkeys(
             ("commands", "joint_integral_sensitivity", "command_sensitivity"), ("N", "N")
         )
-        for name in self.__dataclass_fields__:
-            if getattr(self, name) is None and name in OPTIONAL:
+        for name, field in self.__dataclass_fields__.items():
+            if getattr(self, name) is None and field.default is None:
                 continue
             array = floats(
                 f"start {name}",
@@ -113,10 +102,10 @@ class StartState:
         )
         wanted |= {"latencies": (len(self.commands),)}
         for name, shape in wanted.items():
-            found = getattr(self, name)
-            if found is not None and found.shape != shape:
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
                 raise SimulationError(
-                    f"start {name} of {robot.name} must have shape {shape}, got {found.shape}"
+                    f"start {name} of {robot.name} must have shape {shape}, got {array.shape}"
                 )
 
 
@@ -143,7 +132,7 @@ def checked_loop_parameters(
 
 def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
     """Raise UnreachablePoseError or SingularPoseError for a pose (6,) at which no run can start."""
-    # Both calls can raise an error. The second one raises it for singular Euler angles.
+    # both calls can raise an error, the second one for singular Euler angles
     robot.static_torque(pose, parameters[robot.layout.dynamic])
     robot.pose_rate(pose, np.zeros(6))
 
@@ -171,7 +160,7 @@ def equilibrium(
     pose : array_like, shape (6,)
         Pose of the platform.
     servo : ServoGains
-        Gains of the servo, whose integral gives the command.
+        Gains of the servo. At rest, its integral gives the command.
     servo_robot : Robot, optional
         Robot whose kinematics the servo uses. The default is `robot`.
     elasticity : JointElasticity, optional
@@ -218,17 +207,25 @@ def equilibrium(
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
-    held, integral = law.held(torque, angles)
-    command = drives.sent(held)
+    received, integral = law.held(torque, angles)
+    command = drives.sent(received)
     by_command, by_integral = law.held_by_parameters(
         torque, angles, torque_map, robot.layout.own_gains
     )
-    known = servo_robot or robot
+    kinematics = servo_robot or robot
     servo_integral = np.zeros(len(chart.freedoms))
     # the command comes from the servo's integral, unless it comes from a feedforward
     if servo.ki and not fed_forward:
-        servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), command) / servo.ki
-    moving = by_command / drives.command_scale if by_command.any() else None
+        servo_integral = np.linalg.solve(kinematics.coordinate_jacobian(pose), command) / servo.ki
+    by_parameters = by_command / drives.command_scale if by_command.any() else None
     return StartState(
-        pose, rest, integral, servo_integral, command[None], pose, by_integral, moving, **motors
+        pose,
+        rest,
+        integral,
+        servo_integral,
+        command[None],
+        pose,
+        by_integral,
+        by_parameters,
+        **motors,
     )

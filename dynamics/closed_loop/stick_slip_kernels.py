@@ -25,11 +25,11 @@ from dynamics.closed_loop.sensitivity_kernels import (
 )
 from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
-MAX_EVENTS_PER_SEGMENT = 400
-# margin that counts as zero, in rad/s or as a share of the breakaway torque
+MAX_EVENTS_PER_SPAN = 400
+# margin that counts as zero, in rad/s or as a fraction of the breakaway torque
 NO_MARGIN = 1e-12
-# rounding error of the margin of a stuck joint, as a share of the breakaway torque
-LITTLE_SHARE = 1e-13
+# rounding error of the margin of a stuck joint, as a fraction of the breakaway torque
+TORQUE_ROUNDING = 1e-13
 
 
 TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
@@ -104,15 +104,15 @@ def crossing(now: Record, count: int) -> float:
     """
     length = now.tried
     margin = now.tried_margin
-    found = now.tried_crossing
+    estimate = now.tried_crossing
     for i in range(count):
-        found[i] = length[i]
+        estimate[i] = length[i]
     # Neville's scheme evaluates the polynomial at a margin of zero.
     for order in range(1, count):
         for i in range(count - order):
-            apart = margin[i] - margin[i + order]
-            found[i] = (margin[i] * found[i + 1] - margin[i + order] * found[i]) / apart
-    return found[0]
+            span = margin[i] - margin[i + order]
+            estimate[i] = (margin[i] * estimate[i + 1] - margin[i + order] * estimate[i]) / span
+    return estimate[0]
 
 
 @kernel
@@ -170,7 +170,8 @@ def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
 def ask_between(now: Record, length: float) -> None:
     """Request a step to the estimated event.
 
-    If the estimate is outside the bracket, or if the search is slow, the step goes to the middle.
+    If the estimate is outside the bracket, or after 40 estimates, the step goes to the middle. (The
+    first estimate is trial 3.)
     """
     if now.trials > 43 or not now.low < length < now.high:
         length = 0.5 * (now.low + now.high)
@@ -179,9 +180,7 @@ def ask_between(now: Record, length: float) -> None:
 
 @kernel
 def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Use the step that was tried, half as long as the bracket, as the beginning or end of the
-    bracket.
-    """
+    """Make the step that was tried, half as long as the bracket, an end of the bracket."""
     now.trials += 1
     if margin > 0:
         now.low = now.length
@@ -195,7 +194,10 @@ def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: floa
 
 @kernel
 def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Accept a step to the estimated event, or request another one if the estimate improves."""
+    """Accept a step to the estimated event, or request another one if the estimate improves.
+
+    After 40 estimates and 40 steps to the middle of the bracket, the step is accepted.
+    """
     tried = now.length
     if margin > 0:
         now.low = tried
@@ -204,11 +206,11 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
     remember(now, tried, margin)
     better = crossing(now, min(now.trials, len(now.tried)))
     holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
-    little = LITTLE_SHARE if holds else 0.0
+    negligible = TORQUE_ROUNDING if holds else 0.0
     # because of rounding, a bracket cannot become shorter than this
     near = min(abs(better - tried), now.high - now.low) <= 1e-15 + 1e-13 * now.cut
     now.trials += 1
-    if abs(margin) <= little or near or now.trials == 83:
+    if abs(margin) <= negligible or near or now.trials == 83:
         return take_step(task, now, at, d, True, True)
     ask_between(now, better)
     return OK
@@ -348,7 +350,7 @@ def begin_span(
     if now.start_moves:
         rest_tangent(task, now, start, d)
     now.start_moves = 0
-    now.events_left = MAX_EVENTS_PER_SEGMENT
+    now.events_left = MAX_EVENTS_PER_SPAN
     now.duration = duration
     now.steps = steps
 

@@ -9,6 +9,7 @@ from dynamics.compiled.lanes import (
     Graph,
     Group,
     Node,
+    Operand,
     PartedFunction,
     graph_of,
     lane_groups,
@@ -64,12 +65,14 @@ class FunctionBody:
         self._name = last.name()
         self._sizes = shapes(function)
         self.own_inputs = _inputs(function)
+        # number of input sets that are computed side by side, in one vector for each value
         self._beside = function.side_by_side if isinstance(function, PartedFunction) else 1
         self._number = type_name(self._beside)
         self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
         self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
         self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
         self._count = 0
+        # vectors that have been written, by their entries or by their line of code
         self._vectors = dict[tuple[str, ...], str]()
         self._lines: list[str] = []
         # name of the bit (i1) for each number that is a condition
@@ -104,12 +107,12 @@ class FunctionBody:
         """Columns of all parts, group by group."""
         graph = self._quickened(graph_of(function.parts, function.constants))
         values = GraphValues(self, graph, [])
-        columns = [[""] * len(of) for of in graph.outputs]
+        columns = [[""] * len(outputs) for outputs in graph.outputs]
         for group in lane_groups(graph):
-            for some in group.split(max(1, MOST_LANES // self._beside)):
-                width = lanes_for(len(some.lanes))
-                for row, vector in enumerate(self._group(some, values, width)):
-                    for lane, part in enumerate(some.lanes):
+            for few in group.split(max(1, MOST_LANES // self._beside)):
+                width = lanes_for(len(few.lanes))
+                for row, vector in enumerate(self._group(few, values, width)):
+                    for lane, part in enumerate(few.lanes):
                         columns[part][row] = self._entry(vector, lane, width)
         return columns
 
@@ -117,16 +120,17 @@ class FunctionBody:
         """Outputs of a group of parts, as vectors."""
         steps: list[str] = []
 
-        def operand(of: int | tuple[int, ...]) -> str:
+        def vector(operand: Operand) -> str:
             return (
-                steps[of]
-                if isinstance(of, int)
-                else self._vector([values.of(node) for node in of], width)
+                steps[operand]
+                if isinstance(operand, int)
+                else self._vector([values.of(node) for node in operand], width)
             )
 
-        for operation, of in group.steps:
-            steps.append(self.result(operation, [operand(k) for k in of], len(group.lanes), width))
-        return [operand(of) for of in group.outputs]
+        for operation, operands in group.steps:
+            vectors = [vector(operand) for operand in operands]
+            steps.append(self.result(operation, vectors, len(group.lanes), width))
+        return [vector(output) for output in group.outputs]
 
     def result(self, operation: str, operands: list[str], lanes: int = 1, width: int = 1) -> str:
         """Write an operation on numbers, or on vectors of which `lanes` lanes are in use.
@@ -140,10 +144,11 @@ class FunctionBody:
         if operation in OF_VECTORS and width > 1:
             return self._call(f"{OF_VECTORS[operation]}.v{width}f64", operands, type_name(width))
         if operation in CALLED:
-            entries = [[self._lane(of, lane, width) for of in operands] for lane in range(lanes)]
-            return self._of_lanes(
-                [self._call(CALLED[operation], of, "double") for of in entries], width
-            )
+            calls = []
+            for lane in range(lanes):
+                entries = [self._lane(operand, lane, width) for operand in operands]
+                calls.append(self._call(CALLED[operation], entries, "double"))
+            return self._of_lanes(calls, width)
         if operation not in MEANING:
             known = ", ".join(sorted({*MEANING, *CALLED}))
             raise DynamicsError(
@@ -221,8 +226,8 @@ class FunctionBody:
         if width == 1 or self._beside == 1:
             return self._lane(vector, part, width)
         kind = type_name(width * self._beside)
-        own = range(part * self._beside, (part + 1) * self._beside)
-        mask = f"<{self._beside} x i32> <{', '.join(f'i32 {lane}' for lane in own)}>"
+        lanes = range(part * self._beside, (part + 1) * self._beside)
+        mask = f"<{self._beside} x i32> <{', '.join(f'i32 {lane}' for lane in lanes)}>"
         return self.new(f"shufflevector {kind} {vector}, {kind} poison, {mask}")
 
     def _lane(self, vector: str, lane: int, width: int) -> str:
@@ -235,10 +240,10 @@ class FunctionBody:
 
     def input(self, number: int, entry: int) -> str:
         """Load an entry of an input."""
-        place = self.new(
+        address = self.new(
             f"getelementptr double, ptr %inputs, i64 {self._inputs[number][entry] * self._apart()}"
         )
-        return self.new(f"load {self._number}, ptr {place}, align 8")
+        return self.new(f"load {self._number}, ptr {address}, align 8")
 
     def _apart(self) -> int:
         """Distance between consecutive entries of the inputs, in numbers."""
@@ -266,16 +271,17 @@ class GraphValues:
 
     def of(self, node: int) -> str:
         """Name of the value of a node."""
-        asked = [node]
-        while asked:
-            missing = [k for k in self._nodes[asked[-1]].operands if k not in self._known]
+        pending = [node]
+        while pending:
+            missing = [k for k in self._nodes[pending[-1]].operands if k not in self._known]
             if missing:
-                asked.extend(reversed(missing))
-            elif (known := asked.pop()) not in self._known:
+                pending.extend(reversed(missing))
+            elif (known := pending.pop()) not in self._known:
                 self._known[known] = self._written(self._nodes[known])
         return self._known[node]
 
     def _written(self, node: Node) -> str:
+        """Write the value of a node whose operands have been written, and return its name."""
         if node.operation == "CONST":
             return self._body.constant(node.value)
         if node.operation != "INPUT":

@@ -67,8 +67,8 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 class _InnerLibrary(JITCodeLibrary):
     """Code of a kernel that only other kernels call, for linking into their code.
 
-    By default, Numba optimises each kernel and translates it to machine code, also if nothing calls
-    that. This took two fifths of the time in which the kernels of a loop were compiled.
+    By default, Numba also optimises each kernel by itself and translates it to machine code that
+    nothing calls. This took two fifths of the time in which the kernels of a loop were compiled.
     """
 
     def _optimize_final_module(self) -> None:
@@ -118,7 +118,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Make a small kernel that is inlined into its callers, because a call would take as long."""
+    """Make a small kernel that is inlined into its callers, to save the time of the call."""
     function.kernel = True  # type: ignore[attr-defined]
     return njit(forceinline=True, **_ARITHMETIC, **_ONLY_KERNELS)(function)
 
@@ -168,15 +168,12 @@ class _KernelCache:
     def load_overload(self, signature: object, context: Any) -> object | None:
         """Return the code compiled for a signature on this kind of processor, or None."""
         context.refresh()
-        found = load_object(self._file(signature, context.codegen()))
-        return None if found is None else CompileResult._rebuild(context, *pickle.loads(found))
+        code = load_object(self._file(signature, context.codegen()))
+        return None if code is None else CompileResult._rebuild(context, *pickle.loads(code))
 
     def save_overload(self, signature: object, result: Any) -> None:
-        """Save the code compiled for a signature.
-
-        Before, connect it with the environments of the kernels linked into it, as Numba does where
-        it loads saved code.
-        """
+        """Save the code compiled for a signature."""
+        # connect it with the environments of the kernels linked into it, as Numba does at loading
         for environment in result._find_referenced_environments():
             result.codegen.set_env(environment.env_name, environment)
         save_object(self._file(signature, result.codegen), dumps(result._reduce()))
@@ -187,6 +184,7 @@ class _KernelCache:
 
 
 _at_address: dict[int, Any] = {}
+"""Kernels for which `address` has been called, by address."""
 
 
 def address(compiled: Any, *arguments: object) -> int:
@@ -195,14 +193,14 @@ def address(compiled: Any, *arguments: object) -> int:
     The entry is compiled at the first call. For a function made by `plain`, the result is a number
     that `invoke` accepts in the same way.
     """
-    found = id(compiled)
+    place = id(compiled)
     if isinstance(compiled, Dispatcher):
         kinds = tuple(map(typeof, arguments))
         compiled.compile(kinds)
         result: Any = compiled.overloads[kinds]
-        found = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
-    _at_address[found] = compiled
-    return found
+        place = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+    _at_address[place] = compiled
+    return place
 
 
 # The following functions have the form that `numba.extending.intrinsic` requires: they take the
@@ -233,12 +231,12 @@ def _call(context: Any, address: Any, inputs: Any, outputs: Any) -> Any:
 def _call_columns(context: Any, address: Any, common: Any, rows: Any, into: Any, width: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         arrays = zip(signature.args[1:4], values[1:4], strict=True)
-        given = [
+        pointers = [
             context.make_array(kind)(context, builder, value=value).data for kind, value in arrays
         ]
-        given.append(values[4])
-        kind = ir.FunctionType(ir.VoidType(), [value.type for value in given])
-        builder.call(builder.inttoptr(values[0], kind.as_pointer()), given)
+        pointers.append(values[4])
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in pointers])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
         return context.get_dummy_value()
 
     return types.void(address, common, rows, into, types.int64), code
@@ -269,8 +267,8 @@ def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
                 builder.bitcast(builder.gep(one, [column]), vector.as_pointer())
                 for one in (row, into)
             ]
-            given, before = (builder.load(place, align=8) for place in places)
-            builder.store(builder.fadd(before, builder.fmul(factors, given)), places[1], align=8)
+            added, before = (builder.load(place, align=8) for place in places)
+            builder.store(builder.fadd(before, builder.fmul(factors, added)), places[1], align=8)
         return context.get_dummy_value()
 
     return types.void(types.float64, row, into, types.int64), code
@@ -335,10 +333,10 @@ def plain(compiled: Any) -> Callable[..., Any]:
         for name in source.__code__.co_names
         if name in source.__globals__
     }
-    lines = {name: getattr(value, "py_func", value) for name, value in names.items()}
+    functions = {name: getattr(value, "py_func", value) for name, value in names.items()}
     kernels = [
         name
-        for name, value in lines.items()
+        for name, value in functions.items()
         if isinstance(value, FunctionType) and hasattr(value, "kernel")
     ]
     called: dict[str, Any] = {name: plain(names[name]) for name in kernels}
@@ -357,5 +355,5 @@ def chosen(kernel: Any, compiled: bool) -> Callable[..., Any]:
     if compiled and isinstance(kernel, Dispatcher):
         return kernel
     # compiled code gives no floating-point warnings either
-    lines: Callable[..., Any] = np.errstate(all="ignore")(plain(kernel))
-    return lines
+    function: Callable[..., Any] = np.errstate(all="ignore")(plain(kernel))
+    return function

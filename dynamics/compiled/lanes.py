@@ -134,25 +134,29 @@ class Group(NamedTuple):
     def split(self, count: int) -> list["Group"]:
         """Split into groups of at most `count` parts."""
 
-        def some(operands: list[Operand], first: int) -> list[Operand]:
-            return [of if isinstance(of, int) else of[first : first + count] for of in operands]
+        def part_of(operands: list[Operand], first: int) -> list[Operand]:
+            return [
+                operand if isinstance(operand, int) else operand[first : first + count]
+                for operand in operands
+            ]
 
         return [
             Group(
                 self.lanes[first : first + count],
-                [(operation, some(of, first)) for operation, of in self.steps],
-                some(self.outputs, first),
+                [(operation, part_of(operand, first)) for operation, operand in self.steps],
+                part_of(self.outputs, first),
             )
             for first in range(0, len(self.lanes), count)
         ]
 
 
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:
-    """Values of an SX function, of which each has its own number.
+    """Graph of an SX function. Each value has its own number, which is its index in `nodes`.
 
-    CasADi's own instructions reuse memory. `constants` are the values of the last input, if given.
+    `constants` are the values of the last input, if given.
     """
     nodes: list[Node] = []
+    # CasADi's instructions reuse memory: number of the value that each place in memory holds now
     held: dict[int, int] = {}
     outputs = [[-1] * function.nnz_out(k) for k in range(function.n_out())]
     for index in range(function.n_instructions()):
@@ -180,11 +184,14 @@ def lane_groups(graph: Graph) -> list[Group]:
     everywhere = _needed_by(graph)
     alike: dict[str, list[tuple[int, Group]]] = {}
     for part, outputs in enumerate(graph.outputs):
-        own = _own_steps(graph, everywhere, part, outputs)
+        lone = _own_steps(graph, everywhere, part, outputs)
         form = repr(
-            [(name, [_form(k) for k in of]) for name, of in [*own.steps, ("", own.outputs)]]
+            [
+                (name, [_form(k) for k in operands])
+                for name, operands in [*lone.steps, ("", lone.outputs)]
+            ]
         )
-        alike.setdefault(form, []).append((part, own))
+        alike.setdefault(form, []).append((part, lone))
     return [_together(group) for group in alike.values()]
 
 
@@ -197,37 +204,39 @@ def _needed_by(graph: Graph) -> list[bool]:
     for index in reversed(range(len(graph.nodes))):
         for operand in graph.nodes[index].operands:
             needed[operand] |= needed[index]
-    everybody = reduce(or_, (1 << part for part in range(len(graph.outputs))))
-    return [by == everybody for by in needed]
+    all_parts = reduce(or_, (1 << part for part in range(len(graph.outputs))))
+    return [by == all_parts for by in needed]
 
 
 def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[int]) -> Group:
     """Steps of one part as a group of one lane, in the order in which its outputs need them."""
-    number: dict[int, int] = {}
+    step_numbers: dict[int, int] = {}
     steps: list[tuple[str, list[Operand]]] = []
 
     def place(node: int) -> Operand:
         outside = everywhere[node] or graph.nodes[node].operation in LEAVES
-        return (node,) if outside else number[node]
+        return (node,) if outside else step_numbers[node]
 
-    asked = list(reversed(outputs))
-    while asked:
-        node = asked[-1]
-        if everywhere[node] or graph.nodes[node].operation in LEAVES or node in number:
-            asked.pop()
+    pending = list(reversed(outputs))
+    while pending:
+        node = pending[-1]
+        if everywhere[node] or graph.nodes[node].operation in LEAVES or node in step_numbers:
+            pending.pop()
             continue
-        of = graph.nodes[node].operands
+        operands = graph.nodes[node].operands
         missing = [
             k
-            for k in of
-            if not everywhere[k] and graph.nodes[k].operation not in LEAVES and k not in number
+            for k in operands
+            if not everywhere[k]
+            and graph.nodes[k].operation not in LEAVES
+            and k not in step_numbers
         ]
         if missing:
-            asked.extend(reversed(missing))
+            pending.extend(reversed(missing))
             continue
-        asked.pop()
-        number[node] = len(steps)
-        steps.append((graph.nodes[node].operation, [place(k) for k in of]))
+        pending.pop()
+        step_numbers[node] = len(steps)
+        steps.append((graph.nodes[node].operation, [place(k) for k in operands]))
     return Group((part,), steps, [place(node) for node in outputs])
 
 
@@ -237,18 +246,19 @@ def _form(operand: Operand) -> int:
 
 
 def _together(group: list[tuple[int, Group]]) -> Group:
-    parts = [own for _, own in group]
+    """Group of parts that are alike, from the number and the steps of each part."""
+    parts = [lane for _, lane in group]
     names = [name for name, _ in parts[0].steps]
     operands = [
-        _across(of) for of in zip(*[[of for _, of in own.steps] for own in parts], strict=True)
+        _across(of) for of in zip(*[[of for _, of in lane.steps] for lane in parts], strict=True)
     ]
     lanes = tuple(part for part, _ in group)
     return Group(
-        lanes, list(zip(names, operands, strict=True)), _across([own.outputs for own in parts])
+        lanes, list(zip(names, operands, strict=True)), _across([lane.outputs for lane in parts])
     )
 
 
 def _across(operands: Iterable[list[Operand]]) -> list[Operand]:
     """Operands of a group, joined from the operands of its lanes."""
     columns = zip(*operands, strict=True)
-    return [of[0] if isinstance(of[0], int) else sum(of, ()) for of in columns]
+    return [lanes[0] if isinstance(lanes[0], int) else sum(lanes, ()) for lanes in columns]

@@ -54,17 +54,17 @@ class MachineFunction:
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
         if len(self.constants):
             batches = (*batches, self.constants[None])
-        given = np.empty((count, sum(self.inputs)))
+        arguments = np.empty((count, sum(self.inputs)))
         end = 0
         for batch, size in zip(batches, self.inputs, strict=True):
-            given[:, end : end + size] = batch
+            arguments[:, end : end + size] = batch
             end += size
-        found = np.empty((count, sum(rows * columns for rows, columns in self.outputs)))
-        self.over_rows(count, given.ctypes.data, found.ctypes.data)
+        results = np.empty((count, sum(rows * columns for rows, columns in self.outputs)))
+        self.over_rows(count, arguments.ctypes.data, results.ctypes.data)
         parts = []
         end = 0
         for rows, columns in self.outputs:
-            parts.append(found[:, end : end + rows * columns].reshape(count, rows, columns))
+            parts.append(results[:, end : end + rows * columns].reshape(count, rows, columns))
             end += rows * columns
         return parts
 
@@ -121,8 +121,8 @@ def _without_garbage_collection() -> Iterator[None]:
 def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     """Line of JSON, then the machine code of the hot functions, and that of the others.
 
-    The line has the shapes of inputs and outputs of each function, and the length of the first
-    machine code.
+    The line has the shapes of inputs and outputs of each function, and the length of the machine
+    code of the hot functions.
 
     Optimising takes LLVM ten times as long as translating. Functions that are not hot are only
     translated. They then take up to twice as long, and their results are the same.
@@ -151,7 +151,7 @@ def _optimised(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
 
 
 def _translated(functions: list[AnyFunction]) -> bytes:
-    """Machine code of functions, with one instruction after the other as they are written."""
+    """Machine code of functions, without optimisation."""
     machine = _machine(level=0)
     return bytes(machine.emit_object(_module(llvm_text(functions), machine)))
 
@@ -170,9 +170,9 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
     line, _, code = compiled.partition(b"\n")
     shapes, length = json.loads(line)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-    for part in (code[:length], code[length:]):
-        if part:
-            engine.add_object_file(llvm.ObjectFileRef.from_data(part))
+    for object_code in (code[:length], code[length:]):
+        if object_code:
+            engine.add_object_file(llvm.ObjectFileRef.from_data(object_code))
     engine.finalize_object()
     over_rows = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
     return {
@@ -212,10 +212,10 @@ def _package_digest() -> bytes:
     """Digest of all files of this package that the code depends on."""
     digest = sha256()
     package = Path(__file__).parent.parent
-    rooms = [package / "expressions.py", package / "parameters.py"]
-    for room in ("compiled", "legs", "kinematics", "rigid_body"):
-        rooms += sorted((package / room).glob("*.py"))
-    for file in rooms:
+    files = [package / "expressions.py", package / "parameters.py"]
+    for folder in ("compiled", "legs", "kinematics", "rigid_body"):
+        files += sorted((package / folder).glob("*.py"))
+    for file in files:
         digest.update(file.name.encode() + file.read_bytes())
     return digest.digest()
 
@@ -234,6 +234,7 @@ def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
 
 
 def _body(function: AnyFunction, quick: bool) -> FunctionBody:
+    """LLVM lines of a function."""
     return (
         _ColumnBody(function, quick)
         if isinstance(function, ColumnFunction)
@@ -262,6 +263,7 @@ class _ColumnBody(FunctionBody):
         return f"define void @{self._name}{signature} nounwind {{\n{lines}\n}}\n"
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
+        """Write the values that all columns share, then a loop over groups of columns."""
         common = self._given.common
         values = GraphValues(self, graph, parts)
         lanes = self._given.lanes
@@ -298,10 +300,10 @@ class _ColumnBody(FunctionBody):
                     operation, [in_lanes(k) for k in operands], lanes, lanes
                 )
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
-            for row, found in zip(places, nodes, strict=True):
+            for row, value in zip(places, nodes, strict=True):
                 address = self._place("into", row)
                 self._lines.append(
-                    f"store {type_name(lanes)} {in_lanes(found)}, ptr {address}, align 8"
+                    f"store {type_name(lanes)} {in_lanes(value)}, ptr {address}, align 8"
                 )
         self._lines += [f"%next = add i64 %k, {lanes}", "br label %ask", "done:", "ret void"]
 

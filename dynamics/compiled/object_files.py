@@ -16,13 +16,13 @@ import platformdirs
 DIGEST = sha256().digest_size
 
 DAY = 24 * 3600.0  # s
-UNUSED = 60 * DAY
-"""Time since the last use, s, after which a file is removed."""
+KEPT = 60 * DAY
+"""Time, s, for which a file is kept after its last use."""
 
 KINDS = (".kernel", ".robot", ".half")
 """Endings of the files in this cache. Files with the last ending are not yet complete."""
 
-AT_ONCE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags with which files are opened.
 
 Without O_NONBLOCK, opening a pipe would wait for a writer.
@@ -46,7 +46,7 @@ def load_object(name: str) -> bytes | None:
     """
     path = cache_folder() / name
     try:
-        with os.fdopen(os.open(path, AT_ONCE), "rb") as file:
+        with os.fdopen(os.open(path, OPEN_FLAGS), "rb") as file:
             if not _ours_alone(os.fstat(file.fileno())):
                 return None
             _note_use(path, os.fstat(file.fileno()).st_mtime)
@@ -62,26 +62,26 @@ def save_object(name: str, content: bytes) -> None:
 
     The file is written under a temporary name and then renamed. It is thus never incomplete, even
     if a process is killed or another process saves the same content. Warns once if nothing can be
-    written. Files that no process has used for two months are removed.
+    written. Files that have not been used for two months are removed.
     """
     path = cache_folder() / name
-    missing: list[Path] = []
-    beside = None
+    created: list[Path] = []
+    temporary = None
     try:
         # `exists` raises an error, too, if the folder may not be read
-        missing = [folder for folder in path.parents if not folder.exists()]
+        created = [folder for folder in path.parents if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         # readable and writable by its owner alone
-        descriptor, beside = tempfile.mkstemp(dir=path.parent, suffix=".half")
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, suffix=".half")
         with os.fdopen(descriptor, "wb") as file:
             file.write(sha256(name.encode() + content).digest() + content)
-        Path(beside).replace(path)
+        Path(temporary).replace(path)
         _remove_unused(path.parent)
     except OSError as error:
-        if beside is not None:
-            Path(beside).unlink(missing_ok=True)
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
         with suppress(OSError):  # a folder into which another process has written remains
-            for folder in missing:
+            for folder in created:
                 folder.rmdir()
         text = (
             f"machine code cannot be saved in {path.parent} ({error.strerror}), so that every "
@@ -102,11 +102,11 @@ def _note_use(path: Path, changed: float) -> None:
 
 @cache
 def _remove_unused(folder: Path) -> None:
-    """Remove files that no process has used for two months.
+    """Remove files that have not been used for two months, once in each process.
 
-    Their sources have usually changed. Each process does this once.
+    Their sources have usually changed.
     """
-    oldest = time.time() - UNUSED
+    oldest = time.time() - KEPT
     with suppress(OSError):  # the next process removes the remaining files
         for path in folder.iterdir():
             if path.suffix in KINDS and path.lstat().st_mtime < oldest:
@@ -120,12 +120,10 @@ def _warn_once(text: str) -> None:
 
 
 def _ours_alone(status: os.stat_result) -> bool:
-    """Return True for a file that nobody but the user can have written.
-
-    Windows itself protects the folders of a user.
-    """
+    """Return True for a file that nobody but the user can have written."""
     if not stat.S_ISREG(status.st_mode):
         return False
+    # Windows protects the folders of a user
     if not hasattr(os, "geteuid"):
         return True
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

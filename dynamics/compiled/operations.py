@@ -7,6 +7,8 @@ MOST_LANES = 8
 """Number of doubles in the widest register of present processors."""
 
 TRUTH = "uitofp {i1} {last} to {double}"
+"""Instruction that makes a number, 0 or 1, from a bit: CasADi's conditions are numbers."""
+
 MEANING: dict[str, tuple[str, ...]] = {
     "ADD": ("fadd {double} {0}, {1}",),
     "SUB": ("fsub {double} {0}, {1}",),

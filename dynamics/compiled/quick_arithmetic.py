@@ -25,7 +25,7 @@ HALF_PI = (
     2 * 3.77489470793079817668e-8,
     2 * 2.69515142907905952645e-15,
 )
-"""Parts of pi / 2. Whole multiples of the first two parts have no rounding error."""
+"""Parts of pi / 2. Integer multiples of the first two parts have no rounding error."""
 
 SINE = (
     *(-1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4),
@@ -39,7 +39,7 @@ ARCTANGENT = (
     *(-6.485021904942025371773e1, -1.228866684490136173410e2, -7.500855792314704667340e1),
     *(-1.615753718733365076637e1, -8.750608600031904122785e-1),
 )
-OVER = (
+ARCTANGENT_DIVISOR = (
     *(1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2),
     *(1.650270098316988542046e2, 2.485846490142306297962e1, 1.0),
 )
@@ -66,8 +66,9 @@ def _approximations() -> dict[str, tuple[ca.Function, int]]:
 def _with_approximations(graph: Graph) -> Graph:
     """Replace operations by the functions of `_approximations`."""
     nodes: list[Node] = []
+    # number, in the new graph, of the value of each node of the old one
     placed: list[int] = []
-    made: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    inlined: dict[tuple[str, tuple[int, ...]], list[int]] = {}
     for node in graph.nodes:
         operands = tuple(placed[k] for k in node.operands)
         if node.operation not in _approximations():
@@ -76,9 +77,9 @@ def _with_approximations(graph: Graph) -> Graph:
             continue
         function, output = _approximations()[node.operation]
         call = function.name(), operands
-        if call not in made:
-            made[call] = _inlined(nodes, graph_of(function), operands)
-        placed.append(made[call][output])
+        if call not in inlined:
+            inlined[call] = _inlined(nodes, graph_of(function), operands)
+        placed.append(inlined[call][output])
     return Graph(nodes, [[placed[k] for k in of] for of in graph.outputs])
 
 
@@ -91,7 +92,7 @@ def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> l
             continue
         placed.append(len(nodes))
         nodes.append(node.of(tuple(placed[k] for k in node.operands)))
-    return [placed[found] for (found,) in function.outputs]
+    return [placed[output] for (output,) in function.outputs]
 
 
 def _with_reciprocals(graph: Graph) -> Graph:
@@ -207,7 +208,7 @@ def _arctangent() -> ca.Function:
     )
     square = tangent * tangent
     angle = tangent + tangent * square * (
-        _polynomial(ARCTANGENT, square) / _polynomial(OVER, square)
+        _polynomial(ARCTANGENT, square) / _polynomial(ARCTANGENT_DIVISOR, square)
     )
     angle = angle + ca.if_else(turned, np.pi / 4, 0)
     angle = ca.if_else(steep, np.pi / 2 - angle, angle)

@@ -2,11 +2,11 @@
 
 A law is given an `Assignment`: a motion, a model and the settings of the loop. It returns a
 `LawInLoop`: a feedforward of joint commands for the servo, or a controller. Each law has its own
-file, and `law` has what they share. The law of each joint's drive is in
+file, and `law_interface` has the types that they share. The laws of the joints' drives are in
 `dynamics.closed_loop.drives`.
 """
 
 from dynamics.control.inverse_dynamics import Model, Motion
-from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
+from dynamics.control.law_interface import Assignment, Feedback, Law, LawInLoop
 
 __all__ = ["Assignment", "Feedback", "Law", "LawInLoop", "Model", "Motion"]

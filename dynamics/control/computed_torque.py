@@ -25,14 +25,14 @@ from scipy.linalg import expm
 from dynamics.closed_loop.drives import Drives
 from dynamics.closed_loop.loop_settings import EveryFrame
 from dynamics.control.inverse_dynamics import Motion, spans
-from dynamics.control.law import Assignment, Feedback, LawInLoop
+from dynamics.control.law_interface import Assignment, Feedback, LawInLoop
 from dynamics.control.observer import Estimate
 from dynamics.kinematics.platform import Chart
 
-INTEGRAL = 0.2
-"""Factor of the gain Ki = INTEGRAL bandwidth^3 without an observer."""
+INTEGRAL_FACTOR = 0.2
+"""Factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer."""
 
-FOLLOWED = 1.0
+FOLLOWING_RATE = 1.0
 """Rate at which the subtracted disturbance follows the estimate, over the bandwidth.
 
 Following faster would mainly pass noise on to the robot.
@@ -42,9 +42,7 @@ Command = Callable[[int, float, np.ndarray | None], np.ndarray]
 
 
 def error_map(feedback: Feedback) -> np.ndarray:
-    """Matrix (2, 2) of the linear differential equation of an error and its rate on the way
-    back.
-    """
+    """Matrix (2, 2) that maps an error and its rate, on the way back, to their time derivatives."""
     w = feedback.bandwidth
     return np.array([[0.0, 1.0], [-(w**2), -2 * feedback.damping * w]])
 
@@ -53,8 +51,8 @@ def error_map(feedback: Feedback) -> np.ndarray:
 class DecayingErrors:
     """Motion along which errors (m,) decay.
 
-    `error` and `rate` are the errors and their rates at the time `begin`, s. `beside` is an
-    additional acceleration (m,).
+    `error` and `rate` are the errors, m and rad, and their rates at the time `begin`, s. `map` is
+    that of `error_map`. `correction` is an additional acceleration (m,), m/s^2 and rad/s^2.
     """
 
     desired: Motion
@@ -63,7 +61,7 @@ class DecayingErrors:
     begin: float
     error: np.ndarray
     rate: np.ndarray
-    beside: np.ndarray | float = 0.0
+    correction: np.ndarray | float = 0.0
 
     def pose(self, t: np.ndarray) -> np.ndarray:
         """Poses (N, 6), m and rad."""
@@ -76,13 +74,13 @@ class DecayingErrors:
     def pose_acceleration(self, t: np.ndarray) -> np.ndarray:
         """Pose accelerations (N, 6)."""
         back = np.einsum("i,nij->nj", self.map[1], self._errors(t))
-        return self.desired.pose_acceleration(t) - self.chart.lifted(back - self.beside)
+        return self.desired.pose_acceleration(t) - self.chart.lifted(back - self.correction)
 
     def _errors(self, t: np.ndarray) -> np.ndarray:
         """Errors and their rates (N, 2, m)."""
-        passed = np.asarray(t) - self.begin
+        elapsed = np.asarray(t) - self.begin
         return np.asarray(
-            expm(self.map * passed[:, None, None]) @ np.stack([self.error, self.rate])
+            expm(self.map * elapsed[:, None, None]) @ np.stack([self.error, self.rate])
         )
 
 
@@ -103,19 +101,20 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
     """Controller with an observer, whose estimates are appended to `expected`."""
-    watched = assignment.watched(drives)
-    share = 1 - np.exp(-FOLLOWED * assignment.feedback.bandwidth * assignment.period)
-    taken_off = watched.disturbance
+    observer = assignment.watched(drives)
+    # fraction of the way to the estimate in one frame
+    fraction = 1 - np.exp(-FOLLOWING_RATE * assignment.feedback.bandwidth * assignment.period)
+    subtracted = observer.disturbance
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
-        nonlocal taken_off
-        expected.append(watched.see(frame, measured))
-        at = watched.arrival(frame)
-        seen = watched.ahead(at)
-        taken_off = taken_off + share * (watched.disturbance - taken_off)
-        way = _decaying_errors(assignment, at, seen.coordinates, seen.rates)
-        torque = _torque(assignment, way, way, watched.viscous) - taken_off
-        watched.issue(frame, torque)
+        nonlocal subtracted
+        expected.append(observer.see(frame, measured))
+        arrival = observer.arrival(frame)
+        predicted = observer.ahead(arrival)
+        subtracted = subtracted + fraction * (observer.disturbance - subtracted)
+        way = _decaying_errors(assignment, arrival, predicted.coordinates, predicted.rates)
+        torque = _torque(assignment, way, way, observer.viscous) - subtracted
+        observer.issue(frame, torque)
         return torque
 
     return command
@@ -127,26 +126,26 @@ def _measured(assignment: Assignment) -> Command:
     period = assignment.period
     feedback = assignment.feedback
     pose = assignment.desired(0.0)[0]
-    before = chart.coordinates(pose)
+    last = chart.coordinates(pose)
     elapsed = 0.0
     integral = np.zeros(len(chart.freedoms))
     # error of the modelled torque at rest, which is known from the torque at the start
     at_rest = assignment.holding - assignment.model.robot.static_torque(
         pose, assignment.model.dynamic
     )
-    way = _decaying_errors(assignment, 0.0, before, np.zeros_like(before))
+    way = _decaying_errors(assignment, 0.0, last, np.zeros_like(last))
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
-        nonlocal before, elapsed, integral, way
+        nonlocal last, elapsed, integral, way
         elapsed += period
         if measured is not None:
             now = chart.coordinates(measured)
-            rates = (now - before) / elapsed
-            before = now
+            rates = (now - last) / elapsed
+            last = now
             elapsed = 0.0
             integral = integral + period * (chart.coordinates(assignment.desired(time)[0]) - now)
             way = _decaying_errors(assignment, time, now, rates)
-            way = replace(way, beside=INTEGRAL * feedback.bandwidth**3 * integral)
+            way = replace(way, correction=INTEGRAL_FACTOR * feedback.bandwidth**3 * integral)
         arrival = time + assignment.settings.timing.latency_s
         return _torque(assignment, replace(way, begin=arrival), assignment.motion) + at_rest
 
@@ -166,12 +165,10 @@ def _decaying_errors(
 def _torque(
     assignment: Assignment, way: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Mean torque (n,) over the first frame of a way back, with the dry friction of the motion
-    `dry`.
+    """Mean torque (n,) over the first frame of a way back, N m or N.
 
-    `viscous` (n,) is friction that the model does not include.
+    Dry friction has the signs of the motion `dry`. `viscous` (n,) is friction that the model does
+    not include.
     """
-    along = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
-    return np.asarray(
-        along.torque[0] + viscous * (along.end[0] - along.begin[0]) / assignment.period
-    )
+    span = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
+    return np.asarray(span.torque[0] + viscous * (span.end[0] - span.begin[0]) / assignment.period)

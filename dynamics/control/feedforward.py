@@ -20,7 +20,7 @@ import numpy as np
 from dynamics.closed_loop.drives import PID, Drives
 from dynamics.closed_loop.loop_settings import EveryFrame, FrameTiming
 from dynamics.control.inverse_dynamics import Model, Motion, spans
-from dynamics.control.law import Assignment, LawInLoop
+from dynamics.control.law_interface import Assignment, LawInLoop
 from dynamics.control.observer import Estimate
 
 
@@ -39,40 +39,40 @@ def joint_commands(
     li = law.li
     ld = law.ld
     c = law.rate_weight
-    stiff = law.lp + law.lx
-    before, integral = model.held(motion.pose(np.zeros(1))[0], drives)
+    stiffness = law.lp + law.lx
+    last_command, integral = model.held(motion.pose(np.zeros(1))[0], drives)
     commands = np.empty_like(along.mean)
-    held = timing.hold == "zero"
+    constant = timing.hold == "zero"
     for k in range(frames):
         moved = along.end[k] - along.begin[k]
         mean = along.mean[k]
-        by_before = ld * (c * before + moved) / period
+        by_before = ld * (c * last_command + moved) / period
         # The torque of the drive, solved for the command: the mean torque during a constant
         # command, or the torque at the end of a ramp.
-        if held:
-            left = (
+        if constant:
+            torque = (
                 along.torque[k]
-                + stiff * mean
+                + stiffness * mean
                 + by_before
                 - li * (integral - along.mean_integral[k])
             )
-            commands[k] = left / (lp + c * ld / period + li * period / 2)
+            commands[k] = torque / (lp + c * ld / period + li * period / 2)
             integral = integral + period * (commands[k] - mean)
         else:
-            left = (
+            torque = (
                 along.torque[k]
-                + stiff * along.end[k]
+                + stiffness * along.end[k]
                 + by_before
-                - li * (integral + period * (before / 2 - mean))
+                - li * (integral + period * (last_command / 2 - mean))
             )
-            commands[k] = left / (lp + c * ld / period + li * period / 2)
-            integral = integral + period * ((before + commands[k]) / 2 - mean)
-        before = commands[k]
+            commands[k] = torque / (lp + c * ld / period + li * period / 2)
+            integral = integral + period * ((last_command + commands[k]) / 2 - mean)
+        last_command = commands[k]
     return commands
 
 
 def feedforward(assignment: Assignment) -> LawInLoop:
-    """Law of the servo around these commands.
+    """Law of the servo around the commands of `joint_commands`.
 
     With an observer, the servo corrects the pose predicted for the arrival of its correction.
     Raises the same errors as `joint_commands`.
@@ -83,7 +83,7 @@ def feedforward(assignment: Assignment) -> LawInLoop:
     commands = joint_commands(model, assignment.motion, settings.timing, assignment.frames, drives)
     if not assignment.feedback.observer:
         return LawInLoop(feedforward=commands, drives=drives)
-    watched = assignment.watched(drives)
+    observer = assignment.watched(drives)
     gains = settings.servo
     chart = model.robot.geometry.chart
     expected: list[Estimate] = []
@@ -91,16 +91,16 @@ def feedforward(assignment: Assignment) -> LawInLoop:
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
         nonlocal integral
-        expected.append(watched.see(frame, measured))
-        at = watched.arrival(frame)
-        seen = watched.ahead(at)
-        pose, rate, _ = assignment.desired(at)
-        error = chart.coordinates(pose) - seen.coordinates
+        expected.append(observer.see(frame, measured))
+        arrival = observer.arrival(frame)
+        predicted = observer.ahead(arrival)
+        pose, rate, _ = assignment.desired(arrival)
+        error = chart.coordinates(pose) - predicted.coordinates
         integral = integral + assignment.period * error
-        demand = gains.demand(error, chart.coordinates(rate) - seen.rates, integral)
-        jacobian = model.robot.coordinate_jacobian(chart.pose(seen.coordinates))
+        demand = gains.demand(error, chart.coordinates(rate) - predicted.rates, integral)
+        jacobian = model.robot.coordinate_jacobian(chart.pose(predicted.coordinates))
         issued = np.asarray(commands[frame] + jacobian @ demand)
-        watched.issue(frame, issued)
+        observer.issue(frame, issued)
         return issued
 
     return LawInLoop(

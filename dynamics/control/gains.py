@@ -15,19 +15,20 @@ from scipy.optimize import brentq, minimize
 
 from dynamics.closed_loop import stability
 from dynamics.closed_loop.loop_settings import LoopSettings, ServoGains
-from dynamics.control.computed_torque import INTEGRAL, error_map
+from dynamics.control.computed_torque import INTEGRAL_FACTOR, error_map
 from dynamics.control.inverse_dynamics import Model
-from dynamics.control.law import Feedback
+from dynamics.control.law_interface import Feedback
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
 HALF_POWER = 2**-0.5
-AT_ONCE = 1e-3
+"""Error over the desired motion at the frequency that is the bandwidth."""
+DECAYED = 1e-3
 """Magnitude of eigenvalues below which a motion has decayed within a frame."""
 SLOWEST = 1e-2
 """Lowest frequency, rad/s, in the search for a bandwidth."""
-MET = 0.02
-"""Relative tolerance of a designed loop for the desired bandwidth and damping."""
+DESIGN_TOLERANCE = 0.02
+"""Tolerance of a designed loop for the ratio of its error to HALF_POWER, and for its damping."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,13 @@ def servo_figures(model: Model, settings: LoopSettings, pose: np.ndarray) -> Loo
     They apply to the laws pid and feedforward. Raises the same errors as `closed_loop.equilibrium`.
     """
     arguments = model.robot, model.parameters, settings, pose
-    map_ = stability.frame_map(*arguments)
+    frame_map = stability.frame_map(*arguments)
     radius = stability.spectral_radius(*arguments)
     rate = settings.timing.frame_rate_hz
     bandwidth = (
         float("nan") if radius >= 1 else _bandwidth(stability.pose_response(*arguments), rate)
     )
-    return LoopFigures(bandwidth, _damping(map_), radius, stability.gain_margin(*arguments))
+    return LoopFigures(bandwidth, _damping(frame_map), radius, stability.gain_margin(*arguments))
 
 
 def design_servo(
@@ -73,34 +74,34 @@ def design_servo(
 
     def figures(logs: np.ndarray) -> tuple[float, float]:
         arguments = model.robot, model.parameters, replace(settings, servo=servo(logs)), pose
-        return _error_share(stability.pose_response(*arguments)(bandwidth)), _damping(
+        return _error_ratio(stability.pose_response(*arguments)(bandwidth)), _damping(
             stability.frame_map(*arguments)
         )
 
     def cost(logs: np.ndarray) -> float:
-        share, damped = figures(logs)
+        error, reached_damping = figures(logs)
         # the last term selects one of the many gains that meet both requirements
         return (
-            100 * (share / HALF_POWER - 1) ** 2
-            + 100 * max(damping - damped, 0.0)
+            100 * (error / HALF_POWER - 1) ** 2
+            + 100 * max(damping - reached_damping, 0.0)
             + 1e-4 * float(logs @ logs)
         )
 
     period = 1 / settings.timing.frame_rate_hz
     # a servo that is stable on most robots, in logarithms because gains are positive
     start = np.log([0.3, 0.06 * period, bandwidth])
-    found = minimize(
+    best = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
     )
-    share, damped = figures(found.x)
-    if abs(share / HALF_POWER - 1) > MET or damped < damping - MET:
+    error, reached = figures(best.x)
+    if abs(error / HALF_POWER - 1) > DESIGN_TOLERANCE or reached < damping - DESIGN_TOLERANCE:
         raise SimulationError(
             f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s "
             f"with a damping of {damping:g} at {settings.timing.frame_rate_hz:g} Hz: the best gains"
-            f" have a damping of {damped:.3g} and an error of {share:.3g} of the motion, must be "
+            f" have a damping of {reached:.3g} and an error of {error:.3g} of the motion, must be "
             f"{HALF_POWER:.3g}"
         )
-    return servo(found.x)
+    return servo(best.x)
 
 
 SPEEDS = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
@@ -226,23 +227,23 @@ def check_torque_gains(
     """
     rate = settings.timing.frame_rate_hz
     radius = torque_radius(model, settings, pose, feedback)
-    asked = (
+    law_text = (
         f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s and a damping of "
         f"{feedback.damping:.3g}"
     )
     if radius >= 1:
         limit = largest_bandwidth(model, settings, pose, feedback)
-        mend = f"stable up to {limit:.3g} rad/s" if limit > 0 else "stable at no bandwidth"
+        stable_range = f"stable up to {limit:.3g} rad/s" if limit > 0 else "stable at no bandwidth"
         raise SimulationError(
-            f"{asked} is unstable with this model at {rate:g} Hz: its largest eigenvalue from "
-            f"frame to frame is {radius:.4g}, must be below 1; the law is {mend}"
+            f"{law_text} is unstable with this model at {rate:g} Hz: its largest eigenvalue from "
+            f"frame to frame is {radius:.4g}, must be below 1; the law is {stable_range}"
         )
     if feedback.bandwidth > np.pi * rate:
-        wanted = np.exp(np.linalg.eigvals(error_map(feedback)).real.max() / rate)
+        desired = np.exp(np.linalg.eigvals(error_map(feedback)).real.max() / rate)
         raise SimulationError(
-            f"{asked} is too fast for {rate:g} Hz: the bandwidth must be at most half the frame "
+            f"{law_text} is too fast for {rate:g} Hz: the bandwidth must be at most half the frame "
             f"rate, {np.pi * rate:.3g} rad/s; the largest eigenvalue from frame to frame is "
-            f"{radius:.4g} instead of {wanted:.3g}"
+            f"{radius:.4g} instead of {desired:.3g}"
         )
 
 
@@ -271,15 +272,15 @@ def _torque_map(
     size = len(motion) // 2
     joints = push.shape[1]
     w = feedback.bandwidth
-    one = np.eye(size)
+    identity = np.eye(size)
     map_ = error_map(feedback)
     stiff = motion[size:, :size]
     damp = motion[size:, size:]
-    inverse = np.linalg.pinv(push)
+    to_torque = np.linalg.pinv(push)
     # the mean acceleration along the way back over a frame
     mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
     by_place, by_rate = (
-        inverse @ (factor * (map_[1] @ along) * one - along[0] * stiff - along[1] * damp)
+        to_torque @ (factor * (map_[1] @ along) * identity - along[0] * stiff - along[1] * damp)
         for along in mean.T
     )
     # Constant torques are part of the state, so that one exponential has their exact effect.
@@ -287,16 +288,17 @@ def _torque_map(
     inner[: 2 * size, : 2 * size] = motion
     inner[size : 2 * size, 2 * size :] = push
 
-    def over(time: float) -> tuple[np.ndarray, np.ndarray]:
+    def after(time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Effects of the state and of constant torques on the state after a time, s."""
         moved = expm(inner * time)[: 2 * size]
         return moved[:, : 2 * size], moved[:, 2 * size :]
 
     if feedback.observer:
-        moved, pushed = over(period)
+        moved, pushed = after(period)
         return moved + pushed @ np.hstack([by_place, by_rate])
-    whole = int(np.floor(delay / period + 1e-9))
-    rest = max(0.0, delay - whole * period)
-    states = 4 * size + (whole + 1) * joints
+    late_frames = int(np.floor(delay / period + 1e-9))
+    late_s = max(0.0, delay - late_frames * period)
+    states = 4 * size + (late_frames + 1) * joints
     start = np.eye(states)
     place = start[:size]
     before = start[2 * size : 3 * size]
@@ -305,29 +307,29 @@ def _torque_map(
     torque = (
         by_place @ place
         + by_rate @ (place - before) / period
-        + factor * INTEGRAL * w**3 * inverse @ integral
+        + factor * INTEGRAL_FACTOR * w**3 * to_torque @ integral
     )
-    torques = [torque, *np.split(start[4 * size :], whole + 1)]
+    torques = [torque, *np.split(start[4 * size :], late_frames + 1)]
     state = start[: 2 * size]
-    for age, time in ((whole + 1, rest), (whole, period - rest)):
-        moved, pushed = over(time)
+    for age, time in ((late_frames + 1, late_s), (late_frames, period - late_s)):
+        moved, pushed = after(time)
         state = moved @ state + pushed @ torques[age]
-    return np.vstack([state, place, integral, *torques[: whole + 1]])
+    return np.vstack([state, place, integral, *torques[: late_frames + 1]])
 
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
     """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most the Nyquist
     frequency.
     """
-    # The error may not be monotonic: a grid finds the first crossing, which Brent's method refines.
+    # the error may not be monotonic: a grid finds the first crossing, which Brent's method refines
     places = np.geomspace(1e-2, np.pi * rate_hz, 60)
-    beyond = [_error_share(response(w)) > HALF_POWER for w in places]
+    beyond = [_error_ratio(response(w)) > HALF_POWER for w in places]
     first = int(np.argmax(beyond))
     if not any(beyond) or first == 0:
         return float(places[0 if any(beyond) else -1])
     return float(
         brentq(
-            lambda w: _error_share(response(w)) - HALF_POWER,
+            lambda w: _error_ratio(response(w)) - HALF_POWER,
             places[first - 1],
             places[first],
             rtol=1e-6,
@@ -335,7 +337,8 @@ def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float
     )
 
 
-def _error_share(response: np.ndarray) -> float:
+def _error_ratio(response: np.ndarray) -> float:
+    """Error over the desired motion in the worst direction, for a response (m, m)."""
     return float(np.abs(np.linalg.eigvals(np.eye(len(response)) - response)).max())
 
 
@@ -343,6 +346,6 @@ def _damping(map_: np.ndarray) -> float:
     """Smallest damping ratio of the eigenvalues of a map."""
     values = np.linalg.eigvals(map_).astype(complex)
     # Poles in units of the frame rate. States with an eigenvalue of about zero decay at once.
-    poles = np.log(values[np.abs(values) > AT_ONCE])
+    poles = np.log(values[np.abs(values) > DECAYED])
     # a pole at zero has no damping
     return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))

@@ -10,16 +10,16 @@ from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Gauss-Legendre quadrature.
+"""Gauss-Legendre quadrature over a span.
 
-A reversal of friction within a span is resolved to about an eighth.
+The time of a reversal of friction is resolved to about an eighth of the span.
 """
 
 
-VAGUE = 0.2
+GUESSED_DOUBT = 0.2
 """Value of `Model.doubt` for a guessed model, 1/s."""
 
-FITTED = 4e-4
+FITTED_DOUBT = 4e-4
 """Value of `Model.doubt` for a model that fits measured data, 1/s.
 
 The covariances of identified parameters give 3.3e-4 to 5.4e-4 for three robots, at 29 and 60 Hz,
@@ -71,8 +71,7 @@ class Model:
     friction : FrictionLaw
         Law of joint friction.
     doubt : float
-        Rate, 1/s, at which the errors of the torques are expected to change before a run, relative
-        to the torque at rest.
+        Expected rate of change of the errors of the torques, relative to the torque at rest, 1/s.
 
     Examples
     --------
@@ -86,7 +85,7 @@ class Model:
     robot: Robot
     parameters: np.ndarray
     friction: FrictionLaw
-    doubt: float = VAGUE
+    doubt: float = GUESSED_DOUBT
 
     @property
     def dynamic(self) -> np.ndarray:
@@ -116,8 +115,8 @@ class Model:
     ) -> np.ndarray:
         """Actuator torques (N, n), N m or N, for pose rates and accelerations (N, 6) (eq. 17, 23).
 
-        If joint velocities `dry_along` (N, n) are given, dry friction has their signs instead of
-        the signs of the motion. Raises the same errors as `Robot.inverse_dynamics`.
+        Dry friction has the signs of the joint velocities `dry_along` (N, n). The default is those
+        of the motion. Raises the same errors as `Robot.inverse_dynamics`.
         """
         robot = self.robot
         parameters = self.dynamic.copy()
@@ -125,13 +124,13 @@ class Model:
         parameters[robot.layout.coulomb] = 0.0
         twist = robot.twist(pose, rate)
         twist_dot = robot.twist_dot(pose, rate, acceleration)
-        turning = (
+        joint_rates = (
             np.einsum("nij,nj->ni", robot.pose_jacobian(pose), rate)
             if dry_along is None
             else dry_along
         )
-        without = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
-        return np.asarray(without + coulomb * self.friction.level(turning))
+        frictionless = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
+        return np.asarray(frictionless + coulomb * self.friction.level(joint_rates))
 
 
 @dataclass(frozen=True)
@@ -158,17 +157,19 @@ def spans(
     Dry friction has the signs of the joint velocities of the motion `dry`, if given. Raises the
     same errors as `Robot.inverse_dynamics`.
     """
-    share = (NODES + 1) / 2
+    fraction = (NODES + 1) / 2
     weight = WEIGHTS / 2
-    times = (begins[:, None] + share * length).ravel()
+    times = (begins[:, None] + fraction * length).ravel()
     poses = motion.pose(times)
-    joints = model.robot.inverse_kinematics(poses).reshape(len(begins), len(share), -1)
-    turning = None
+    joints = model.robot.inverse_kinematics(poses).reshape(len(begins), len(fraction), -1)
+    dry_rates = None
     if dry is not None:
-        turning = np.einsum(
+        dry_rates = np.einsum(
             "nij,nj->ni", model.robot.pose_jacobian(dry.pose(times)), dry.pose_rate(times)
         )
-    torque = model.torque(poses, motion.pose_rate(times), motion.pose_acceleration(times), turning)
+    torque = model.torque(
+        poses, motion.pose_rate(times), motion.pose_acceleration(times), dry_rates
+    )
     begin, end = (
         model.robot.inverse_kinematics(motion.pose(begins + shift)) for shift in (0.0, length)
     )
@@ -176,6 +177,6 @@ def spans(
         begin,
         end,
         mean=np.einsum("s,nsj->nj", weight, joints),
-        mean_integral=length * np.einsum("s,nsj->nj", weight * (1 - share), joints),
+        mean_integral=length * np.einsum("s,nsj->nj", weight * (1 - fraction), joints),
         torque=np.einsum("s,nsj->nj", weight, torque.reshape(joints.shape)),
     )

@@ -22,7 +22,7 @@ from dynamics.control.inverse_dynamics import Model
 from dynamics.control.prediction import Prediction
 from dynamics.errors import SimulationError
 
-STEP = 3e-3
+LONGEST_STEP = 3e-3
 """Longest step of the prediction, s. Dry friction can reverse a joint within milliseconds."""
 
 PLACE_DOUBT = 1e-4
@@ -37,19 +37,19 @@ TORQUE_DOUBT = 1e-3
 VISCOUS_DOUBT = 5.0
 """Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s."""
 
-SCALE_FELT = 2.0
+TORQUE_COMMAND_FACTOR = 2.0
 """Ratio of the model error with torque commands to the model error with joint commands.
 
 With torque commands, the error of the common factor of all parameters has an effect, too.
 """
 
-MEMORY = 2.0
+MEMORY_TIME = 2.0
 """Time constant, s, with which information from earlier innovations about the scales fades.
 
 The gradient differs far from the solution, and early information would slow down convergence.
 """
 
-KNOWN_BEFORE = (0.3, 200.0)
+PRIOR_INFORMATION = (0.3, 200.0)
 """Prior information about the logarithms of the scales of the walk and of the noise."""
 
 SAME_TIME = 1e-9
@@ -104,40 +104,42 @@ class Observer:
 
     def _start(self, pose: np.ndarray, holding: np.ndarray, common: np.ndarray) -> None:
         """Set state and covariance at the start."""
-        at = self._prediction.blocks
+        blocks = self._prediction.blocks
         robot = self._model.robot
         torque = robot.static_torque(pose, self._model.dynamic)
-        free = robot.geometry.chart.basis
-        self._state = np.zeros(at.size)
-        self._state[at.coordinates] = robot.coordinates(pose)
+        basis = robot.geometry.chart.basis
+        self._state = np.zeros(blocks.size)
+        self._state[blocks.coordinates] = robot.coordinates(pose)
         if self._drives.torques:
-            self._state[at.torque] = torque - holding
+            self._state[blocks.torque] = torque - holding
         else:
-            self._state[at.integral] = self._model.held(pose, self._drives)[1]
+            self._state[blocks.integral] = self._model.held(pose, self._drives)[1]
         scale = np.abs(torque).mean()
         # The random walk changes as much per frame period as the error of the model, whose change
         # is smooth along a motion.
-        walk = np.zeros(at.size)
-        doubt = np.zeros(at.size)
-        felt_scale = SCALE_FELT if self._drives.torques else 1.0
-        walk[at.torque] = felt_scale * self._model.doubt * scale * np.sqrt(self._period)
+        walk = np.zeros(blocks.size)
+        doubt = np.zeros(blocks.size)
+        factor = TORQUE_COMMAND_FACTOR if self._drives.torques else 1.0
+        walk[blocks.torque] = factor * self._model.doubt * scale * np.sqrt(self._period)
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
-        mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
-        # Inertia at each joint while the other joints are free.
-        felt = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
-        doubt[at.coordinates] = PLACE_DOUBT
-        doubt[at.rates] = RATE_DOUBT
-        doubt[at.torque] = TORQUE_DOUBT * scale
-        doubt[at.viscous] = VISCOUS_DOUBT * felt
+        mass = basis.T @ robot.mass_matrix(pose, self._model.dynamic) @ basis
+        # inertia at each joint while the other joints are free
+        inertia = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
+        doubt[blocks.coordinates] = PLACE_DOUBT
+        doubt[blocks.rates] = RATE_DOUBT
+        doubt[blocks.torque] = TORQUE_DOUBT * scale
+        doubt[blocks.viscous] = VISCOUS_DOUBT * inertia
         self._covariance = np.diag(doubt**2)
-        self._covariance[at.offset, at.offset] = free.T @ common @ free
-        self._seen = np.zeros((len(mass), at.size))
-        # The offset of the sensor is in every measured pose.
-        self._seen[:, at.coordinates] = self._seen[:, at.offset] = np.eye(len(mass))
-        self._by_scale = np.zeros((2, at.size, at.size))
+        self._covariance[blocks.offset, blocks.offset] = basis.T @ common @ basis
+        # the offset of the sensor is in every measured pose
+        self._output_map = np.zeros((len(mass), blocks.size))
+        self._output_map[:, blocks.coordinates] = np.eye(len(mass))
+        self._output_map[:, blocks.offset] = np.eye(len(mass))
+        # derivatives of the covariance with respect to the logarithms of the two scales
+        self._by_scale = np.zeros((2, blocks.size, blocks.size))
         self._scale = np.zeros(2)
-        self._information = np.diag(KNOWN_BEFORE)
+        self._information = np.diag(PRIOR_INFORMATION)
 
     @property
     def scales(self) -> np.ndarray:
@@ -155,8 +157,7 @@ class Observer:
         return self._state[self._prediction.blocks.viscous].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
-        """Go on to a frame, and update the state by its measured pose (6,). The pose is None if
-        lost.
+        """Go on to a frame, and update the state by its measured pose (6,), or None if lost.
 
         Returns the estimate before the update.
         """
@@ -190,35 +191,39 @@ class Observer:
         return 4 + sum(1 for arrival in self._arrivals if arrival > self._time - 2 * self._period)
 
     def _estimate(self, state: np.ndarray, covariance: np.ndarray) -> Estimate:
-        at = self._prediction.blocks
-        place = covariance[at.coordinates, at.coordinates]
-        return Estimate(state[at.coordinates].copy(), state[at.rates].copy(), place.copy())
+        """Coordinates and rates of a state, with the covariance of the coordinates."""
+        blocks = self._prediction.blocks
+        place = covariance[blocks.coordinates, blocks.coordinates]
+        return Estimate(state[blocks.coordinates].copy(), state[blocks.rates].copy(), place.copy())
 
     def _learn(self, measured: np.ndarray, noise: np.ndarray) -> None:
         """Update the state, the covariance and the scales by measured coordinates (m,)."""
-        seen = self._seen
-        free = self._model.robot.geometry.chart.basis
-        noise = np.exp(self._scale[1]) * free.T @ noise @ free
-        innovation = measured - seen @ self._state
-        inverse = np.linalg.inv(seen @ self._covariance @ seen.T + noise)
-        by_scale = seen @ self._by_scale @ seen.T
+        output_map = self._output_map
+        basis = self._model.robot.geometry.chart.basis
+        noise = np.exp(self._scale[1]) * basis.T @ noise @ basis
+        innovation = measured - output_map @ self._state
+        inverse = np.linalg.inv(output_map @ self._covariance @ output_map.T + noise)
+        by_scale = output_map @ self._by_scale @ output_map.T
         by_scale[1] += noise
-        told = inverse @ innovation
-        shares = inverse @ by_scale
+        weighted = inverse @ innovation
+        ratios = inverse @ by_scale
         # gradient of the log likelihood with respect to the logarithms of the scales
         gradient = 0.5 * (
-            np.einsum("i,kij,j->k", told, by_scale, told) - np.trace(shares, axis1=1, axis2=2)
+            np.einsum("i,kij,j->k", weighted, by_scale, weighted)
+            - np.trace(ratios, axis1=1, axis2=2)
         )
-        before = np.diag(KNOWN_BEFORE)
+        prior = np.diag(PRIOR_INFORMATION)
         # information from earlier innovations fades towards the prior information
-        self._information = before + np.exp(-self._period / MEMORY) * (self._information - before)
-        self._information += 0.5 * np.einsum("aij,bji->ab", shares, shares)
-        gain = self._covariance @ seen.T @ inverse
+        self._information = prior + np.exp(-self._period / MEMORY_TIME) * (
+            self._information - prior
+        )
+        self._information += 0.5 * np.einsum("aij,bji->ab", ratios, ratios)
+        gain = self._covariance @ output_map.T @ inverse
         self._state = self._state + gain @ innovation
-        kept = np.eye(len(gain)) - gain @ seen
+        remaining = np.eye(len(gain)) - gain @ output_map
         # the Joseph form keeps the covariance positive definite in spite of rounding
-        self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T
-        self._by_scale = kept @ self._by_scale @ kept.T
+        self._covariance = remaining @ self._covariance @ remaining.T + gain @ noise @ gain.T
+        self._by_scale = remaining @ self._by_scale @ remaining.T
         self._by_scale[1] += gain @ noise @ gain.T
         # a step of at most a half in the logarithm, because the gradient of one frame is noisy
         self._scale = self._scale + np.clip(np.linalg.solve(self._information, gradient), -0.5, 0.5)
@@ -236,8 +241,8 @@ class Observer:
             begins = [*self._arrivals, *(arrival + self._period for arrival in self._arrivals)]
             later = [begin for begin in begins if at + SAME_TIME * self._period < begin < time]
             until = min([time, *later])
-            # steps of equal length, none longer than STEP
-            end = at + (until - at) / np.ceil((until - at) / STEP)
+            # steps of equal length, none longer than LONGEST_STEP
+            end = at + (until - at) / np.ceil((until - at) / LONGEST_STEP)
             command, rate = self._acting((at + end) / 2)
             state, errors = self._prediction.step(state, covariance, command, rate, end - at)
             walked = np.exp(self._scale[0]) * (end - at) * self._walk

@@ -24,16 +24,16 @@ from scipy.special import ndtr
 from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.inverse_dynamics import Model
 
-ROUNDS = 12
-"""Largest number of iterations of Newton's method over the joints."""
+MOST_ITERATIONS = 12
+"""Largest number of iterations of Newton's method for the friction of all joints."""
 
-STEP_TOLERANCE = 1e-6
-"""Error of a saturation below which these iterations end."""
+FRICTION_TOLERANCE = 1e-6
+"""Error of a joint's friction, over the largest friction, below which the iterations end."""
 
 LEAST_WIDTH = 1e-9
 """Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly."""
 
-SHORTEST = 1.5e-3
+SHORTEST_HALVED = 1.5e-3
 """Length, s, below which a step in which a joint reverses is not halved."""
 
 LEAST_REACH = 1e-3
@@ -92,15 +92,15 @@ class Prediction:
         command_rate: np.ndarray,
         length: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """State after a time, s, during which a command (n,) and its rate act, and the map of
-        errors.
+        """State after a time, s, during which a command (n,) and its rate act.
 
-        The covariance (size, size) of the state determines how well the velocities of joints are
-        known. A step in which a joint comes to rest or breaks away is halved until this changes its
+        Also returns the map (size, size) from errors of the state before to errors after. The
+        covariance (size, size) of the state determines how well the velocities of joints are known.
+        A step in which a joint comes to rest or breaks away is halved until this changes its
         velocity by less than the standard deviation of the velocity.
         """
         after, errors, turns = self._once(state, covariance, command, command_rate, length)
-        if not turns or length < SHORTEST:
+        if not turns or length < SHORTEST_HALVED:
             return after, errors
         midway, first = self.step(state, covariance, command, command_rate, length / 2)
         after, second = self.step(
@@ -121,33 +121,34 @@ class Prediction:
         It is too long if a joint that comes to rest or breaks away changes its velocity by more
         than the standard deviation of the velocity.
         """
-        at = self.blocks
-        free, errors, jacobian = self._without_dry_friction(state, command, command_rate, length)
+        blocks = self.blocks
+        after, errors, jacobian = self._without_dry_friction(state, command, command_rate, length)
         if not self._coulomb.any():
-            return free, errors, False
-        by_rates = jacobian @ errors[at.rates]
-        velocity = jacobian @ free[at.rates]
+            return after, errors, False
+        by_rates = jacobian @ errors[blocks.rates]
+        velocity = jacobian @ after[blocks.rates]
         # effect of a torque over the step
-        pushed = errors[at.moving, at.torque]
-        turned = jacobian @ pushed[at.rates]
+        pushed = errors[blocks.moving, blocks.torque]
+        turned = jacobian @ pushed[blocks.rates]
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
-        level, kept = expected_dry_friction(velocity, width, turned, largest, smooth)
+        level, gains = expected_dry_friction(velocity, width, turned, largest, smooth)
         # friction at one joint changes the velocities, and thus the friction, of the others
         gain = np.linalg.solve(
-            np.eye(len(level)) + kept[:, None] * (turned - np.diag(np.diag(turned))), np.diag(kept)
+            np.eye(len(level)) + gains[:, None] * (turned - np.diag(np.diag(turned))),
+            np.diag(gains),
         )
-        free[at.moving] -= pushed @ level
-        errors[at.moving] -= pushed @ gain @ by_rates
-        moved = np.maximum(np.abs(jacobian @ state[at.rates]), np.abs(jacobian @ free[at.rates]))
+        after[blocks.moving] -= pushed @ level
+        errors[blocks.moving] -= pushed @ gain @ by_rates
+        moved = np.maximum(
+            np.abs(jacobian @ state[blocks.rates]), np.abs(jacobian @ after[blocks.rates])
+        )
         # velocity that additional friction could remove
         unused = np.diag(turned) * (largest - np.abs(level))
-        return free, errors, bool((np.minimum(moved, unused) > width).any())
+        return after, errors, bool((np.minimum(moved, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
-        """Largest dry friction (n,) at joint velocities, and the velocity over which it
-        changes its sign.
-        """
+        """Largest dry friction (n,) at joint velocities, and the velocity of its change of sign."""
         law = self._friction
         largest = self._coulomb
         if law.name == "stribeck":
@@ -163,7 +164,7 @@ class Prediction:
         slope, by_state, jacobian = self._slope(state, command, command_rate)
         moving = self.blocks.moving
         size = len(slope)
-        held = slice(size, by_state.shape[1])
+        constant = slice(size, by_state.shape[1])
         augmented = np.zeros((by_state.shape[1] + 1, by_state.shape[1] + 1))
         augmented[moving, :-1] = length * by_state
         augmented[moving, -1] = length * slope
@@ -172,61 +173,60 @@ class Prediction:
         errors = np.eye(self.blocks.size)
         after[moving] += moved[moving, -1]
         errors[moving, moving] = moved[moving, moving]
-        errors[moving, held] = moved[moving, held]
+        errors[moving, constant] = moved[moving, constant]
         return after, errors, jacobian
 
     def _slope(
         self, state: np.ndarray, command: np.ndarray, command_rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Time derivative of the moving parts, its derivatives, and the Jacobian of the joints (n,
-        m).
+        """Time derivative of the moving parts, its derivatives, and the joint Jacobian (n, m).
 
         The derivatives are with respect to the state without the offset.
         """
-        at = self.blocks
+        blocks = self.blocks
         law = self._law
         pid = not self._drives.torques
         li = law.li
         ld = law.ld
-        stiff = law.lp + law.lx
-        q = state[at.coordinates]
-        rate = state[at.rates]
-        integral = state[at.integral]
-        found = self._motion(q[None], rate[None], self._rigid)
-        mass, bias, jacobian, _, angle, *_ = (part[0] for part in found)
+        stiffness = law.lp + law.lx
+        q = state[blocks.coordinates]
+        rate = state[blocks.rates]
+        integral = state[blocks.integral]
+        outputs = self._motion(q[None], rate[None], self._rigid)
+        mass, bias, jacobian, _, angle, *_ = (part[0] for part in outputs)
         velocity = jacobian @ rate
         error = command - angle[:, 0]
         by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
         torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
         limit = self._drives.torque_limit
-        growing = error
+        integral_rate = error
         if limit is not None:
             # conditional integration, as in the drives
-            further = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
-            growing = np.where(further, law.lx * velocity / np.where(li, li, 1.0), error)
+            winds_up = (np.abs(torque) >= limit) & ((li * error - law.lx * velocity) * torque > 0)
+            integral_rate = np.where(winds_up, law.lx * velocity / np.where(li, li, 1.0), error)
             torque = np.clip(torque, -limit, limit)
         push = np.linalg.solve(mass, jacobian.T)
         falling = np.linalg.solve(mass, bias[:, 0])
-        viscous = self._viscous + state[at.viscous]
-        net = torque + state[at.torque] - viscous * velocity
+        viscous = self._viscous + state[blocks.viscous]
+        net = torque + state[blocks.torque] - viscous * velocity
         acceleration = push @ net - falling
-        given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
-        by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
+        arguments = (q[None], rate[None], acceleration[None], net[None], self._rigid)
+        by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*arguments))
         # the derivative of the joint accelerations with respect to the rates is 2 J_theta_dot
         damping = (ld * pid + viscous)[:, None]
-        by_state = np.zeros((at.moving.stop, at.offset.start))
-        by_state[at.coordinates, at.rates] = np.eye(len(rate))
-        of_rates = by_state[at.rates]
-        of_rates[:, at.coordinates] = push @ (
-            (-stiff * pid)[:, None] * jacobian - damping * (turning / 2)
+        by_state = np.zeros((blocks.moving.stop, blocks.offset.start))
+        by_state[blocks.coordinates, blocks.rates] = np.eye(len(rate))
+        of_rates = by_state[blocks.rates]
+        of_rates[:, blocks.coordinates] = push @ (
+            (-stiffness * pid)[:, None] * jacobian - damping * (turning / 2)
         )
-        of_rates[:, at.coordinates] -= np.linalg.solve(mass, by_q)
-        of_rates[:, at.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
-        of_rates[:, at.integral] = li * pid * push
-        of_rates[:, at.torque] = push
-        of_rates[:, at.viscous] = -push * velocity
-        by_state[at.integral, at.coordinates] = -pid * jacobian
-        return np.concatenate([rate, acceleration, pid * growing]), by_state, jacobian
+        of_rates[:, blocks.coordinates] -= np.linalg.solve(mass, by_q)
+        of_rates[:, blocks.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
+        of_rates[:, blocks.integral] = li * pid * push
+        of_rates[:, blocks.torque] = push
+        of_rates[:, blocks.viscous] = -push * velocity
+        by_state[blocks.integral, blocks.coordinates] = -pid * jacobian
+        return np.concatenate([rate, acceleration, pid * integral_rate]), by_state, jacobian
 
 
 def expected_dry_friction(
@@ -246,24 +246,25 @@ def expected_dry_friction(
     With this gain, propagated errors have the variance of the velocity after dry friction, which
     stops a part of the distribution. The slope of the expected torque would give another variance.
     """
-    own = np.diag(turned)
-    reach = np.maximum(own * largest + smooth, LEAST_REACH * width)
-    others = turned - np.diag(own)
+    own_effect = np.diag(turned)
+    reach = np.maximum(own_effect * largest + smooth, LEAST_REACH * width)
+    others = turned - np.diag(own_effect)
     # Newton's method; in its initial guess, each joint slips or rests as if it were alone
     level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
-    for _ in range(ROUNDS):
-        share, slope, _ = expected_saturation(velocity - others @ level, width, reach)
-        miss = largest * share - level
+    for _ in range(MOST_ITERATIONS):
+        saturation, slope, _ = expected_saturation(velocity - others @ level, width, reach)
+        residual = largest * saturation - level
         level = level + np.linalg.solve(
-            np.eye(len(level)) + (largest * slope)[:, None] * others, miss
+            np.eye(len(level)) + (largest * slope)[:, None] * others, residual
         )
-        if np.abs(miss).max() <= STEP_TOLERANCE * largest.max():
+        if np.abs(residual).max() <= FRICTION_TOLERANCE * largest.max():
             break
     _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
-    change = own * largest
-    # share of the variance of a velocity that remains after dry friction
-    passed = 1 - 2 * change * slope + (change / width) ** 2 * variance
-    return np.clip(level, -largest, largest), (1 - np.sqrt(np.clip(passed, 0.0, 1.0))) / own
+    change = own_effect * largest
+    # fraction of the variance of a velocity that remains after dry friction
+    remaining = 1 - 2 * change * slope + (change / width) ** 2 * variance
+    gain = (1 - np.sqrt(np.clip(remaining, 0.0, 1.0))) / own_effect
+    return np.clip(level, -largest, largest), gain
 
 
 def expected_saturation(
@@ -279,5 +280,6 @@ def expected_saturation(
     at_low, at_high = (np.exp(-(end**2) / 2) / np.sqrt(2 * np.pi) for end in (low, high))
     line = mean * inside + deviation * (at_low - at_high)
     square = mean * line + deviation * (deviation * inside - reach * (at_low + at_high))
-    share = ndtr(-high) - ndtr(low) + line / reach
-    return share, inside / reach, np.maximum(1 - inside + square / reach**2 - share**2, 0.0)
+    saturation = ndtr(-high) - ndtr(low) + line / reach
+    variance = 1 - inside + square / reach**2 - saturation**2
+    return saturation, inside / reach, np.maximum(variance, 0.0)

@@ -1,4 +1,4 @@
-"""Mechanism that another program's file describes: its bodies and joints at home, and its legs.
+"""Mechanism in a file of another program: its bodies and joints at home, and its legs.
 
 Bodies that are welded together become one body. Joints that meet in a body without mass become one
 joint: two hinges become a universal joint, and three become a ball joint.
@@ -16,8 +16,8 @@ from dynamics.legs.chain import SAME, Chain
 BASE = 0
 """Number of the body that is fixed to the ground."""
 
-SHARE_OF_HUB = 1e-4
-"""Share of the total mass below which a body between two hinges counts as part of a joint.
+HUB_MASS_RATIO = 1e-4
+"""Fraction of the total mass below which a body between two hinges counts as part of a joint.
 
 Such a body has a small mass only because engines require one.
 """
@@ -27,8 +27,9 @@ Such a body has a small mass only because engines require one.
 class Solid:
     """Rigid body at home. All vectors are in the axes of the base.
 
-    It has its mass, kg; its centre of mass (3,), m; its inertia about that centre (3, 3), kg m^2;
-    its own axes as columns (3, 3); and the length and radius, m, of the rod that draws it.
+    `mass` is in kg, and `centre` (3,) is the centre of mass, m. `inertia` (3, 3) is about the
+    centre, kg m^2. `axes` (3, 3) has the axes of the body as columns. `rod` is the length and the
+    radius of the rod that draws the body, m.
     """
 
     name: str
@@ -42,9 +43,9 @@ class Solid:
 class Freedom(NamedTuple):
     """Elementary joint between two bodies.
 
-    Its kind is "hinge", "slide" or "ball". Its point (3,), m, and its axis (3,) are in the axes of
-    the base. `coordinate` is the joint coordinate at home, `friction` is the dry and the viscous
-    friction, and `actuator` is the number of its actuator, or None.
+    `kind` is "hinge", "slide" or "ball". `point` (3,), m, and `axis` (3,) are in the axes of the
+    base. `coordinate` is that at home, rad or m. `friction` is the dry friction, N m or N, and the
+    viscous friction, N m s/rad or N s/m. `actuator` is the number of the actuator, or None.
     """
 
     kind: str
@@ -120,7 +121,7 @@ def simplified(mechanism: Mechanism) -> Mechanism:
         keep, gone = sorted((weld.first, weld.second))
         solids[keep] = solids[keep] if keep == BASE else _together(solids[keep], solids[gone])
         connections = _moved(connections, weld, gone, keep)
-    limit = SHARE_OF_HUB * sum(solid.mass for solid in mechanism.solids[1:])
+    limit = HUB_MASS_RATIO * sum(solid.mass for solid in mechanism.solids[1:])
     notes = list(mechanism.notes)
     while (hub := _hub(solids, connections, limit)) is not None:
         body, (a, b) = hub
@@ -145,13 +146,13 @@ def platform_of(mechanism: Mechanism) -> int:
         for body in {one.first, one.second} - {BASE}:
             count[body] += 1
     most = max(count.values(), default=0)
-    found = [body for body, number in count.items() if number == most]
-    if most < 2 or len(found) > 1:
-        names = ", ".join(mechanism.solids[body].name for body in found) or "none"
+    candidates = [body for body, number in count.items() if number == most]
+    if most < 2 or len(candidates) > 1:
+        names = ", ".join(mechanism.solids[body].name for body in candidates) or "none"
         raise RobotFileError(
             f"no single body can be the platform: the most joints ({most}) belong to {names}"
         )
-    return found[0]
+    return candidates[0]
 
 
 def legs_of(
@@ -163,11 +164,11 @@ def legs_of(
     are the axes and the origin of the platform at home. Raises RobotFileError, with the leg and its
     bodies, for a mechanism of any other form.
     """
-    left = [body for body in range(1, len(mechanism.solids)) if body != platform]
+    remaining = [body for body in range(1, len(mechanism.solids)) if body != platform]
     number = 0
-    while left:
-        members = _reached(mechanism, left[0], {BASE, platform})
-        left = [body for body in left if body not in members]
+    while remaining:
+        members = _reached(mechanism, remaining[0], {BASE, platform})
+        remaining = [body for body in remaining if body not in members]
         if not any({one.first, one.second} & members for one in mechanism.connections):
             continue
         number += 1
@@ -207,7 +208,7 @@ def _leg(
     points = []
     axes = []
     bodies = []
-    across = np.zeros(3)
+    bar_offset = np.zeros(3)
     for steps in zip(*paths, strict=True):
         kinds = [_joint(connection.seen_from(body)) for body, connection in steps]
         kind, point, axis = kinds[0]
@@ -219,9 +220,9 @@ def _leg(
                 raise RobotFileError(
                     f"its two bars are joined differently, by {kinds[0][0]} and {kinds[1][0]}"
                 )
-            before = across
-            across = kinds[1][1] - kinds[0][1]
-            if before.any() and np.linalg.norm(across - before) > SAME:
+            offset_before = bar_offset
+            bar_offset = kinds[1][1] - kinds[0][1]
+            if offset_before.any() and np.linalg.norm(bar_offset - offset_before) > SAME:
                 raise RobotFileError("its two bars are not parallel")
             point = (kinds[0][1] + kinds[1][1]) / 2
         joints.append(kind + "*" * sum(one.actuator is not None for one in steps[0][1].freedoms))
@@ -238,7 +239,7 @@ def _leg(
         np.array(axes),
         actuated[0].coordinate,
         end,
-        across,
+        bar_offset,
         centres,
         rods,
     )
@@ -281,21 +282,22 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
     if kinds not in (2 * ["hinge"], 3 * ["hinge"]):
         return "-".join(kinds), freedoms[0].point, axes
     directions = np.array([one.axis for one in freedoms])
+    # the point that is nearest to the axes of all hinges
     square = sum(np.eye(3) - np.outer(axis, axis) for axis in directions)
     pulled = sum((np.eye(3) - np.outer(one.axis, one.axis)) @ one.point for one in freedoms)
     point = np.linalg.lstsq(square, pulled, rcond=None)[0]
-    apart = max(float(np.linalg.norm(np.cross(one.axis, point - one.point))) for one in freedoms)
+    distance = max(float(np.linalg.norm(np.cross(one.axis, point - one.point))) for one in freedoms)
     names = ", ".join(one.name for one in freedoms)
-    if apart > SAME:
+    if distance > SAME:
         raise RobotFileError(
-            f"the axes of the hinges {names} are {2 * apart:.3g} m apart, must meet in a point"
+            f"the axes of the hinges {names} are {2 * distance:.3g} m apart, must meet in a point"
         )
     if len(kinds) == 2:
-        lean = abs(float(directions[0] @ directions[1]))
-        if lean > SAME:
+        cosine = abs(float(directions[0] @ directions[1]))
+        if cosine > SAME:
             raise RobotFileError(
-                f"the hinges {names} are {np.degrees(np.arcsin(lean)):.3g} deg from perpendicular "
-                "to each other"
+                f"the hinges {names} are {np.degrees(np.arcsin(cosine)):.3g} deg from "
+                "perpendicular to each other"
             )
         return "universal", point, axes
     if abs(np.linalg.det(directions)) < 1e-3:
@@ -307,15 +309,15 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
 
 def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
     """Bodies that are connected to `start` without passing through the bodies in `walls`."""
-    found = {start}
-    left = [start]
-    while left:
-        body = left.pop()
+    reached = {start}
+    pending = [start]
+    while pending:
+        body = pending.pop()
         for one in mechanism.connections:
-            if body in (one.first, one.second) and one.other(body) not in found | walls:
-                found.add(one.other(body))
-                left.append(one.other(body))
-    return found
+            if body in (one.first, one.second) and one.other(body) not in reached | walls:
+                reached.add(one.other(body))
+                pending.append(one.other(body))
+    return reached
 
 
 def _hub(
@@ -326,23 +328,23 @@ def _hub(
     Such a body has nearly no mass and two connections, which consist of hinges.
     """
     for body in range(1, len(solids)):
-        own = [one for one in connections if body in (one.first, one.second)]
+        joined = [one for one in connections if body in (one.first, one.second)]
         if (
-            len(own) == 2
+            len(joined) == 2
             and solids[body].mass <= limit
-            and all(f.kind == "hinge" for one in own for f in one.freedoms)
+            and all(f.kind == "hinge" for one in joined for f in one.freedoms)
         ):
-            return body, (own[0], own[1])
+            return body, (joined[0], joined[1])
     return None
 
 
 def _moved(connections: list[Connection], gone: Connection, old: int, new: int) -> list[Connection]:
     """Connections without `gone`, in which body `new` replaces body `old`."""
-    left = [one for one in connections if one is not gone]
-    names = {old: new}
+    kept = [one for one in connections if one is not gone]
+    numbers = {old: new}
     return [
-        Connection(names.get(c.first, c.first), names.get(c.second, c.second), c.freedoms)
-        for c in left
+        Connection(numbers.get(c.first, c.first), numbers.get(c.second, c.second), c.freedoms)
+        for c in kept
     ]
 
 

@@ -40,11 +40,11 @@ from dynamics.kinematics.platform import base_from_platform
 from dynamics.pseudo_inertia import PAIRS, about_centre, is_centred
 from dynamics.robot import Robot
 
-# MuJoCo lowers larger values to this without a warning.
+# MuJoCo lowers larger values to this one without a warning
 MAX_IMPEDANCE = 0.9999
 
-# XML has no way to write these: control characters, halves of surrogate pairs (undecodable file
-# names), non-characters.
+# characters that XML cannot write: control characters, halves of surrogate pairs (from undecodable
+# file names), non-characters
 NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 Integrator = Literal["implicitfast", "RK4"]
@@ -66,8 +66,8 @@ class MjcfSolver:
     of `cmmsim verify-model`.
 
     `time_constant_steps` is the time constant of the springs in steps; MuJoCo requires at least 2.
-    `impedance` is the share of the constraint force that the solver enforces at once; the springs
-    provide the remainder.
+    `impedance` is the fraction of the constraint force that the solver enforces at once; the
+    springs provide the remainder.
 
     The integrator implicitfast treats joint damping implicitly. It is stable for any viscous
     friction and needs one evaluation per step. RK4 is of fourth order, for comparisons with other
@@ -100,8 +100,8 @@ def mjcf_text(
 ) -> str:
     """MJCF of a robot with dynamic parameters (p,), by default the nominal ones.
 
-    If `coulomb` is False, the dry friction is left out and joints have only their damping. `source`
-    is a text for the header of the file that states where the parameters come from.
+    If `coulomb` is False, joints have viscous friction only. `source` is a text for the header of
+    the file that states where the parameters come from.
 
     Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
     body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
@@ -172,6 +172,7 @@ class _Chain:
 
 def end_names(part: Part) -> dict[str, str]:
     """Names of the two sites that a loop joins: on a leg's last part, and on the platform."""
+    # the end of a name such as link1a: the number of the leg, and the letter of the bar
     tail = part.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
     return {"site1": f"link_end{tail}", "site2": f"platform_joint{tail}"}
 
@@ -197,6 +198,7 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
 
 
 def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int) -> None:
+    """Add options of the solver, and defaults for loops, joints, geoms and sites."""
     _add_comment(
         root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two."
     )
@@ -231,6 +233,7 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int
 
 
 def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> None:
+    """Add the platform with its inertia (10,), the sites of its joints, and its appearance."""
     pose = chain.robot.home_pose
     joints = chain.robot.geometry.platform_joints
     turned = numbers_text(quaternion(base_from_platform(pose)))
@@ -292,12 +295,12 @@ def _add_joint(
         Xml.SubElement(body, "joint", name=part.name, type="hinge", axis=numbers_text(axis))
         Xml.SubElement(body, "joint", name=f"{part.name}_x", type="hinge", axis="1 0 0")
         return [0.0, 0.0]
-    form = {"type": part.segment.joint, "axis": numbers_text(axis)}
+    attributes = {"type": part.segment.joint, "axis": numbers_text(axis)}
     if not part.segment.actuated:
-        Xml.SubElement(body, "joint", name=part.name, attrib=form)
+        Xml.SubElement(body, "joint", name=part.name, attrib=attributes)
         return [0.0]
-    form |= {"ref": numbers_text(coordinate)} | friction
-    Xml.SubElement(body, "joint", name=f"joint{part.leg + 1}", attrib=form)
+    attributes |= {"ref": numbers_text(coordinate)} | friction
+    Xml.SubElement(body, "joint", name=f"joint{part.leg + 1}", attrib=attributes)
     return [coordinate]
 
 
@@ -316,18 +319,19 @@ def _cleaned(values: np.ndarray) -> np.ndarray:
 
 def _add_inertia(body: Xml.Element, reference: np.ndarray, inertia: np.ndarray) -> None:
     """Add the inertia of a full body (10,) with a reference point (3,) in the axes of the body."""
-    form = {"pos": numbers_text(reference), "mass": numbers_text(inertia[0])}
+    attributes = {"pos": numbers_text(reference), "mass": numbers_text(inertia[0])}
     if is_centred(inertia):
-        form["diaginertia"] = numbers_text(inertia[4:7])
+        attributes["diaginertia"] = numbers_text(inertia[4:7])
     else:
         centre, about = about_centre(inertia)
-        form["pos"] = numbers_text(reference + centre)
+        attributes["pos"] = numbers_text(reference + centre)
         products = [about[row, column] for row, column in PAIRS]
-        form["fullinertia"] = numbers_text([*np.diagonal(about), *products])
-    Xml.SubElement(body, "inertial", attrib=form)
+        attributes["fullinertia"] = numbers_text([*np.diagonal(about), *products])
+    Xml.SubElement(body, "inertial", attrib=attributes)
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
+    """Add an equality that closes each loop, and the motor of each leg."""
     equality = Xml.SubElement(root, "equality")
     actuator = Xml.SubElement(root, "actuator")
     for number in chain.ends:

@@ -19,7 +19,7 @@ from dynamics.files import LARGEST_XML, parse_xml, read_bytes
 from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
-MOST = 120
+MOST_BODIES = 120
 """Largest number of bodies of a robot."""
 
 
@@ -44,11 +44,11 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
         raise RobotFileError(f"{path}: {error}") from None
 
 
-def _refuse_large(path: Path, above: tuple[Path, ...] = ()) -> int:
+def _refuse_large(path: Path, including: tuple[Path, ...] = ()) -> int:
     """Count the bodies of a file and of the files that it includes.
 
-    Raises RobotFileError if the file has more bodies than a robot, or includes a file of another
-    folder.
+    `including` are the files that include this one. Raises RobotFileError if the file has more
+    bodies than a robot, or includes a file of another folder.
     """
     content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
     bodies = 0
@@ -56,15 +56,20 @@ def _refuse_large(path: Path, above: tuple[Path, ...] = ()) -> int:
         bodies += element.tag == "body"
         if element.tag == "include":
             name = Path(element.get("file", ""))
-            further = path.parent / name
-            if name.is_absolute() or ".." in name.parts or further in above or len(above) > 8:
+            included = path.parent / name
+            if (
+                name.is_absolute()
+                or ".." in name.parts
+                or included in including
+                or len(including) > 8
+            ):
                 raise RobotFileError(
                     f"{path} includes {shown(str(name))}; it may only include files of its own "
                     "folder, and each of them once"
                 )
-            bodies += _refuse_large(further, (*above, path, further))
-    if bodies > MOST:
-        raise RobotFileError(f"{path} has {bodies} bodies, a robot has at most {MOST}")
+            bodies += _refuse_large(included, (*including, path, included))
+    if bodies > MOST_BODIES:
+        raise RobotFileError(f"{path} has {bodies} bodies, a robot has at most {MOST_BODIES}")
     return bodies
 
 

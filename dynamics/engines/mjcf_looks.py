@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from dynamics.geometry import RobotGeometry
 
-BALL_RADIUS = 0.009
-PLATE_THICKNESS = 0.012
+BALL_RADIUS = 0.009  # m
+PLATE_THICKNESS = 0.012  # m
 COLOURS = {
     "base": "0.35 0.37 0.40 1",
     "crank": "0.85 0.45 0.15 1",
@@ -35,8 +35,8 @@ def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
 def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
     """Add geoms that show the base.
 
-    They are a plate behind the legs, as seen from the platform, a motor on each hinge of the base,
-    and a rail below each slide.
+    The geoms are a plate behind the legs, as seen from the platform, a motor on each hinge of the
+    base, and a rail below each slide.
     """
     centre, radius = disc(geometry.base_joints)
     behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])

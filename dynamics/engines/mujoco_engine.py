@@ -24,7 +24,7 @@ class MujocoMissingError(DynamicsError):
 
 
 class MujocoError(DynamicsError):
-    """MuJoCo does not load or refuses a model, or a value for it is invalid."""
+    """MuJoCo does not load, or refuses a model or a value."""
 
 
 def import_mujoco() -> Any:
@@ -75,8 +75,9 @@ class MujocoRobot:
             self._bodies = [self.model.body(part.name) for part in self._parts.all]
         except KeyError as error:
             raise MujocoError(f"the model is no export of {robot.name}: {error.args[0]}") from None
-        self._joint = np.array([joint.qposadr[0] for joint in joints])
-        self._rate = np.array([joint.dofadr[0] for joint in joints])
+        # places of the actuated joints in the coordinates and in the rates of MuJoCo
+        self._coordinate_places = np.array([joint.qposadr[0] for joint in joints])
+        self._rate_places = np.array([joint.dofadr[0] for joint in joints])
 
     @property
     def timestep(self) -> float:
@@ -97,12 +98,12 @@ class MujocoRobot:
     @property
     def joints(self) -> np.ndarray:
         """Joint coordinates (n,), rad or m."""
-        return self.data.qpos[self._joint]
+        return self.data.qpos[self._coordinate_places]
 
     @property
     def joint_rates(self) -> np.ndarray:
         """Rates of the joint coordinates (n,), rad/s or m/s."""
-        return self.data.qvel[self._rate]
+        return self.data.qvel[self._rate_places]
 
     @property
     def closure_error(self) -> float:
@@ -139,64 +140,64 @@ class MujocoRobot:
         self._mujoco.mj_resetData(self.model, data)
         data.qpos[:7] = [*pose[:3], *quaternion(platform)]
         data.qvel[:6] = [*twist[:3], *(platform.T @ twist[3:])]
-        data.qpos[self._joint] = self._robot.inverse_kinematics(pose)
-        data.qvel[self._rate] = self._robot.joint_jacobian(pose) @ twist
+        data.qpos[self._coordinate_places] = self._robot.inverse_kinematics(pose)
+        data.qvel[self._rate_places] = self._robot.joint_jacobian(pose) @ twist
         for number, (part, body) in enumerate(zip(self._parts.all, self._bodies, strict=True)):
             if part.segment.actuated:
                 continue
-            at = int(body.jntadr[0])
+            at = int(self.model.jnt_qposadr[int(body.jntadr[0])])
             rate = int(body.dofadr[0])
-            at = int(self.model.jnt_qposadr[at])
-            own = frames.axes[number]
+            axes = frames.axes[number]
             before = frames.axes[part.before]
             at_rest = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
-            turned = at_rest.T @ before.T @ own
-            spin = own.T @ (frames.spin[number] - frames.spin[part.before])
+            turned = at_rest.T @ before.T @ axes
+            spin = axes.T @ (frames.spin[number] - frames.spin[part.before])
             if part.segment.joint == "ball":
                 data.qpos[at : at + 4] = quaternion(turned)
                 data.qvel[rate : rate + 3] = spin
                 continue
             axis = part_axis(part, frames, number)
-            resting = at_rest.T @ part.segment.axis
+            axis_at_rest = at_rest.T @ part.segment.axis
             if part.segment.joint == "hinge":
-                data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ resting
+                data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ axis_at_rest
                 data.qvel[rate] = spin @ axis
                 continue
             # a universal joint turns about an axis of the part before it, then about x
-            moved = turned[:, 0]
-            angle = np.arctan2(np.cross(resting, X) @ moved, moved[0])
-            about_x = Rotation.from_rotvec(-angle * resting).as_matrix() @ turned
+            x_axis = turned[:, 0]
+            angle = np.arctan2(np.cross(axis_at_rest, X) @ x_axis, x_axis[0])
+            about_x = Rotation.from_rotvec(-angle * axis_at_rest).as_matrix() @ turned
             data.qpos[at : at + 2] = angle, np.arctan2(about_x[2, 1], about_x[1, 1])
             data.qvel[rate : rate + 2] = spin @ axis, spin[0]
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,) under joint torques or forces (n,).
+        """Acceleration [h_ddot, omega_dot] (6,) of the present state under torques or forces (n,).
 
-        It is that of the present state, in the axes of the base.
+        It is in the axes of the base, m/s^2 and rad/s^2.
         """
-        self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
+        self.data.ctrl[:] = floats("torque", torque, (self.model.nu,))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
     def feed_back(self, stiffness: ArrayLike, damping: ArrayLike) -> None:
-        """Add -stiffness * coordinate - damping * rate to every control, inside MuJoCo's
-        integrator.
+        """Add -stiffness * coordinate - damping * rate to every control, in MuJoCo's integrator.
 
-        Each is one number, or one number (n,) per joint.
+        Stiffness and damping are one number, or one number (n,) per joint.
         """
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         self.model.actuator_biasprm[:, 0] = 0.0
-        for column, (name, given) in enumerate(
+        for column, (name, coefficients) in enumerate(
             (("stiffness", stiffness), ("damping", damping)), start=1
         ):
-            values = floats(name, given, (), (len(self._joint),), error=MujocoError, finite=False)
+            values = floats(
+                name, coefficients, (), (self.model.nu,), error=MujocoError, finite=False
+            )
             for value in values.ravel().tolist():
                 real(name, value, MujocoError, least=0)
             self.model.actuator_biasprm[:, column] = -values
 
     def step(self, control: np.ndarray) -> None:
         """Do one step under a control (n,), N m or N."""
-        self.data.ctrl[:] = floats("control", control, (len(self._joint),))
+        self.data.ctrl[:] = floats("control", control, (self.model.nu,))
         self._mujoco.mj_step(self.model, self.data)

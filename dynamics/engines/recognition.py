@@ -35,8 +35,8 @@ from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import MOMENTS
 
-DIAGONAL = 1e-9
-"""Share of the largest moment below which products of inertia count as rounding errors."""
+ROUNDING = 1e-9
+"""Fraction of the largest moment below which products of inertia count as rounding errors."""
 
 MOST_TILT = 0.9
 """Largest sin(beta) at home.
@@ -45,21 +45,17 @@ Near 1 the angles are singular, because alpha and gamma turn about the same axis
 tilted further, its axes are reordered to be nearest to those of the base.
 """
 
-OWN_RATE = 2 * np.pi * 3
-"""Natural frequency of the chosen joint PID, rad/s, at the joint with the least inertia.
+DEFAULT_FREQUENCY = 2 * np.pi * 3
+"""Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID."""
 
-It is used for a file that states no joint PID.
-"""
+DEFAULT_DAMPING = 0.7
+"""Damping ratio of this joint."""
 
-OWN_DAMPING = 0.7
-"""Damping ratio of the chosen joint PID."""
-
-TRAVEL = 0.5
+DEFAULT_TRAVEL = 0.5
 """Travel beyond the home coordinates if a file states no joint ranges, rad."""
 
-TRAVEL_SHARE = 0.1
-"""Travel of sliding actuators if a file states no ranges, as a share of the distance from B to A.
-"""
+DEFAULT_TRAVEL_RATIO = 0.1
+"""Travel of sliding actuators if a file states no ranges, over the distance from B to A."""
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
@@ -74,8 +70,8 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     axes, moments = _principal(platform)
     if not np.array_equal(axes, platform.axes):
         notes.append(f"the platform has principal axes instead of the axes of {platform.name}")
-    found = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
-    legs = [_leg(one, k) for k, one in enumerate(found, 1)]
+    mechanism_legs = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
+    legs = [_leg(one, k) for k, one in enumerate(mechanism_legs, 1)]
     if not legs:
         raise RobotFileError(
             f"it has no legs: no body is between the base and {platform.name}, which has the most "
@@ -87,10 +83,10 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     if chart.name == "planar":
         home = (*home[:3], 0.0, 0.0, home[5])
         chart = _upright(axes, legs, home)
-    travel = plain.travel_limit or _travel(plain, found, legs, notes)
+    travel = plain.travel_limit or _travel(plain, mechanism_legs, legs, notes)
     geometry = RobotGeometry(tuple(legs), chart, travel, plain.gravity, unstated=Unstated())
-    of_platform = full_body(platform.mass, np.zeros(3), np.diag(moments))
-    bodies = _bodies(geometry, found, of_platform)
+    platform_inertia = full_body(platform.mass, np.zeros(3), np.diag(moments))
+    bodies = _bodies(geometry, mechanism_legs, platform_inertia)
     full = [
         body
         for body, row in zip(geometry.layout.bodies, bodies, strict=True)
@@ -98,12 +94,12 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     ]
     geometry = replace(geometry, full_bodies=tuple(full))
     layout = geometry.layout
-    notes += _spinning(geometry, found)
-    friction = np.transpose([one.actuated.friction for one in found])
+    notes += _spinning(geometry, mechanism_legs)
+    friction = np.transpose([one.actuated.friction for one in mechanism_legs])
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     gains = plain.gains
-    known = len(JOINT_PID), len(JOINT_PID) * layout.joints
-    if gains is None or len(gains) not in known:
+    gain_counts = len(JOINT_PID), len(JOINT_PID) * layout.joints
+    if gains is None or len(gains) not in gain_counts:
         gains = _gains(geometry, dynamic[layout.rigid])
         notes.append(
             "the file has no joint PID: gains are chosen for a natural frequency of 3 Hz at the "
@@ -124,7 +120,9 @@ def _leg(one: MechanismLeg, number: int) -> Leg:
         raise RobotFileError(f"leg {number} ({names}): {error}") from None
 
 
-def _bodies(geometry: RobotGeometry, found: list[MechanismLeg], platform: np.ndarray) -> np.ndarray:
+def _bodies(
+    geometry: RobotGeometry, mechanism_legs: list[MechanismLeg], platform: np.ndarray
+) -> np.ndarray:
     """Full bodies (bodies, 10) of a robot: the platform (10,), and the bodies of the legs.
 
     Raises the RobotFileError of `_inertia` with the number of the leg.
@@ -132,7 +130,7 @@ def _bodies(geometry: RobotGeometry, found: list[MechanismLeg], platform: np.nda
     layout = geometry.layout
     bodies = np.empty((len(layout.bodies), len(platform)))
     bodies[0] = platform
-    for k, (one, leg) in enumerate(zip(found, geometry.legs, strict=True)):
+    for k, (one, leg) in enumerate(zip(mechanism_legs, geometry.legs, strict=True)):
         places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
         for body, place, bars, row in zip(
             leg.bodies, places, one.bodies, layout.of_leg[k], strict=True
@@ -144,13 +142,13 @@ def _bodies(geometry: RobotGeometry, found: list[MechanismLeg], platform: np.nda
     return bodies
 
 
-def _spinning(geometry: RobotGeometry, found: list[MechanismLeg]) -> list[str]:
-    """Remark on full links that can spin about their length between two ball joints."""
+def _spinning(geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]) -> list[str]:
+    """List with a remark on links that can spin between two ball joints, if there are any."""
     layout = geometry.layout
     names = [
-        layout.bodies[of[-1]]
-        for one, of in zip(found, layout.of_leg, strict=True)
-        if layout.full[of[-1]] and one.chain.joints[-2:] == ("ball", "ball")
+        layout.bodies[rows[-1]]
+        for one, rows in zip(mechanism_legs, layout.of_leg, strict=True)
+        if layout.full[rows[-1]] and one.chain.joints[-2:] == ("ball", "ball")
     ]
     if not names:
         return []
@@ -166,13 +164,13 @@ def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _inertia(
-    body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray
+    body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], directions: np.ndarray
 ) -> np.ndarray:
     """Full body (10,) of a leg, in the axes that its kind of leg defines.
 
     The body may consist of several equal bars. First moments and products of inertia are zero if
     they have no effect. The centre of mass has an effect only if the body turns, and only along
-    `ways` (3, n), the directions in which the platform can move. Raises RobotFileError for bars of
+    the `directions` (3, n) in which the platform can move. Raises RobotFileError for bars of
     different mass.
     """
     centre, axes = place
@@ -183,23 +181,23 @@ def _inertia(
             f"the bars {name} differ: {', '.join(f'{bar.mass:g} kg' for bar in bars)}"
         )
     shift = np.mean([bar.centre for bar in bars], axis=0) - centre
-    off = float(np.linalg.norm(shift @ ways)) if body.moments else 0.0
+    offset = float(np.linalg.norm(shift @ directions)) if body.moments else 0.0
     inertia = sum(axes.T @ bar.inertia @ axes for bar in bars)
     moments = np.diagonal(inertia)
     working = np.array([MOMENTS.index(moment) for moment in body.moments], dtype=int)
     block = inertia[np.ix_(working, working)]
     products = np.abs(block - np.diag(np.diagonal(block))).max(initial=0.0)
-    if off <= SAME and products <= SAME * moments.max():
+    if offset <= SAME and products <= SAME * moments.max():
         return full_body(mass, np.zeros(3), np.diag(moments))
     return full_body(mass, axes.T @ shift, inertia)
 
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
     """Axes (3, 3) of the platform's frame, and the moments of inertia (3,) about them."""
-    own = platform.axes.T @ platform.inertia @ platform.axes
+    inertia = platform.axes.T @ platform.inertia @ platform.axes
     axes = platform.axes
-    if np.abs(own - np.diag(np.diagonal(own))).max() > DIAGONAL * np.abs(own).max():
-        axes = _nearest(axes @ np.linalg.eigh(own)[1], axes)
+    if np.abs(inertia - np.diag(np.diagonal(inertia))).max() > ROUNDING * np.abs(inertia).max():
+        axes = _nearest(axes @ np.linalg.eigh(inertia)[1], axes)
     if abs(axes[0, 2]) > MOST_TILT:
         axes = _nearest(axes, np.eye(3))
     return axes, np.diagonal(axes.T @ platform.inertia @ axes)
@@ -240,11 +238,11 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
 
 
 def _travel(
-    plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]
+    plain: Mechanism, mechanism_legs: list[MechanismLeg], legs: list[Leg], notes: list[str]
 ) -> float:
     """Travel limit from the ranges in the file, or a default about home."""
     limits = []
-    for one in found:
+    for one in mechanism_legs:
         at_home = one.actuated.coordinate
         span = plain.ranges.get(one.actuated.name)
         if span is not None:
@@ -256,18 +254,22 @@ def _travel(
                 )
     if limits:
         return float(min(limits))
-    lengths = [float(np.linalg.norm(one.chain.points[-1] - one.chain.points[0])) for one in found]
+    lengths = [
+        float(np.linalg.norm(one.chain.points[-1] - one.chain.points[0])) for one in mechanism_legs
+    ]
     notes.append("the file has no ranges of the actuated joints: travel_limit is chosen")
-    beyond = TRAVEL_SHARE * min(lengths) if legs[0].prismatic else TRAVEL
-    return float(max(abs(one.actuated.coordinate) for one in found) + beyond)
+    beyond = DEFAULT_TRAVEL_RATIO * min(lengths) if legs[0].prismatic else DEFAULT_TRAVEL
+    return float(max(abs(one.actuated.coordinate) for one in mechanism_legs) + beyond)
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """Gains lp, li, ld for the smallest inertia of any joint at home."""
+    """Gains lp, li, ld with the default frequency at the joint with the least inertia at home."""
     home = ca.SX(geometry.home_pose)
-    free = geometry.chart.basis
-    jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ free
-    mass = free.T @ np.array(ca.evalf(mass_matrix(geometry, home, ca.SX(rigid)))) @ free
-    felt = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
-    stiff = felt * OWN_RATE**2
-    return np.array([stiff, stiff * OWN_RATE / 20, 2 * OWN_DAMPING * felt * OWN_RATE])
+    basis = geometry.chart.basis
+    jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ basis
+    mass = basis.T @ np.array(ca.evalf(mass_matrix(geometry, home, ca.SX(rigid)))) @ basis
+    inertia = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
+    lp = inertia * DEFAULT_FREQUENCY**2
+    # an integral that is slow enough to leave frequency and damping nearly unchanged
+    li = lp * DEFAULT_FREQUENCY / 20
+    return np.array([lp, li, 2 * DEFAULT_DAMPING * inertia * DEFAULT_FREQUENCY])

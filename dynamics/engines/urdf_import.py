@@ -34,16 +34,17 @@ from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-MOST = 120
+MOST_ELEMENTS = 120
 """Largest number of links, and of joints, of a robot. The largest example has about forty."""
 
 MOST_COORDINATES = 90
 """Largest number of all joint coordinates. The time to close loops grows with its square."""
 
-STEPS = 60
+MOST_ITERATIONS = 60
 """Largest number of iterations to close the loops. About ten are usual."""
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
+"""Gravity, m/s^2, which URDF does not state."""
 
 COORDINATES = {"hinge": 1, "slide": 1, "ball": 3, "weld": 0, "universal": 2, "floating": 6}
 """Number of coordinates of each kind of joint."""
@@ -55,7 +56,7 @@ KINDS = {
     "fixed": "weld",
     "floating": "floating",
 }
-"""Kinds of joints for each joint type of URDF."""
+"""Kind of joint for each joint type of URDF."""
 
 
 @dataclass(frozen=True)
@@ -77,16 +78,16 @@ class _Joint:
 
     def moved(self, q: np.ndarray) -> np.ndarray:
         """Frame (4, 4) of the child in the frame of the parent, at coordinates of the joint."""
-        own = np.eye(4)
+        motion = np.eye(4)
         if self.kind in ("ball", "floating"):
-            own[:3, :3] = Rotation.from_rotvec(q[-3:]).as_matrix()
-            own[:3, 3] = q[:-3] if self.kind == "floating" else 0.0
+            motion[:3, :3] = Rotation.from_rotvec(q[-3:]).as_matrix()
+            motion[:3, 3] = q[:-3] if self.kind == "floating" else 0.0
         elif self.kind == "slide":
-            own[:3, 3] = q[0] * self.axes[0]
+            motion[:3, 3] = q[0] * self.axes[0]
         else:
             for angle, axis in zip(q, self.axes, strict=False):
-                own[:3, :3] = own[:3, :3] @ Rotation.from_rotvec(angle * axis).as_matrix()
-        return np.asarray(self.place @ own)
+                motion[:3, :3] = motion[:3, :3] @ Rotation.from_rotvec(angle * axis).as_matrix()
+        return np.asarray(self.place @ motion)
 
 
 def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescription, list[str]]:
@@ -136,19 +137,23 @@ def _closures(path: str | Path) -> dict[str, list[Any]]:
 
 
 def _require_once(names: list[str], what: str) -> None:
+    """Raise RobotFileError if a name appears more than once."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise RobotFileError(f"{what} has {shown(twice[0])} more than once")
 
 
 def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
+    """Mechanism of a URDF and the settings of its YAML file."""
     elements = {kind: root.findall(kind) for kind in ("link", "joint")}
     for kind, found in elements.items():
-        if len(found) > MOST:
-            raise RobotFileError(f"it has {len(found)} elements {kind}, a robot has at most {MOST}")
+        if len(found) > MOST_ELEMENTS:
+            raise RobotFileError(
+                f"it has {len(found)} elements {kind}, a robot has at most {MOST_ELEMENTS}"
+            )
         _require_once([str(element.get("name")) for element in found], f"the name of a {kind}")
-    others = dict(zip(settings["joint_name"], settings["joint_type"], strict=True))
-    joints = [_joint(element, others.get(element.get("name"))) for element in elements["joint"]]
+    new_types = dict(zip(settings["joint_name"], settings["joint_type"], strict=True))
+    joints = [_joint(element, new_types.get(element.get("name"))) for element in elements["joint"]]
     links = {str(element.get("name")): element for element in elements["link"]}
     ordered = _from_the_root(links, joints)
     base = ordered[0].parent if ordered else ""
@@ -192,32 +197,32 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
     return Mechanism(str(root.get("name") or "robot"), solids, connections, GRAVITY, ranges)
 
 
-def _joint(element: Xml.Element, other: str | None) -> _Joint:
-    """Joint of an XML element. `other` is the type that the YAML file gives the joint, or None."""
+def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
+    """Joint of an XML element. `new_type` is its type in the YAML file, or None."""
     name = str(element.get("name"))
     kind = str(element.get("type"))
     if kind not in KINDS or element.find("mimic") is not None:
         raise RobotFileError(
             f"joint {name} is of type {kind} or mimics another; valid: {', '.join(KINDS)}"
         )
-    own = KINDS[kind]
+    own_kind = KINDS[kind]
     axes = np.array([_numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
     if (
-        other is not None
-        and other.startswith("UJOINT_")
-        and set(other[7:]) <= set("XYZ")
-        and len(other) == 9
+        new_type is not None
+        and new_type.startswith("UJOINT_")
+        and set(new_type[7:]) <= set("XYZ")
+        and len(new_type) == 9
     ):
-        own = "universal"
-        axes = np.array([np.eye(3)["XYZ".index(letter)] for letter in other[7:]])
-    elif other is not None:
-        if other not in ("SPHERICAL", "FIXED"):
+        own_kind = "universal"
+        axes = np.array([np.eye(3)["XYZ".index(letter)] for letter in new_type[7:]])
+    elif new_type is not None:
+        if new_type not in ("SPHERICAL", "FIXED"):
             raise RobotFileError(
-                f"joint_type {other} of {name} is unknown; valid: SPHERICAL, FIXED, UJOINT_XY"
+                f"joint_type {new_type} of {name} is unknown; valid: SPHERICAL, FIXED, UJOINT_XY"
             )
-        own = {"SPHERICAL": "ball", "FIXED": "weld"}[other]
+        own_kind = {"SPHERICAL": "ball", "FIXED": "weld"}[new_type]
     length = np.linalg.norm(axes[0])
-    if own in ("hinge", "slide") and not length > 0:
+    if own_kind in ("hinge", "slide") and not length > 0:
         raise RobotFileError(f"joint {name} has an axis of length {length:g}")
     ends = [element.find(end) for end in ("parent", "child")]
     if any(end is None or end.get("link") is None for end in ends):
@@ -229,7 +234,7 @@ def _joint(element: Xml.Element, other: str | None) -> _Joint:
         span = (_number(element, "limit", "lower"), _number(element, "limit", "upper"))
     parent, child = (str(end.get("link")) for end in ends if end is not None)
     return _Joint(
-        name, own, parent, child, _origin(element), axes / max(length, 1e-300), friction, span
+        name, own_kind, parent, child, _origin(element), axes / max(length, 1e-300), friction, span
     )
 
 
@@ -274,6 +279,7 @@ def _placed(base: str, joints: list[_Joint], q: np.ndarray) -> dict[str, np.ndar
 
 
 def _slices(joints: list[_Joint]) -> dict[str, slice]:
+    """Slice of the coordinates of each joint, by name."""
     ends = np.cumsum([COORDINATES[joint.kind] for joint in joints]).tolist()
     return {
         joint.name: slice(end - COORDINATES[joint.kind], end)
@@ -289,14 +295,14 @@ def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]])
 
     def gaps(q: np.ndarray) -> np.ndarray:
         place = _placed(base, joints, q)
-        found = [np.zeros(1)]
+        differences = [np.zeros(1)]
         for a, b, welded in loops:
-            found.append(place[a][:3, 3] - place[b][:3, 3])
+            differences.append(place[a][:3, 3] - place[b][:3, 3])
             if welded:
-                found.append(
+                differences.append(
                     Rotation.from_matrix(place[a][:3, :3].T @ place[b][:3, :3]).as_rotvec()
                 )
-        return np.concatenate(found)
+        return np.concatenate(differences)
 
     q = np.zeros(sum(COORDINATES[joint.kind] for joint in joints))
     if len(q) > MOST_COORDINATES:
@@ -304,7 +310,7 @@ def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]])
             f"its joints have {len(q)} coordinates, a robot has at most {MOST_COORDINATES}"
         )
     if np.abs(gaps(q)).max() > SAME**2:
-        q = least_squares(gaps, q, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=STEPS).x
+        q = least_squares(gaps, q, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=MOST_ITERATIONS).x
     worst = float(np.abs(gaps(q)).max())
     if worst > SAME:
         raise RobotFileError(
@@ -349,16 +355,17 @@ def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
     rod = None if shape is None else (_float(shape, "length"), _float(shape, "radius"))
     if inertial is None:
         return Solid(name, 0.0, place[:3, 3], np.zeros((3, 3)), axes, rod)
-    own = place @ _origin(inertial)
+    inertial_frame = place @ _origin(inertial)
     tensor = inertial.find("inertia")
     if tensor is None:
         raise RobotFileError(f"link {name} has an inertial without inertia")
     rows = [[_float(tensor, f"i{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"]
-    turned = own[:3, :3] @ np.array(rows) @ own[:3, :3].T
-    return Solid(name, _number(inertial, "mass", "value"), own[:3, 3], turned, axes, rod)
+    turned = inertial_frame[:3, :3] @ np.array(rows) @ inertial_frame[:3, :3].T
+    return Solid(name, _number(inertial, "mass", "value"), inertial_frame[:3, 3], turned, axes, rod)
 
 
 def _origin(element: Xml.Element) -> np.ndarray:
+    """Frame (4, 4) in the tag `origin` of an element."""
     place = np.eye(4)
     turn = Rotation.from_euler("xyz", _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
     place[:3, :3] = turn.as_matrix()
@@ -367,6 +374,7 @@ def _origin(element: Xml.Element) -> np.ndarray:
 
 
 def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]) -> np.ndarray:
+    """Three numbers in an attribute of a tag. Raises RobotFileError if they are not finite."""
     found = element.find(tag)
     text = None if found is None else found.get(key)
     if text is None:
@@ -383,6 +391,7 @@ def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...
 
 
 def _number(element: Xml.Element, tag: str, key: str) -> float:
+    """Number in an attribute of a tag, or zero if there is no such tag."""
     found = element.find(tag)
     return 0.0 if found is None else _float(found, key)
 

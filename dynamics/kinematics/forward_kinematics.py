@@ -25,7 +25,7 @@ HALVINGS = 20
 # Gap, m^2, below which a loop is closed up to rounding errors.
 CLOSED = 1e-14
 
-# Two poses are the same if their positions differ by less than this share of the radius of the
+# Two poses are the same if their positions differ by less than this, relative to the radius of the
 # search, and the entries of their rotation matrices by less than this.
 SAME = 1e-5
 
@@ -74,11 +74,13 @@ def solve(
             f"{theta.shape}"
         )
     poses = np.array(np.broadcast_to(start, (len(angles), 6)))
-    found = search(functions, chart, angles, poses)
-    _check(functions, angles, found)
+    solution = search(functions, chart, angles, poses)
+    _check(functions, angles, solution)
     rows = theta.shape[:-1]
-    residual = found.residual.reshape(theta.shape)
-    return ForwardSolution(found.pose.reshape(*rows, 6), found.iterations.reshape(rows), residual)
+    residual = solution.residual.reshape(theta.shape)
+    return ForwardSolution(
+        solution.pose.reshape(*rows, 6), solution.iterations.reshape(rows), residual
+    )
 
 
 def assembly_modes(
@@ -98,24 +100,24 @@ def assembly_modes(
     rng = np.random.default_rng(seed)
     turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")
     drawn = np.hstack([centre + radius * rng.uniform(-1, 1, (starts, 3)), turns])
-    ended = search(
+    solution = search(
         functions, chart, np.tile(theta, (starts, 1)), chart.pose(chart.coordinates(drawn))
     )
-    found = ended.pose[ended.converged]
-    turned = Rotation.from_euler("XYZ", found[:, 3:])
+    poses = solution.pose[solution.converged]
+    rotations = Rotation.from_euler("XYZ", poses[:, 3:])
     # a rotation has several sets of Euler angles; use the principal ones
-    found = np.hstack([found[:, :3], turned.as_euler("XYZ")])
+    poses = np.hstack([poses[:, :3], rotations.as_euler("XYZ")])
     order = np.argsort(
-        np.linalg.norm(found[:, :3] - np.array(chart.home)[:3], axis=1), kind="stable"
+        np.linalg.norm(poses[:, :3] - np.array(chart.home)[:3], axis=1), kind="stable"
     )
-    found = found[order]
-    matrices = turned.as_matrix()[order].reshape(-1, 9)
+    poses = poses[order]
+    matrices = rotations.as_matrix()[order].reshape(-1, 9)
     kept: list[int] = []
-    for row, (place, matrix) in enumerate(zip(found[:, :3], matrices, strict=True)):
-        near = np.abs(found[kept, :3] - place).max(axis=1, initial=0.0) < SAME * radius
+    for row, (place, matrix) in enumerate(zip(poses[:, :3], matrices, strict=True)):
+        near = np.abs(poses[kept, :3] - place).max(axis=1, initial=0.0) < SAME * radius
         if not (near & (np.abs(matrices[kept] - matrix).max(axis=1, initial=0.0) < SAME)).any():
             kept.append(row)
-    return found[kept]
+    return poses[kept]
 
 
 def search(
@@ -123,15 +125,14 @@ def search(
 ) -> ForwardSolution:
     """Best poses (N, 6) found for joint coordinates (N, n) from starts (N, 6)."""
     poses, iterations = close_loops(functions["loop_closure"], chart, theta, start)
-    found = functions["inverse_kinematics"](poses)[0][..., 0]
-    return ForwardSolution(poses, iterations, np.abs(theta - found))
+    joints = functions["inverse_kinematics"](poses)[0][..., 0]
+    return ForwardSolution(poses, iterations, np.abs(theta - joints))
 
 
 def close_loops(
     closure: Closure, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 6) that close the loops best for joint coordinates (N, n), and numbers of steps
-    (N,).
+    """Poses (N, 6) that close the loops best for joint coordinates (N, n), with steps (N,) needed.
 
     Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
     negligible or reduces its gaps no further.
@@ -162,8 +163,8 @@ def _damped(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Poses, gaps and Jacobians after a damped step, and the rows for which a step was found.
 
-    The step is the full step, or the first of its halves that reduces the gaps. A negligible step
-    is accepted even if rounding keeps it from reducing the gaps.
+    The step is halved until it reduces the gaps. A negligible step is accepted even if rounding
+    keeps it from reducing the gaps.
     """
     before = np.linalg.norm(gaps[..., 0], axis=1)
     scale = np.ones(len(poses))
@@ -179,10 +180,10 @@ def _damped(
 
 
 def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions (N, 6, 1) of linear systems.
+    """Solutions (N, m, 1) of linear systems.
 
-    For a singular matrix, it is the least-squares solution of minimum norm. For a matrix that has
-    overflowed, it is NaN.
+    That of a singular matrix is the least-squares solution of minimum norm. That of a matrix that
+    has overflowed is NaN.
     """
     try:
         return np.linalg.solve(matrices, right)
@@ -194,23 +195,24 @@ def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
         return solutions
 
 
-def _check(functions: Functions, theta: np.ndarray, found: ForwardSolution) -> None:
+def _check(functions: Functions, theta: np.ndarray, solution: ForwardSolution) -> None:
     """Raise ConvergenceError for the first row that has not converged."""
-    if found.converged.all():
+    if solution.converged.all():
         return
-    row = int(np.argmin(found.converged))
-    leg = int(np.argmin(found.residual[row] < ANGLE_TOLERANCE))
-    lacking = found.residual[row, leg]
+    row = int(np.argmin(solution.converged))
+    leg = int(np.argmin(solution.residual[row] < ANGLE_TOLERANCE))
+    difference = solution.residual[row, leg]
     gap = np.abs(
-        functions["loop_closure"](found.pose[row : row + 1], theta[row : row + 1])[0]
+        functions["loop_closure"](solution.pose[row : row + 1], theta[row : row + 1])[0]
     ).max()
-    why = f"its loops have a gap of {gap:.3g} m^2 in squared length"
+    loop_text = f"its loops have a gap of {gap:.3g} m^2 in squared length"
     if gap < CLOSED:
-        why = f"it closes the loops, but leg {leg + 1} is folded the other way than at home"
-    there = f"joint {leg + 1} is off by {lacking:.3g}, limit {ANGLE_TOLERANCE:.0e}"
-    if np.isnan(lacking):
-        there = f"leg {leg + 1} cannot reach it"
+        loop_text = f"it closes the loops, but leg {leg + 1} is folded the other way than at home"
+    joint_text = f"joint {leg + 1} is off by {difference:.3g}, limit {ANGLE_TOLERANCE:.0e}"
+    if np.isnan(difference):
+        joint_text = f"leg {leg + 1} cannot reach it"
     raise ConvergenceError(
         f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row "
-        f"{row}) in {found.iterations[row]} steps: of the nearest pose, {why}; {there}"
+        f"{row}) in {solution.iterations[row]} steps: of the nearest pose, {loop_text}; "
+        f"{joint_text}"
     )

@@ -78,13 +78,12 @@ def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.
 
 
 class PlatformJointMotion:
-    """Motion of the joints A (N, 3), m, platform axes, for a pose q, its rate and acceleration
-    (6,).
+    """Motion of the joints A for a pose q (6,), its rate and its acceleration, which are symbols.
 
-    The attributes are lists with one entry for each leg: `position`, `velocity` and `acceleration`
-    (3,); `gradient`, dA/dq = d(velocity)/d(rate) (3, 6); `gradient_rate`, d(velocity)/dq (3, 6);
-    and `acceleration_by_pose`, d(acceleration)/dq (3, 6). The derivative d(acceleration)/d(rate) is
-    twice `gradient_rate`. Pose, rate and acceleration (`gain`) are symbols.
+    `joints` (legs, 3) are the joints in the axes of the platform, m. The attributes are lists with
+    one entry for each leg: `position`, `velocity` and `acceleration` (3,); `gradient`, dA/dq =
+    d(velocity)/d(rate) (3, 6); `gradient_rate`, d(velocity)/dq (3, 6); and `acceleration_by_pose`,
+    d(acceleration)/dq (3, 6). The derivative d(acceleration)/d(rate) is twice `gradient_rate`.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class PlatformJointMotion:
     ) -> None:
         self.pose = pose
         self.rate = rate
-        self.gain = acceleration
+        self.pose_acceleration = acceleration
         angles = pose[3:6]
         spin = rate[3:6]
         spin_rate = acceleration[3:6]
@@ -121,9 +120,7 @@ class PlatformJointMotion:
         return self.position[leg], self.velocity[leg], self.acceleration[leg]
 
     def curvature(self, leg: int, force: ca.SX) -> ca.SX:
-        """Derivative d(gradient^T force)/dq (6, 6) for a constant force (3,) at the joint
-        of a leg.
-        """
+        """Derivative d(gradient^T force)/dq (6, 6) for a constant force (3,) at a leg's joint."""
         arm = self._arms[leg]
         rows = [
             ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second
@@ -132,11 +129,13 @@ class PlatformJointMotion:
 
 
 def _by_angles(matrix: ca.SX, angles: ca.SX) -> list[ca.SX]:
+    """Derivatives of a matrix (3, 3) with respect to each of three angles."""
     columns = ca.jacobian(ca.vec(matrix), angles)
     return [ca.reshape(columns[:, axis], 3, 3) for axis in range(3)]
 
 
 def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
+    """Weighted sum of three matrices."""
     return matrices[0] * weights[0] + matrices[1] * weights[1] + matrices[2] * weights[2]
 
 
@@ -147,9 +146,9 @@ def base_from_platform(pose: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Chart:
-    """Chart of a platform: the entries of its pose that are coordinates.
+    """Chart of a platform: the m entries of its pose that are coordinates.
 
-    `name` is a key of FREEDOMS, and `home` the pose at home (six numbers).
+    `name` is a key of FREEDOMS, and `home` the pose at home (six numbers, m and rad).
     """
 
     name: str
@@ -172,14 +171,14 @@ class Chart:
 
     @property
     def basis(self) -> np.ndarray:
-        """Derivative d(pose)/d(coordinates) (6, n), which also spans the twists.
+        """Basis (6, m) of the allowed pose changes, and of the allowed twists.
 
         Rotations are about the axes of the base in every chart.
         """
         return np.eye(6)[:, list(self.freedoms)]
 
     def pose(self, coordinates: ArrayLike) -> np.ndarray:
-        """Poses (6,) or (N, 6) for coordinates (n,) or (N, n)."""
+        """Poses (6,) or (N, 6) for coordinates (m,) or (N, m)."""
         values = np.asarray(coordinates, dtype=float)
         poses = np.empty((*values.shape[:-1], len(POSE_NAMES)))
         if len(self.freedoms) == len(POSE_NAMES):
@@ -190,7 +189,7 @@ class Chart:
         return poses
 
     def coordinates(self, pose: ArrayLike) -> np.ndarray:
-        """Coordinates (n,) or (N, n) of poses (6,) or (N, 6).
+        """Coordinates (m,) or (N, m) of poses (6,) or (N, 6).
 
         The entries that the platform cannot change are ignored.
         """
@@ -202,9 +201,9 @@ class Chart:
         )
 
     def projected(self, rows: np.ndarray) -> np.ndarray:
-        """Rows (..., n, k) for the coordinates from rows (..., 6, k) for the twist: basis.T @ rows.
+        """Rows (..., m, k) for the coordinates from rows (..., 6, k) for the twist: basis.T @ rows.
 
-        If n is 6, the array itself is returned.
+        If m is 6, the array itself is returned.
         """
         return rows if len(self.freedoms) == len(POSE_NAMES) else rows[..., list(self.freedoms), :]
 
@@ -221,9 +220,7 @@ class Chart:
         return np.moveaxis(lifted, -1, axis)
 
     def forbidden(self, pose: ArrayLike) -> np.ndarray:
-        """Deviation of each entry of poses (N, 6) from the poses that the platform can have, m and
-        rad.
-        """
+        """Deviations (N, 6) of poses from the poses that the platform can have, m and rad."""
         values = np.asarray(pose, dtype=float)
         if len(self.freedoms) == len(POSE_NAMES):
             return np.zeros(values.shape)

@@ -44,16 +44,16 @@ class Chain(NamedTuple):
 
     @property
     def signature(self) -> str:
-        """Joints as text."""
+        """Joints as text, in the form of `SIGNATURES`."""
         first, *others = self.joints
         return f"{first} 2 x ({' '.join(others)})" if self.across.any() else " ".join(self.joints)
 
 
 def leg_of(chain: Chain) -> Leg:
-    """Leg with these joints, in its present assembly.
+    """Leg with the joints of a chain, on the branch that the chain has at home.
 
     Raises RobotFileError, with the valid kinds, if the joints form no kind of leg. Raises it, with
-    the number, if the joints are not placed as their kind requires.
+    the deviation, if the joints are not placed as their kind requires.
     """
     if chain.signature not in SIGNATURES:
         kinds = ", ".join(
@@ -66,20 +66,22 @@ def leg_of(chain: Chain) -> Leg:
     try:
         leg = kind.model_validate(fields(chain) | {"platform_joint": chain.platform_joint})
     except ValidationError as error:
-        said = [
+        problems = [
             f"{'.'.join(map(str, item['loc']))} = {item['input']}: {item['msg']}"
             for item in error.errors()
         ]
-        raise RobotFileError("; ".join(said)) from None
+        raise RobotFileError("; ".join(problems)) from None
     branches: list[Leg] = [leg.model_copy(update={"branch": sign}) for sign in (1, -1)]
-    off = [float(each.coordinate(ca.SX(chain.points[-1]))) - chain.coordinate for each in branches]
+    differences = [
+        float(each.coordinate(ca.SX(chain.points[-1]))) - chain.coordinate for each in branches
+    ]
     if not leg.prismatic:
-        off = [(value + np.pi) % (2 * np.pi) - np.pi for value in off]
-    best = int(np.argmin(np.nan_to_num(np.abs(off), nan=np.inf)))
-    if not abs(off[best]) < SAME:
+        differences = [(value + np.pi) % (2 * np.pi) - np.pi for value in differences]
+    best = int(np.argmin(np.nan_to_num(np.abs(differences), nan=np.inf)))
+    if not abs(differences[best]) < SAME:
         raise RobotFileError(
             f"its coordinate at home is {chain.coordinate:g}, but its geometry gives "
-            f"{chain.coordinate + off[best]:g}"
+            f"{chain.coordinate + differences[best]:g}"
         )
     return branches[best]
 
@@ -189,10 +191,10 @@ def _drawn(chain: Chain, *names: str) -> dict[str, float]:
 def _second_axis_across(chain: Chain, joint: int) -> None:
     """Raise RobotFileError unless the second axis of a joint is perpendicular to its body."""
     along = chain.points[-1] - chain.points[joint]
-    off = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
-    if off > SAME:
+    angle = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
+    if angle > SAME:
         raise RobotFileError(
-            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from "
+            f"the second axis of its universal joint is {np.degrees(angle):.3g} deg from "
             "perpendicular to the body on it"
         )
 

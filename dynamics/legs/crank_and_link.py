@@ -1,6 +1,6 @@
 """Force and mass of a crank and a link that does not spin, if they are full bodies (CasADi).
 
-Of the crank only the rotation about its axis z does work. With its length r, its angle theta, and
+Of the crank, only the rotation about its axis z does work. With its length r, its angle theta, and
 the axes x along it and y = z x x, its first moments m_x and m_y add to the torque about its axis
 
     m_x (r theta_ddot - y . g) + m_y x . g
@@ -36,7 +36,8 @@ def full_force(
 ) -> ca.SX:
     """Force at A (3,), N, for the motion of crank and link.
 
-    `gradient` (3,) is that of the crank angle. `bodies` has the parameters of both, 4 or 10.
+    `gradient` (3,) is that of the crank angle. `bodies` has the parameters of crank and link, 4 or
+    10 each.
     """
     mass, mx, my, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
     tangent = ca.cross(leg.axis, leg.crank)
@@ -77,12 +78,12 @@ def _link_load(
 def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
     """Mass matrix (3, 3) of crank and link at A. For the arguments see `full_force`."""
     mass, mx, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
-    own, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(_ten(bodies[1]))
+    link_mass, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(_ten(bodies[1]))
     tangent = ca.cross(leg.axis, leg.crank)
     radius = leg.crank_length
-    reflected = izz + mx * radius + (mass + own) * (radius**2 / 4)
-    half = gradient @ (own / 4 * tangent).T
-    total = reflected * (gradient @ gradient.T) + own / 4 * ca.SX.eye(3) + half + half.T
+    reflected = izz + mx * radius + (mass + link_mass) * (radius**2 / 4)
+    half = gradient @ (link_mass / 4 * tangent).T
+    total = reflected * (gradient @ gradient.T) + link_mass / 4 * ca.SX.eye(3) + half + half.T
     # rows of the rates of rotation p and q, and of the velocity of the middle, in the link's axes
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
     by_crank = [ca.dot(tangent, axes[:, k]) for k in range(3)]

@@ -2,9 +2,8 @@
 
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
 its joints and lengths, m, and small rotations of its axis, rad. Rotations are relative to the leg
-itself.
-`u` and `v` are perpendicular to the axis. On a crank, `u` is along its zero direction. `crank_zero`
-is about the axis.
+itself. The rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank, `u`
+is about its zero direction, and `crank_zero` is about the crank axis.
 
 A leg can be described by another leg and a vector of deviations of the geometric numbers. The
 deviations can be symbols, with respect to which the leg then has derivatives.
@@ -22,6 +21,8 @@ from dynamics.legs.leg import Leg
 
 AnyKind = TypeVar("AnyKind", bound=Leg)
 POINTS = ("base_joint", "platform_joint")
+"""Fields of a leg that are points, whose coordinates are geometric numbers."""
+
 MOST_NUMBERS = 11
 """Largest number of geometric numbers of a leg of any built-in kind."""
 
@@ -41,24 +42,24 @@ def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
 
     If the deviations are symbols, the leg can only be used in CasADi expressions.
     """
-    by = (
+    symbols = (
         deviations
         if isinstance(deviations, ca.SX)
         else ca.SX(ca.DM(np.asarray(deviations, dtype=float)))
     )
-    off = dict(zip(leg.numbers, ca.vertsplit(by), strict=True))
+    deviation = dict(zip(leg.numbers, ca.vertsplit(symbols), strict=True))
     changes: dict[str, Any] = {
         field: getattr(leg, field)
-        + ca.vertcat(*[off.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
+        + ca.vertcat(*[deviation.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
         for field in POINTS
     }
     changes |= {
-        name: getattr(leg, name) + off[name]
+        name: getattr(leg, name) + deviation[name]
         for name in leg.numbers
         if "." not in name and not _is_turn(name)
     }
     if leg.turned:
-        turns = [off.get(name, ca.SX(0)) for name in _turns(leg)]
+        turns = [deviation.get(name, ca.SX(0)) for name in _turns(leg)]
         frame = ca.SX(_frame(leg)) @ rotation_matrix(ca.vertcat(*turns))
         changes |= {
             field: frame[:, column] for field, column in zip(leg.turned, (2, 0), strict=False)
@@ -71,7 +72,7 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
 
     This is the inverse of `moved`.
     """
-    off = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
+    changes = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
     if leg.turned:
         between = _frame(nominal).T @ _frame(leg)
         # only the axis of this leg is rotated: Rx(u) Ry(v) z
@@ -80,8 +81,10 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
             turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]
         else:
             turns = list(Rotation.from_matrix(between).as_euler("XYZ"))
-        off |= {name: turn for name, turn in zip(_turns(leg), turns, strict=True) if name in off}
-    return np.array(list(off.values()))
+        changes |= {
+            name: turn for name, turn in zip(_turns(leg), turns, strict=True) if name in changes
+        }
+    return np.array(list(changes.values()))
 
 
 def _turns(leg: Leg) -> tuple[str, str, str]:
@@ -118,10 +121,7 @@ def _frame(leg: Leg) -> np.ndarray:
 
 
 def _number(value: ca.SX) -> Any:
-    """Number or array of an expression without symbols.
-
-    Any other expression is returned unchanged.
-    """
+    """Number or array of a constant expression. Any other expression is returned unchanged."""
     if not value.is_constant():
         return value
     array = np.array(ca.DM(value)).ravel()

@@ -2,13 +2,15 @@
 
 The motion of A determines the motion of the bodies of a leg (eq. 5-16). Each leg therefore adds a
 force F at A. The wrench on the robot is the wrench of the platform itself plus the sum of [F; a x
-F] over the legs. This is the virtual-work model of eq. 23, with Jacobians with respect to the
-velocity of A (3 columns) instead of the twist (6 columns). It needs a fraction of the operations.
+F] over the legs, with the vector a from the platform's origin to A. This is the virtual-work model
+of eq. 23, with Jacobians with respect to the velocity of A (3 columns) instead of the twist (6
+columns). It needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
-work. A kind can also define closed forms that are faster. Vectors are in the axes of the base, and
-A is given by its position (3,) in them. Units are SI. The actuated coordinate is in rad for a
-rotating actuator, and in m for a sliding one.
+work. A kind can also define closed forms that are faster. Its inverse kinematics is the method
+`coordinate`, in `rss`, `pss` and `ups`. Vectors are in the axes of the base, and A is given by its
+position (3,) in them. Units are SI. The actuated coordinate is in rad for a rotating actuator, and
+in m for a sliding one.
 """
 
 from __future__ import annotations
@@ -42,12 +44,12 @@ def _vector(value: object) -> np.ndarray:
 
 
 ROUNDED = 1e-4
-"""Largest error of the length of a direction, or of a right angle.
+"""Largest error of the length of a direction, or of a right angle, in a file.
 
 Directions can thus be written with four decimals or more.
 """
 EXACT = 1e-12
-"""Largest error that is not corrected."""
+"""Largest such error that is not corrected."""
 
 
 def _direction(value: object) -> np.ndarray:
@@ -173,18 +175,18 @@ class Leg(BaseModel, ABC):
                 f"leg {number} cannot reach the home pose: reach margin {margin:.3g}, must be > 0; "
                 f"B to A {np.linalg.norm(joint - self.base_joint):.4g} m, {self.lengths()}"
             )
-        found = self
+        assembled = self
         if self.branch is None:
             both = [self.model_copy(update={"branch": sign}) for sign in (1, -1)]
-            found = min(both, key=lambda leg: abs(float(leg.coordinate(ca.SX(joint)))))
-        for body, turning in zip(found.bodies, found._turning(joint), strict=True):
+            assembled = min(both, key=lambda leg: abs(float(leg.coordinate(ca.SX(joint)))))
+        for body, turning in zip(assembled.bodies, assembled._turning(joint), strict=True):
             if not turning < MOST_TURNING:
                 raise RobotFileError(
                     f"leg {number} is singular at the home pose: its {body.name} turns by "
                     f"{turning:.3g} rad/m, limit {MOST_TURNING:.0e}; it lies along the axis of its "
                     "universal joint or of its actuator"
                 )
-        return found
+        return assembled
 
     def _turning(self, joint: np.ndarray) -> np.ndarray:
         """Rotation of each body per motion of A, rad/m. NaN for bodies whose axes are undefined."""
@@ -194,10 +196,11 @@ class Leg(BaseModel, ABC):
             ca.norm_fro(ca.jacobian(spin, moving)) for spin in self.angular_velocities(at, moving)
         ]
         axes = [ca.sum1(ca.vec(place.axes)) for place in self.placements(at)]
-        turning, known = ca.Function("turning", [at], [ca.vertcat(*turns), ca.vertcat(*axes)])(
+        turning, axis_sums = ca.Function("turning", [at], [ca.vertcat(*turns), ca.vertcat(*axes)])(
             joint
         )
-        return np.array(turning).ravel() + 0 * np.array(known).ravel()
+        # undefined axes are NaN, and make the sum NaN
+        return np.array(turning).ravel() + 0 * np.array(axis_sums).ravel()
 
     @abstractmethod
     def lengths(self) -> str:
@@ -265,9 +268,7 @@ class Leg(BaseModel, ABC):
         return ca.substitute(ca.jacobian(self.coordinate(at), at).T, at, position)
 
     def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Vector (3,) parallel to the gradient, and its divisor: the terms of eq. 7, whose ratio is
-        eq. 8.
-        """
+        """Vector (3,) and divisor (terms of eq. 7) whose ratio is the gradient (eq. 8)."""
         return self.gradient(position), ca.SX(1)
 
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
@@ -291,39 +292,38 @@ class Leg(BaseModel, ABC):
         `bodies` has the inertial parameters of each body, 4 if it is centred or 10 if it is full.
         """
         at, moving, gaining = (ca.SX.sym(name, 3) for name in "pva")
-        own = _alike(bodies)
+        parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3)
-        for inertia, centre_map, spin_map, spin in self._maps(at, moving, own):
+        for inertia, centre_map, spin_map, spin in self._maps(at, moving, parameters):
             centre_gain = centre_map @ gaining + ca.jtimes(centre_map @ moving, at, moving)
             spin_gain = spin_map @ gaining + ca.jtimes(spin, at, moving)
             push, moment = inertia.load(centre_gain - gravity, spin, spin_gain)
             total += centre_map.T @ push
             total += spin_map.T @ moment
         return _replaced(
-            total, (at, moving, gaining, *own), (position, velocity, acceleration, *bodies)
+            total, (at, moving, gaining, *parameters), (position, velocity, acceleration, *bodies)
         )
 
     def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
         """Mass matrix (3, 3) of the leg at A. For `bodies` see `force`."""
         at = ca.SX.sym("p", 3)
         moving = ca.SX.sym("v", 3)
-        own = _alike(bodies)
+        parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, _ in self._maps(at, moving, own):
+        for inertia, centre_map, spin_map, _ in self._maps(at, moving, parameters):
             total += inertia.mass_matrix(centre_map, spin_map)
-        return symmetric_from_lower(_replaced(total, (at, *own), (position, *bodies)))
+        return symmetric_from_lower(_replaced(total, (at, *parameters), (position, *bodies)))
 
     def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        """Matrix C (3, 3), whose product with the velocity is the Coriolis and centrifugal force at
-        A.
+        """Matrix C (3, 3). C velocity is the Coriolis and centrifugal force at A.
 
-        It is that of eq. 21 and 22: the sum of J^T (M_body J_dot + C_body J).
+        It is the sum of J^T (M_body J_dot + C_body J) over the bodies (eq. 21, 22).
         """
         at = ca.SX.sym("p", 3)
         moving = ca.SX.sym("v", 3)
-        own = _alike(bodies)
+        parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, spin in self._maps(at, moving, own):
+        for inertia, centre_map, spin_map, spin in self._maps(at, moving, parameters):
             map_rates = [
                 ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), at, moving), 3, 3)
                 for m in (centre_map, spin_map)
@@ -331,7 +331,7 @@ class Leg(BaseModel, ABC):
             maps = (centre_map, spin_map)
             for part in inertia.coriolis_parts(maps, map_rates, centre_map @ moving, spin):
                 total += part
-        return _replaced(total, (at, moving, *own), (position, velocity, *bodies))
+        return _replaced(total, (at, moving, *parameters), (position, velocity, *bodies))
 
     def _maps(
         self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]
@@ -341,17 +341,17 @@ class Leg(BaseModel, ABC):
         The maps (3, 3) give the velocity of the reference point and the angular velocity from the
         velocity of A.
         """
-        found = []
+        maps_of_bodies = []
         spins = self.angular_velocities(position, velocity)
         for kind, own, place, spin in zip(
             self.bodies, bodies, self.placements(position), spins, strict=True
         ):
             maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
-            found.append((spatial_inertia(own, place.axes, kind.moments), *maps, spin))
-        return found
+            maps_of_bodies.append((spatial_inertia(own, place.axes, kind.moments), *maps, spin))
+        return maps_of_bodies
 
 
-def _alike(bodies: Sequence[ca.SX]) -> list[ca.SX]:
+def _symbols_for(bodies: Sequence[ca.SX]) -> list[ca.SX]:
     """Symbols for the inertial parameters of bodies."""
     return [ca.SX.sym(f"i{k}", own.numel()) for k, own in enumerate(bodies)]
 
@@ -364,7 +364,7 @@ def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.S
 def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
     """Axes (3, 3) of a link along the unit vector z.
 
-    x is perpendicular to a given direction and to z, and y = z x x.
+    x is perpendicular to the direction `across_from` and to z, and y = z x x.
     """
     across = ca.cross(ca.SX(across_from), z)
     x = across * (1 / ca.norm_2(across))
@@ -379,7 +379,7 @@ def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
     """
     across = ca.cross(ca.SX(axis), z)
     inverse = 1 / ca.dot(across, across)
-    # Rotation about the first axis moves z along `across`; rotation about x moves it along y.
+    # rotation about the first axis moves z along `across`; rotation about x moves it along y
     turn = ca.dot(z_rate, across) * inverse
     swing = ca.dot(z_rate, ca.cross(z, across)) * inverse
     return turn * axis - swing * across

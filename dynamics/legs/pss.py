@@ -28,8 +28,8 @@ from dynamics.legs.rss import Z
 class PssLeg(Leg):
     """Slider that is at B if its coordinate is zero, and a link from the slider to A.
 
-    The link does not spin about its length. Its x is perpendicular to the direction of the slider
-    and to its length.
+    The link does not spin about its length. The x of the link is perpendicular to the direction of
+    the slider and to the link's length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy")))
@@ -154,9 +154,7 @@ class PssLeg(Leg):
         return velocity - ca.dot(self.gradient(position), velocity) * self.slider_axis
 
     def _parts(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Component of the vector from B to A along the slider's axis, and the perpendicular part
-        (3,).
-        """
+        """Parts of the vector from B to A: component along the slider's axis, and the rest (3,)."""
         reach = position - self.base_joint
         axis = self.slider_axis
         along = ca.dot(reach, axis)
@@ -166,7 +164,7 @@ class PssLeg(Leg):
 class PusLeg(PssLeg):
     """Slider and a link on a universal joint, which determines the spin of the link.
 
-    The x of the link is perpendicular to the first axis of that joint and to its length.
+    The x of the link is perpendicular to the first axis of the joint and to the link's length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy", "Izz")))

@@ -9,8 +9,8 @@ faster.
 
 The link of a RUS leg has a universal joint (U) at the tip of the crank. The first axis of this
 joint is parallel to the crank axis, so that its direction is fixed in the axes of the base. The
-link rotates about this axis and about its own x. This determines its spin about its length, and all
-three of its moments of inertia do work.
+link rotates about this axis and about its own x. Its spin about its length is thus determined, and
+all three of its moments of inertia do work.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ Z = np.array([0.0, 0.0, 1.0])
 class LegVectors:
     """Vectors of one leg in the axes of the base, m.
 
-    They are the crank angle (rad), the axis s, the crank w = T - B and the link l = A - T, (3,)
-    each, and the lengths of crank and link, which are constants of the robot.
+    `angle` is the crank angle, rad. `axis` is s, `crank` is w = T - B and `link` is l = A - T, (3,)
+    each. The lengths of crank and link are constants of the robot.
     """
 
     angle: ca.SX
@@ -61,8 +61,9 @@ class LegVectors:
 class LegMotion:
     """Motion of crank and link.
 
-    It has the angular acceleration of the crank, the second time derivatives of the crank and link
-    vectors (3,), and the angular velocity and acceleration of the link (3,). The link does not spin
+    `crank_acceleration` is an angular acceleration, rad/s^2. `tip_acceleration` and
+    `link_acceleration` (3,) are the second time derivatives of the crank and link vectors, m/s^2.
+    `angular_velocity` and `angular_acceleration` (3,) are those of the link, which does not spin
     about its own axis.
     """
 
@@ -254,7 +255,7 @@ class RssLeg(Leg):
         if not centred(bodies):
             return full_force(leg, motion, gradient, bodies, gravity)
         tangent = ca.cross(leg.axis, leg.crank)
-        # The crank rotates only about its own z. Izz of a link without spin about l does no work.
+        # the crank rotates only about its own z; Izz of a link without spin about l does no work
         lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
         torque = crank[0] * lever + crank[3] * motion.crank_acceleration
         pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
@@ -296,7 +297,8 @@ class RssLeg(Leg):
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Components of the vector from B to A along and across the zero direction, and the chord.
 
-        The chord is the component along the crank that the length of the link requires.
+        The chord is the component of the vector along the crank, as the lengths require. All are in
+        m.
         """
         reach = position - self.base_joint
         zero = self.crank_zero_direction
@@ -319,7 +321,7 @@ class ParallelogramLeg(RssLeg):
     bar_distance: Length = Field(description="between the two bars of the parallelogram, m")
 
     def segments(self) -> list[Segment]:
-        """Bodies as a chain. The bars are side by side along the crank axis."""
+        """Bodies as a chain from the base. The bars are side by side along the crank axis."""
         crank, link = super().segments()
         return [crank, link._replace(copies=np.outer([-0.5, 0.5], self.bar_distance * Z))]
 

@@ -59,11 +59,11 @@ def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnF
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Function of the derivatives of the slope of a state, and of the net torque of joints.
 
-    No joint sticks here, and the platform has m coordinates. All columns share these inputs, for
-    one of the stages, which are side by side in memory: the outputs of `motion_derivatives`;
-    J_theta (n, m), and the same with zeros for stuck joints; the factor of M (m, m); and the
-    derivatives (n,) of the torque of a joint with respect to its velocity (with opposite sign), its
-    error, the integral of the error, and the rate of the command.
+    No joint sticks here, and the platform has m coordinates. All columns share the following inputs
+    of one stage (stages are side by side in memory): the outputs of `motion_derivatives`; J_theta
+    (n, m), and the same with zeros for stuck joints; the factor of M (m, m); and the derivatives
+    (n,) of the torque of a joint with respect to its velocity (with opposite sign), its error, the
+    integral of the error, and the rate of the command.
 
     The inputs of each column are the derivatives of pose and rate (m,), of joint integral, command
     and its rate (n,), and, at a fixed state, of -M q_ddot - b (m,) and of the torque (n,). Its
@@ -85,16 +85,17 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     torques = []
     for i in range(n):
         errors.append(lessened(command[i], ca.horzsplit(jacobian[i, :]), pose))
+        # d(joint velocity)/d(pose) is half of d(joint acceleration)/d(rate)
         velocity = summed(ca.SX(0), ca.horzsplit(0.5 * joint_by_rate[i, :]), pose)
         velocity = summed(velocity, ca.horzsplit(jacobian[i, :]), rate)
-        felt = [errors[i], command_rate[i], integral[i]]
-        pushed = summed(direct[i], [by_error[i], by_command_rate[i], by_integral[i]], felt)
-        torques.append(pushed - damping[i] * velocity)
+        inputs = [errors[i], command_rate[i], integral[i]]
+        driven = summed(direct[i], [by_error[i], by_command_rate[i], by_integral[i]], inputs)
+        torques.append(driven - damping[i] * velocity)
     accelerations = []
     for j in range(m):
-        left = lessened(push[j], ca.horzsplit(by_pose[j, :]), pose)
-        left = lessened(left, ca.horzsplit(by_rate[j, :]), rate)
-        accelerations.append(summed(left, ca.vertsplit(pushing[:, j]), torques))
+        force = lessened(push[j], ca.horzsplit(by_pose[j, :]), pose)
+        force = lessened(force, ca.horzsplit(by_rate[j, :]), rate)
+        accelerations.append(summed(force, ca.vertsplit(pushing[:, j]), torques))
     common = [
         by_pose,
         by_rate,
@@ -109,25 +110,27 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     ]
     rows = [ca.vertcat(*row) for row in (pose, rate, integral, command, command_rate, push, direct)]
     outputs = [rate, _solved(factor, accelerations), errors, torques]
-    found = ca.Function("slope_derivative", [*common, *rows], [ca.vertcat(*row) for row in outputs])
-    return ColumnFunction(found, len(common), layout.derivatives(m), LANES, STAGES)
+    function_of_column = ca.Function(
+        "slope_derivative", [*common, *rows], [ca.vertcat(*row) for row in outputs]
+    )
+    return ColumnFunction(function_of_column, len(common), layout.derivatives(m), LANES, STAGES)
 
 
 def factored(matrix: ca.SX) -> ca.SX:
     """Factorisation L D L^T of a symmetric matrix (m, m), in one matrix.
 
     L, whose diagonal is one, is below the diagonal. D L^T is above it. The diagonal has the
-    reciprocals of D. They are not all positive and finite if the matrix is not positive definite.
+    reciprocals of D, which are all positive and finite only if the matrix is positive definite.
     """
     size = matrix.shape[0]
     factor = ca.SX.zeros(size, size)
     for i in range(size):
         for j in range(i + 1):
-            left = matrix[i, j]
+            rest = matrix[i, j]
             for k in range(j):
-                left -= factor[i, k] * factor[k, j]
-            factor[j, i] = left
-            factor[i, j] = left * factor[j, j] if i > j else 1 / left
+                rest -= factor[i, k] * factor[k, j]
+            factor[j, i] = rest
+            factor[i, j] = rest * factor[j, j] if i > j else 1 / rest
     return factor
 
 
@@ -146,12 +149,12 @@ def lessened(start: ca.SX, row: Sequence[ca.SX], column: Sequence[ca.SX]) -> ca.
 def _solved(factor: ca.SX, right: list[ca.SX]) -> list[ca.SX]:
     """Solution of L D L^T x = right, in the order of `linear_algebra_kernels.solve`."""
     size = len(right)
-    found = list(right)
+    solution = list(right)
     for i in range(size):
         for k in range(i):
-            found[i] -= factor[i, k] * found[k]
+            solution[i] -= factor[i, k] * solution[k]
     for i in range(size - 1, -1, -1):
-        found[i] *= factor[i, i]
+        solution[i] *= factor[i, i]
         for k in range(i + 1, size):
-            found[i] -= factor[k, i] * found[k]
-    return found
+            solution[i] -= factor[k, i] * solution[k]
+    return solution

@@ -33,7 +33,7 @@ from dynamics.rigid_body.accelerations import (
     response,
     slope_derivative,
 )
-from dynamics.rigid_body.jacobians import freedoms, platform_arms
+from dynamics.rigid_body.jacobians import platform_arms, pose_basis
 from dynamics.rigid_body.passive_friction import passive_friction_columns
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
@@ -70,12 +70,12 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     layout = geometry.layout
     q, rate = _coordinates(geometry, "q", "rate")
     pose, pose_rate, _ = _poses(geometry, q, rate, 0 * rate)
-    free = freedoms(geometry)
+    basis = pose_basis(geometry)
     to_twist = pose_rate_to_twist(pose)
     gravity = ca.DM(geometry.gravity)
     twist = to_twist @ pose_rate
     twist_dot = twist_bias(pose, pose_rate)
-    freely = to_twist @ free
+    to_free_twist = to_twist @ basis
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
     legs, sides = _legs(geometry)
     parts = []
@@ -86,7 +86,7 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         mass = symmetric_from_lower(to_joint.T @ leg.mass(position, bodies) @ to_joint)
         force = leg.force(position, *moving, bodies, gravity)
-        row = leg.gradient(position).T @ to_joint @ freely
+        row = leg.gradient(position).T @ to_joint @ to_free_twist
         joint = [leg.acceleration(position, *moving), leg.coordinate(position), row @ rate]
         parts.append([mass, ca.vertcat(force, ca.cross(arm, force)), row, *joint])
     platform = rigid[layout.body_slices[0]]
@@ -98,10 +98,12 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     def end(
         masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]
     ) -> list[ca.SX]:
-        total = symmetric_from_lower(freely.T @ symmetric_from_lower(sum(masses, mass)) @ freely)
+        total = symmetric_from_lower(
+            to_free_twist.T @ symmetric_from_lower(sum(masses, mass)) @ to_free_twist
+        )
         return [
             total,
-            freely.T @ sum(forces, bias),
+            to_free_twist.T @ sum(forces, bias),
             *(ca.vertcat(*row) for row in rows),
             factored(total),
         ]
@@ -114,11 +116,15 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
     (q,) = _coordinates(geometry, "q")
     legs, sides = _legs(geometry)
     pose = _poses(geometry, q, 0 * q, 0 * q)[0]
-    freely = pose_rate_to_twist(pose) @ freedoms(geometry)
+    to_free_twist = pose_rate_to_twist(pose) @ pose_basis(geometry)
     parts = []
     for leg, arm in zip(legs, platform_arms(geometry, pose), strict=True):
         parts.append(
-            [leg.gradient(pose[0:3] + arm).T @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm)) @ freely]
+            [
+                leg.gradient(pose[0:3] + arm).T
+                @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+                @ to_free_twist
+            ]
         )
 
     def end(rows: Sequence[ca.SX]) -> list[ca.SX]:
@@ -133,12 +139,14 @@ def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
     The inputs of a column are pose and rate (m,). Its outputs are J_theta_dot rate (n,), theta
     (n,), its rate (n,), the factor of M (m, m), b (m,) and J_theta (n, m).
     """
-    whole = motion.whole
-    inputs = whole.sx_in()
+    function_ = motion.whole
+    inputs = function_.sx_in()
     q, rate, *shared = inputs
-    _, bias, jacobian, *joints, factor = whole.call(inputs)
-    found = ca.Function("motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian])
-    return ColumnFunction(found, len(shared), LANES, LANES)
+    _, bias, jacobian, *joints, factor = function_.call(inputs)
+    lane_function = ca.Function(
+        "motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian]
+    )
+    return ColumnFunction(lane_function, len(shared), LANES, LANES)
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
@@ -180,31 +188,34 @@ def _derivatives(
     `motion` are pose, rate and acceleration as expressions of `coordinates`.
     """
     layout = geometry.layout
-    free = freedoms(geometry)
+    basis = pose_basis(geometry)
     torque = ca.SX.sym("torque", layout.joints)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
     joints = _joints(geometry)
     legs, sides = _legs(geometry)
     parts = []
     for number, leg in enumerate(legs):
-        own = [rigid[one] for one in layout.leg_slices(number)]
+        bodies = [rigid[one] for one in layout.leg_slices(number)]
         gradient = joints.gradient[number]
         local, net_force, force, joint = _leg_derivatives(
-            leg, joints.of(number), torque[number], own, gravity
+            leg, joints.of(number), torque[number], bodies, gravity
         )
         by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
         by_rate = gradient.T @ _by_rate(force, joints, number)
-        of_joint = [_by_pose(joint, joints, number) @ free, _by_rate(joint, joints, number) @ free]
+        of_joint = [
+            _by_pose(joint, joints, number) @ basis,
+            _by_rate(joint, joints, number) @ basis,
+        ]
         of_leg = [
-            free.T @ by_pose @ free,
-            free.T @ by_rate @ free,
-            free.T @ gradient.T @ local,
+            basis.T @ by_pose @ basis,
+            basis.T @ by_rate @ basis,
+            basis.T @ gradient.T @ local,
             *of_joint,
         ]
         parts.append(of_leg[:count])
     platform = _platform_columns(joints, gravity, layout.full[0])
     of_platform = layout.body_slices[0]
-    whole = platform @ rigid[of_platform]
+    wrench = platform @ rigid[of_platform]
     passive = ca.SX.zeros(6, 0)
     # at a stop nothing turns that friction could act on
     if layout.passive_names and count > 3:
@@ -212,8 +223,10 @@ def _derivatives(
         passive = to_twist.T @ passive_friction_columns(
             geometry, joints.pose, to_twist @ joints.rate
         )
-        whole += passive @ rigid[layout.passive]
-    alone = [free.T @ ca.jacobian(whole, of) @ free for of in (joints.pose, joints.rate)]
+        wrench += passive @ rigid[layout.passive]
+    of_platform_alone = [
+        basis.T @ ca.jacobian(wrench, of) @ basis for of in (joints.pose, joints.rate)
+    ]
 
     def end(
         by_pose: Sequence[ca.SX],
@@ -221,25 +234,30 @@ def _derivatives(
         local: Sequence[ca.SX],
         *of_joints: Sequence[ca.SX],
     ) -> list[ca.SX]:
-        columns = ca.SX.zeros(free.shape[1], layout.rigid.stop)
-        columns[:, of_platform] = free.T @ platform
+        columns = ca.SX.zeros(basis.shape[1], layout.rigid.stop)
+        columns[:, of_platform] = basis.T @ platform
         if passive.shape[1]:
-            columns[:, layout.passive] = free.T @ passive
+            columns[:, layout.passive] = basis.T @ passive
         for number, of_leg in enumerate(local):
             slices = layout.leg_slices(number)
-            ends = np.cumsum([0, *(own.stop - own.start for own in slices)]).tolist()
-            for own, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
-                columns[:, own] = part
+            ends = np.cumsum([0, *(bodies.stop - bodies.start for bodies in slices)]).tolist()
+            for bodies, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
+                columns[:, bodies] = part
         return [
-            sum(by_pose, alone[0]),
-            sum(by_rate, alone[1]),
+            sum(by_pose, of_platform_alone[0]),
+            sum(by_rate, of_platform_alone[1]),
             columns,
             *(ca.vertcat(*rows) for rows in of_joints),
         ]
 
     inputs = [*coordinates, torque, rigid, *geometry.symbols]
     return _parted(
-        name, inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion)
+        name,
+        inputs,
+        parts,
+        end,
+        sides,
+        ([joints.pose, joints.rate, joints.pose_acceleration], motion),
     )
 
 
@@ -258,7 +276,7 @@ def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
         at_joint = ca.substitute(gradient, position, joints.position[number])
         along = joints.velocity[number].T @ curvature @ joints.gradient[number]
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
-    outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
+    outputs = [ca.vertcat(*rows) @ pose_basis(geometry)]
     return function(
         "rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion)
     )
@@ -273,9 +291,9 @@ def _poses(
     geometry: AnyGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Pose (6,), pose rate and pose acceleration for coordinates (m,) and their derivatives."""
-    free = freedoms(geometry)
-    at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(free.shape[1]))))
-    return at_home + free @ q, ca.densify(free @ rate), ca.densify(free @ acceleration)
+    basis = pose_basis(geometry)
+    at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(basis.shape[1]))))
+    return at_home + basis @ q, ca.densify(basis @ rate), ca.densify(basis @ acceleration)
 
 
 def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
@@ -332,7 +350,9 @@ def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
 
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
     """Expressions evaluated at another motion of the platform."""
-    return ca.substitute(outputs, [joints.pose, joints.rate, joints.gain], list(motion))
+    return ca.substitute(
+        outputs, [joints.pose, joints.rate, joints.pose_acceleration], list(motion)
+    )
 
 
 def _leg_derivatives(
@@ -391,6 +411,6 @@ def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
 def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM, full: bool) -> ca.SX:
     """Columns of the platform's own parameters."""
     to_twist = pose_rate_to_twist(joints.pose)
-    twist_dot = to_twist @ joints.gain + twist_bias(joints.pose, joints.rate)
+    twist_dot = to_twist @ joints.pose_acceleration + twist_bias(joints.pose, joints.rate)
     twist = to_twist @ joints.rate
     return to_twist.T @ platform_columns(joints.pose, twist, twist_dot, gravity, full)

@@ -1,4 +1,4 @@
-"""Inverse kinematics of a robot, its Jacobians, singularities and closure, from its legs (CasADi).
+"""Inverse kinematics, Jacobians, singularities and loop closure of a robot from its legs (CasADi).
 
 With J_a1 and J_a2 of eq. 7, diag(J_a1) theta_dot = J_a2 twist. Then J_ad = J_a1^-1 J_a2 (eq. 8),
 and J_theta = J_ad T is the Jacobian for pose rates (eq. 29). A pose has six entries even if the
@@ -12,11 +12,8 @@ from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
 
 
-def freedoms(geometry: AnyGeometry) -> ca.DM:
-    """Derivative d(pose)/d(coordinates) (6, m) as a sparse matrix.
-
-    Its columns also span the twists.
-    """
+def pose_basis(geometry: AnyGeometry) -> ca.DM:
+    """Basis (6, m) of the allowed pose changes, and of the allowed twists, as a sparse matrix."""
     return ca.sparsify(ca.DM(geometry.chart.basis))
 
 
@@ -29,7 +26,7 @@ def platform_arms(geometry: AnyGeometry, pose: ca.SX) -> list[ca.SX]:
 def joint_coordinates(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
     """Joint coordinates (n,), rad or m, at a pose (6,).
 
-    NaN for a leg that cannot reach the pose.
+    Entries of legs that cannot reach the pose are NaN.
     """
     arms = platform_arms(geometry, pose)
     return ca.vertcat(
@@ -68,19 +65,21 @@ def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
         position = pose[0:3] + arm
         velocity = twist[0:3] + ca.cross(twist[3:6], arm)
-        found = zip(
+        places_and_spins = zip(
             leg.placements(position), leg.angular_velocities(position, velocity), strict=True
         )
-        rows += [ca.vertcat(place.centre, ca.vec(place.axes.T), spin).T for place, spin in found]
+        rows += [
+            ca.vertcat(place.centre, ca.vec(place.axes.T), spin).T
+            for place, spin in places_and_spins
+        ]
     return ca.vertcat(*rows)
 
 
 def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Leverage (n,) of each actuator on its leg, in 0..1, and J_a2 (n, n) without unit.
+    """Leverage (n,) of each actuator on its leg, in 0..1, and J_a2 (n, m) without unit.
 
-    The columns of J_a2 are the twists that the platform can have. Its rows are [d, a x d], with the
-    unit vectors d of the forces of the legs. Angular columns are divided by the characteristic
-    length.
+    Row i of J_a2 is [d, a x d] for the unit vector d of the force of leg i. Each column is for one
+    twist that the platform can have, with rotations divided by the characteristic length.
     """
     leverages = []
     rows = []
@@ -89,15 +88,15 @@ def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.
         leverages.append(leg.leverage(pose[0:3] + arm))
         rows.append(ca.horzcat(direction.T, ca.cross(arm, direction).T))
     scale = np.repeat([1.0, 1 / geometry.characteristic_length], 3)
-    return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ freedoms(geometry)
+    return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ pose_basis(geometry)
 
 
 def loop_closure(geometry: AnyGeometry, pose: ca.SX, joints: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Gaps (n,), m^2, of the loops of eq. 3 and 4, at a pose and any joint coordinates.
 
-    The second result is d(gaps)/d(coordinates of the platform) (n, n).
+    Also returns the derivatives (n, m) of the gaps with respect to the platform's coordinates.
     """
     arms = platform_arms(geometry, pose)
     legs = enumerate(zip(geometry.legs, arms, strict=True))
     gap = ca.vertcat(*[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in legs])
-    return gap, ca.jacobian(gap, pose) @ freedoms(geometry)
+    return gap, ca.jacobian(gap, pose) @ pose_basis(geometry)

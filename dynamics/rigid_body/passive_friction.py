@@ -1,4 +1,4 @@
-"""Friction of the passive joints of the legs, by the relative angular velocity of their bodies.
+"""Friction of the passive joints of the legs, from the relative angular velocity of their bodies.
 
 Let w (3,) be the angular velocity of the outer body of a joint relative to the inner one, and W
 (3, 6) its derivatives with respect to the twist of the platform. Friction with the moment c w takes
@@ -35,11 +35,11 @@ def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -
         by_twist = ca.jacobian(relative, moving)
         spin = ca.substitute(relative, moving, ca.densify(twist))
         viscous = count * (by_twist.T @ spin)
-        sizes = {
+        wrenches = {
             "viscous": viscous,
             "coulomb": viscous / ca.sqrt(ca.dot(spin, spin) + SLOW**2),
         }
-        for law, wrench in sizes.items():
+        for law, wrench in wrenches.items():
             if f"{name}.{law}" in names:
                 columns[:, names.index(f"{name}.{law}")] += wrench
     return columns
@@ -50,19 +50,19 @@ def _relative_spins(
 ) -> list[tuple[str, ca.SX, int]]:
     """Name, relative angular velocity (3,) and number of parallel joints of each passive joint."""
     nominal = geometry if isinstance(geometry, RobotGeometry) else geometry.nominal
-    found = []
-    for leg, known, arm in zip(
+    joints = []
+    for leg, nominal_leg, arm in zip(
         geometry.legs, nominal.legs, platform_arms(geometry, pose), strict=True
     ):
         velocity = twist[0:3] + ca.cross(twist[3:6], arm)
         spins = leg.angular_velocities(pose[0:3] + arm, velocity)
         before = ca.SX.zeros(3)
-        segments = known.segments()
+        segments = nominal_leg.segments()
         for body, segment, spin in zip(leg.bodies, segments, spins, strict=True):
             if segment.passive:
-                found.append((PASSIVE_JOINT.format(body.name), spin - before, len(segment.copies)))
+                joints.append((PASSIVE_JOINT.format(body.name), spin - before, len(segment.copies)))
             before = spin
-        found.append(
+        joints.append(
             (PASSIVE_JOINT.format("platform"), twist[3:6] - before, len(segments[-1].copies))
         )
-    return found
+    return joints

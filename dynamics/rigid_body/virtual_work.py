@@ -19,12 +19,12 @@ from dynamics.kinematics.platform import (
     twist_bias,
 )
 from dynamics.rigid_body.jacobians import (
-    freedoms,
     joint_coordinates,
     joint_jacobian,
     loop_closure,
     placements,
     platform_arms,
+    pose_basis,
     pose_jacobian,
     reach_margin,
     singularity_measures,
@@ -85,8 +85,8 @@ def inertial_wrench(
 ) -> ca.SX:
     """Wrench M twist_dot + C twist + G (6,) for parameters `rigid` of the equation of motion.
 
-    It includes the friction of passive joints. It is the product of the regressor and the
-    parameters, but the regressor is not computed.
+    The wrench includes the friction of passive joints. It is the product of the regressor and the
+    parameters, computed without the regressor.
     """
     gravity = ca.DM(geometry.gravity)
     layout = geometry.layout
@@ -145,12 +145,12 @@ def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.
 
 def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
     """Mass matrix (6, 6) of the platform alone for its inertial parameters (4,) or (10,)."""
-    own = spatial_inertia(platform, rotation_matrix(pose[3:6]))
-    linear = own.mass * ca.SX.eye(3)
-    if own.first_moment is None:
-        return ca.diagcat(linear, own.inertia)
-    first = ca.skew(own.first_moment)
-    return ca.vertcat(ca.horzcat(linear, -first), ca.horzcat(first, own.inertia))
+    inertia = spatial_inertia(platform, rotation_matrix(pose[3:6]))
+    linear = inertia.mass * ca.SX.eye(3)
+    if inertia.first_moment is None:
+        return ca.diagcat(linear, inertia.inertia)
+    first = ca.skew(inertia.first_moment)
+    return ca.vertcat(ca.horzcat(linear, -first), ca.horzcat(first, inertia.inertia))
 
 
 def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
@@ -193,11 +193,10 @@ def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
 
 
 def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """Functions M, C, G, friction, regressor (eq. 23-26), inverse and forward dynamics (eq. 17,
-    40).
+    """Functions M, C, G, friction, regressor (eq. 23-26), and dynamics (eq. 17, 40).
 
-    Wrenches have six entries. The legs balance the entries that the chart forbids, and these have
-    no effect on the torques.
+    Wrenches have six entries. The legs balance the entries along which the platform cannot move,
+    and these have no effect on the torques.
     """
     layout = geometry.layout
     pose = ca.SX.sym("pose", 6)
@@ -213,17 +212,21 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
     holding = inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
     mass = mass_matrix(geometry, pose, rigid)
-    free = freedoms(geometry)
-    diagonal, upper, order = ca.ldl(symmetric_from_lower(free.T @ mass @ free))
-    acceleration = free @ ca.ldl_solve(
-        free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order
+    basis = pose_basis(geometry)
+    diagonal, upper, order = ca.ldl(symmetric_from_lower(basis.T @ mass @ basis))
+    acceleration = basis @ ca.ldl_solve(
+        basis.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order
     )
     # Coulomb and viscous friction of eq. 24, without its second v_E, which is a misprint
-    rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
-    regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
+    friction_columns = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
+    regressor = ca.horzcat(
+        rigid_body_regressor(geometry, pose, twist, twist_dot), *friction_columns
+    )
     passive = passive_friction_columns(geometry, pose, twist) @ xi[layout.passive]
-    rubbed = jacobian.T @ friction + passive if layout.passive_names else jacobian.T @ friction
-    torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction
+    friction_wrench = (
+        jacobian.T @ friction + passive if layout.passive_names else jacobian.T @ friction
+    )
+    torques = ca.solve((jacobian @ basis).T, basis.T @ inertial) + friction
     return [
         function("mass_matrix", [pose, xi, *geometry.symbols], [mass]),
         function(
@@ -232,7 +235,7 @@ def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
             [coriolis_matrix(geometry, pose, twist, rigid)],
         ),
         function("gravity_wrench", [pose, xi, *geometry.symbols], [holding]),
-        function("friction_wrench", [pose, twist, xi, *geometry.symbols], [rubbed]),
+        function("friction_wrench", [pose, twist, xi, *geometry.symbols], [friction_wrench]),
         function("regressor", [pose, twist, twist_dot, *geometry.symbols], [regressor]),
         function("inverse_dynamics", [pose, twist, twist_dot, xi, *geometry.symbols], [torques]),
         function("forward_dynamics", [pose, twist, torque, xi, *geometry.symbols], [acceleration]),

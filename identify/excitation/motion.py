@@ -22,7 +22,7 @@ from scipy.linalg import null_space
 
 from dynamics import Robot
 from dynamics.kinematics.platform import Chart, pose_rate_to_twist, twist_bias
-from dynamics.rigid_body.jacobians import freedoms, joint_jacobian
+from dynamics.rigid_body.jacobians import joint_jacobian, pose_basis
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array, agreed
 from identify.scenario import Excitation
@@ -208,7 +208,7 @@ def regressor(
     jacobian = joint_jacobian(robot.geometry, pose)
     velocity = jacobian @ twist
     sign = ca.sign(velocity) if smoothing is None else ca.tanh(velocity / smoothing)
-    free = freedoms(robot.geometry)
+    free = pose_basis(robot.geometry)
     rigid = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
     along = jacobian @ free
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))

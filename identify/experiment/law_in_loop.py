@@ -8,8 +8,8 @@ import numpy as np
 
 from dynamics.closed_loop import DriveName, EveryFrame
 from dynamics.control.gains import check_torque_gains
-from dynamics.control.inverse_dynamics import VAGUE, Model, Motion
-from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
+from dynamics.control.inverse_dynamics import GUESSED_DOUBT, Model, Motion
+from dynamics.control.law_interface import Assignment, Feedback, Law, LawInLoop
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.workspace import check_motion
 from identify.arrays import Array
@@ -78,7 +78,7 @@ class KnownModel:
 
     parameters: Array
     drive: DriveName | None = None
-    doubt: float = VAGUE
+    doubt: float = GUESSED_DOUBT
 
 
 def by_images(eye: SensorInLoop) -> LoopSensor:

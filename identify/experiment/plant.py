@@ -25,7 +25,7 @@ from dynamics.closed_loop import (
     simulate_servo,
     stability,
 )
-from dynamics.control.law import LawInLoop
+from dynamics.control.law_interface import LawInLoop
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import ScenarioError

@@ -12,7 +12,7 @@ import numpy as np
 
 import cmmsim
 from dynamics.closed_loop import LoopFailure
-from dynamics.control.inverse_dynamics import FITTED, VAGUE
+from dynamics.control.inverse_dynamics import FITTED_DOUBT, GUESSED_DOUBT
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
@@ -131,7 +131,7 @@ def known_model(plant: Plant, model: str) -> KnownModel:
     """Return the model of a plant with the name "initial" or "true"."""
     if model == "true":
         known = plant.parameters_of(plant.nominal.layout)
-        return KnownModel(known, plant.switches.drive, FITTED)
+        return KnownModel(known, plant.switches.drive, FITTED_DOUBT)
     start = plant.loop.side.model
     law = start.drive_law
     guess = starting_guess(plant.nominal, start.start_parameters, 1.0, drive=law)
@@ -186,7 +186,7 @@ def _fitted_doubt(misfit: Misfit | None) -> float:
 
     If the model does not explain the record, it is the uncertainty of a guess.
     """
-    return VAGUE if misfit is None or misfit.significant else FITTED
+    return GUESSED_DOUBT if misfit is None or misfit.significant else FITTED_DOUBT
 
 
 def follow_by_images(

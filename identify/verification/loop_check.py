@@ -16,7 +16,7 @@ from dynamics.control.gains import (
     torque_figures,
 )
 from dynamics.control.inverse_dynamics import Model
-from dynamics.control.law import Feedback
+from dynamics.control.law_interface import Feedback
 from dynamics.errors import DynamicsError, SimulationError
 from identify.arrays import Array
 from identify.loop_parameters import steps_needed

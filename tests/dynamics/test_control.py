@@ -26,13 +26,13 @@ from dynamics.closed_loop import (
 from dynamics.control.computed_torque import DecayingErrors, computed_torque, error_map
 from dynamics.control.feedforward import feedforward, joint_commands
 from dynamics.control.gains import design_servo, servo_figures, torque_figures
-from dynamics.control.inverse_dynamics import FITTED, Model, spans
-from dynamics.control.law import Assignment, Feedback
+from dynamics.control.inverse_dynamics import FITTED_DOUBT, Model, spans
+from dynamics.control.law_interface import Assignment, Feedback
 from dynamics.errors import SimulationError
 
 SERVO = ServoGains(0.3, 0.001, 2.4)
 FAST, SLOW = FrameTiming(60.0), FrameTiming(29.0, 1 / 29)
-EXACT = 0.6 * FITTED
+EXACT = 0.6 * FITTED_DOUBT
 """Doubt of a model with the plant's parameters: what is left are the steps in which the observer
 follows.
 """

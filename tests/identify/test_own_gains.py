@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import Drives, equilibrium
-from dynamics.control.law import LawInLoop
+from dynamics.control.law_interface import LawInLoop
 from dynamics.parameter_set import ParameterSet
 from identify.diagnosis.diagnose import diagnosis_from
 from identify.errors import EstimationError, RecordError, ScenarioError

@@ -7,7 +7,7 @@ import pytest
 
 from dynamics import load_robot
 from dynamics.closed_loop import LoopFailure
-from dynamics.control.law import LawInLoop
+from dynamics.control.law_interface import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.experiment.law_in_loop import KnownModel, NamedMotion, prepared

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from dynamics.control.inverse_dynamics import VAGUE
+from dynamics.control.inverse_dynamics import GUESSED_DOUBT
 from identify.estimation.identification import identify
 from identify.experiment.law_in_loop import KnownModel
 from identify.experiment.run import excitation_run
@@ -147,7 +147,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
     model = _model(setup, options)
     if options.off:
         model = replace(
-            model, parameters=model.parameters * (1.0 + options.off * signs), doubt=VAGUE
+            model, parameters=model.parameters * (1.0 + options.off * signs), doubt=GUESSED_DOUBT
         )
     # `motions` also returns a circle and a square, which are not used here.
     unseen = motions(setup.design, number)[: setup.design.unseen.count]

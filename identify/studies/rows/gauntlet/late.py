@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynamics.closed_loop import IDEAL, ClosedLoopRun, Reference, Sensor
-from dynamics.control.law import LawInLoop
+from dynamics.control.law_interface import LawInLoop
 from identify.arrays import Array
 from identify.experiment.plant import Plant
 
