@@ -27,15 +27,15 @@ SLOPE = np.deg2rad(15.0)
 # m: half of the width of side A.
 HALF_RIDGE = 0.020
 # m: width of sides B and C.
-SIDE = 0.060
+SIDE_WIDTH = 0.060
 # m: length of the board beyond its outermost stickers.
-END = 0.020
+END_LENGTH = 0.020
 # m: distance by which the base is moved behind the cameras.
 OUT_OF_SIGHT = 100.0
-# m: distance between the origins of the two ends of the rigid bar, which lie on its x axis.
+# m: distance between the origins of the two end frames of the rigid bar, which lie on its x axis.
 LENGTH = 0.300
 HALF_LENGTH = 0.5 * LENGTH + 0.065
-HALF_WIDTH = HALF_RIDGE + SIDE
+HALF_WIDTH = HALF_RIDGE + SIDE_WIDTH
 # True transform from the frame of the second end to the frame of the first end.
 END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
@@ -52,7 +52,7 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
 
     Side B lies towards +y, and side C towards -y.
     """
-    reach = max(float(np.abs(along).max()) for along, _ in (a, b, c)) + END
+    reach = max(float(np.abs(along).max()) for along, _ in (a, b, c)) + END_LENGTH
     sine = float(np.sin(SLOPE))
     cosine = float(np.cos(SLOPE))
     sides = {
@@ -60,7 +60,7 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
         "B": _side((0.0, sine, cosine), (0.0, HALF_RIDGE, 0.0), b, 1.0),
         "C": _side((0.0, -sine, cosine), (0.0, -HALF_RIDGE, 0.0), c, -1.0),
     }
-    width = HALF_RIDGE + SIDE * cosine
+    width = HALF_RIDGE + SIDE_WIDTH * cosine
     cuts = [
         HalfSpace(normal=normal, point=point)
         for normal, point in (
@@ -68,7 +68,7 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
             ((-1.0, 0.0, 0.0), (-reach, 0.0, 0.0)),
             ((0.0, 1.0, 0.0), (0.0, width, 0.0)),
             ((0.0, -1.0, 0.0), (0.0, -width, 0.0)),
-            ((0.0, 0.0, -1.0), (0.0, 0.0, -SIDE * sine - 0.05)),
+            ((0.0, 0.0, -1.0), (0.0, 0.0, -SIDE_WIDTH * sine - 0.05)),
         )
     ]
     return Platform(planes=Planes(**sides), cuts=cuts, home=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -77,7 +77,7 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
 def artefact_file(file: SensorFile, artefact: Platform) -> SensorFile:
     """Return the sensor file with an artefact instead of the platform, and the base out of sight.
 
-    The artefact's stickers lie exactly at the places that its certificate states.
+    The artefact's stickers lie exactly at their nominal places, which its certificate states.
     """
     stickers = file.stickers.model_copy(update={"placement": (0.0, 0.0)})
     return file.model_copy(
@@ -155,6 +155,7 @@ def _behind(body: Body, rig: Rig) -> Body:
 
 
 def _moved(half_space: H, shift: Array) -> H:
+    """Return the half-space moved by ``shift`` (3,) m."""
     x, y, z = np.array(half_space.point) + shift
     return half_space.model_copy(update={"point": (float(x), float(y), float(z))})
 
@@ -163,7 +164,7 @@ def _moved(half_space: H, shift: Array) -> H:
 class SensorUnderTest:
     """Sensor under test: its file, the seed of all its noise, and the name of a renderer.
 
-    Without a renderer, the renderer that the file names is used.
+    The default renderer is that of the file.
     """
 
     file: SensorFile

@@ -82,7 +82,7 @@ def estimate_latency(
 
     The model is positions(k) = motion(reported(k) - delay(k)) + offset. The constant offset (3,) is
     estimated as well, but not returned. Reports are at times ``reported`` (n,) s with ``positions``
-    (n, 3) m and ``covariances`` (n, 3, 3). The search begins with common delays from 0 to
+    (n, 3) m and ``covariances`` (n, 3, 3) m². The search begins with common delays from 0 to
     ``largest`` s, which must be at most half the period of the motion. Raises ShapeError for fewer
     than four reports, and for a motion that stands still.
     """
@@ -103,7 +103,7 @@ def estimate_latency(
                 f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
-        # One common delay and the offset are estimated first, then each delay separately.
+        # one common delay and the offset are estimated first, then each delay separately
         if iteration < ITERATIONS // 2:
             common, shift = _common_step(residuals, velocity)
             delays = delays + common
@@ -154,7 +154,7 @@ def latency_test(
     def motion(times: Array) -> Array:
         return apply(volume.base_from_volume, _circle(times))
 
-    # If the body cannot be found, the exception is raised here, before the frames are tracked.
+    # if the body cannot be found, the exception is raised here, before the frames are tracked
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
     taken = np.arange(frames) / sensor.timing.frame_rate
@@ -211,8 +211,8 @@ def _resolution(velocity: Array, covariances: Array | None) -> float:
     """
     if covariances is None:
         return 0.0
-    along = (
+    variances = (
         np.einsum("ni,nij,nj->n", velocity, covariances, velocity)
         / np.sum(velocity**2, axis=1) ** 2
     )
-    return float(np.sqrt(along.mean()))
+    return float(np.sqrt(variances.mean()))

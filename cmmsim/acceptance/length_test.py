@@ -25,7 +25,7 @@ STREAM = 1
 # Number of exposures of the artefact at rest over which lengths are averaged.
 EXPOSURES = 5
 # Irregular places of the stickers that serve to recognise the artefact. Along the artefact, they
-# are counted from its middle, as shares of the longest length. Across, they are in m.
+# are counted from its middle, as fractions of the longest length. Across, they are in m.
 RECOGNITION_B = (-0.37, -0.08, 0.31)
 RECOGNITION_C = (-0.29, 0.13, 0.4)
 RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
@@ -119,10 +119,10 @@ def length_test(
         sensor = under_test.facing(length_artefact(lines[number]), STREAM + number)
         return measure_line(sensor, volume, lines[number], exposures)
 
-    for found in on_all_cores(
+    for of_line in on_all_cores(
         measured, range(len(lines)), choose_renderer(under_test.renderer_name())
     ):
-        lengths += found
+        lengths += of_line
         advance()
     return LengthTest(volume, lines, tuple(lengths))
 
@@ -157,8 +157,7 @@ def measure_line(
 
 
 def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the distances (n - 1,) m of points from the first point, and their standard
-    deviations.
+    """Return the distances (n - 1,) m of points from the first, and their standard deviations.
 
     The points are (n, 3) with covariances (n, 3, 3).
     """

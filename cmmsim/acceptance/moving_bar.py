@@ -50,6 +50,7 @@ CYCLES = 1.5
 # Amplitude of the rotation about each axis, and number of its cycles in a run.
 TURN = np.deg2rad(8.0)
 TURN_CYCLES = np.array([1.0, 1.5, 0.5])
+# Angle of the bar to the image plane in the third orientation.
 TOWARDS_DEPTH = np.deg2rad(35.0)
 # s: step of the difference quotient of a path.
 STEP = 1e-4
@@ -166,8 +167,7 @@ class BarRun:
 class BarTest:
     """Result of the bar test.
 
-    It contains the measuring volume, the runs, the exposure time in s, and the largest speed of the
-    bar in m/s.
+    ``exposure`` is the exposure time, s, and ``largest_speed`` that of the bar, m/s.
     """
 
     volume: MeasuringVolume
@@ -233,12 +233,12 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     """Measure the bar at ``times`` (n,) s of a path. Before time 0, the bar stands still."""
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
-        # If an end cannot be found, the exception is raised here, before the frames are tracked.
+        # if an end cannot be found, the exception is raised here, before the frames are tracked
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
     rows = []
     seen = []
-    in_a_row = 0
+    lost_in_a_row = 0
     reason = ""
     for time in times:
         images = sensor.look(
@@ -246,13 +246,13 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
         )
         first, second = (tracker.measure(images) for tracker in trackers)
         if first.ok and second.ok:
-            in_a_row = 0
+            lost_in_a_row = 0
             seen.append(time)
             rows.append(relative_error(first, second))
         else:
-            in_a_row = in_a_row + 1
+            lost_in_a_row = lost_in_a_row + 1
             reason = first.reason or second.reason
-            if in_a_row == GIVEN_UP:
+            if lost_in_a_row == GIVEN_UP:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(
@@ -260,7 +260,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
             f"{reason}"
         )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
-    given_up = reason if in_a_row == GIVEN_UP else ""
+    given_up = reason if lost_in_a_row == GIVEN_UP else ""
     return BarRun(
         path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen), given_up
     )
@@ -287,7 +287,7 @@ def relative_covariance(first: Measurement, second: Measurement) -> Array:
     The error is in axes of the first end.
     """
     by_first = -np.eye(6)
-    # A rotation of the first end shifts the second end, because there is a lever between them.
+    # a rotation of the first end shifts the second end, because there is a lever between them
     by_first[:3, 3:] = skew(second.pose[:3] - first.pose[:3])
     total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)
     return compose_covariance(invert(pose_to_transform(first.pose)), total)

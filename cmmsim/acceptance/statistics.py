@@ -44,7 +44,7 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
-    # Blocks continue at the beginning of the values, so that all values are drawn equally often.
+    # blocks continue at the beginning of the values, so that all values are drawn equally often
     drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[
         :, : len(values)
     ]
@@ -52,10 +52,10 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
         k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
         for k, v in _figures(values[drawn]).items()
     }
-    found = {name: float(value) for name, value in _figures(values).items()}
+    figures = {name: float(value) for name, value in _figures(values).items()}
     return Statistics(
         len(values),
-        **found,
+        **figures,
         maximum=float(values.max()),
         interval={k: (float(a), float(b)) for k, (a, b) in limits.items()},
     )
@@ -82,6 +82,7 @@ def interval_of_mean(values: Array) -> Interval:
 
 
 def _require_finite(values: Array) -> None:
+    """Raise ShapeError unless there are values (n,), all finite."""
     if values.ndim != 1 or len(values) == 0 or not np.all(np.isfinite(values)):
         raise ShapeError(
             "statistics need at least one value and only finite values (n,), got shape "

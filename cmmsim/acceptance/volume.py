@@ -1,4 +1,4 @@
-"""Measuring volume, a cuboid wholly visible to both cameras, and the seven lines of VDI/VDE 2634-1.
+"""Measuring volume, a cuboid that both cameras see, and the seven lines of VDI/VDE 2634-1 in it.
 
 The origin of the volume axes is the target of the rig. As seen from the rig, x points to the right
 and y downwards; z points away from the middle of the baseline. Four lines are the space diagonals.
@@ -22,18 +22,18 @@ from cmmsim.geometry.stereo_rig import StereoRig
 # Smallest distance of the corners from the image edges. It leaves space for the artefacts' width.
 MARGIN_PX = 40.0
 # Largest ratio of half the volume's depth to the distance of the target from the baseline.
-LARGEST_SHARE = 0.8
+LARGEST_DEPTH_RATIO = 0.8
 # m: smallest side of a volume. The stickers of an artefact do not fit into a smaller volume.
 SMALLEST_SIZE = 0.1
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
 FEWEST_LINES = 7
 FEWEST_LENGTHS = 5
 # Smallest ratio of the longest test length to the space diagonal of the volume.
-LONGEST_SHARE = 2.0 / 3.0
-# Share of a diagonal that its line uses. The rest leaves space for the ends of the artefact.
-USED_SHARE = 0.9
-# Test lengths of a line, as shares of its longest test length.
-LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
+SMALLEST_LENGTH_RATIO = 2.0 / 3.0
+# Ratio of a line to its diagonal. The rest leaves space for the ends of the artefact.
+LINE_RATIO = 0.9
+# Test lengths of a line over its longest test length.
+TEST_LENGTHS = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
 # Ends of the lines, in half sides of the volume.
 LINES = {
     "space 1": ((-1, -1, -1), (1, 1, 1)),
@@ -110,8 +110,8 @@ def common_volume(place: Rig) -> MeasuringVolume:
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
     low = 0.0
-    high = 2.0 * LARGEST_SHARE * distance
-    # After 40 steps of bisection, the side is accurate to rounding.
+    high = 2.0 * LARGEST_DEPTH_RATIO * distance
+    # after 40 steps of bisection, the side is accurate to rounding
     for _ in range(40):
         middle = 0.5 * (low + high)
         if _unseen(rig, camera_from_base @ frame, np.full(3, middle), distance) is None:
@@ -162,10 +162,10 @@ def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[
 def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
     """Return a text that names a corner of a cuboid that a camera does not see.
 
-    The result is None if both cameras see all corners.
+    Returns None if both cameras see all corners.
     """
     corners = CORNERS * size
-    if 0.5 * size[2] > LARGEST_SHARE * distance:
+    if 0.5 * size[2] > LARGEST_DEPTH_RATIO * distance:
         return (
             f"its front face comes within {1e3 * (distance - 0.5 * size[2]):.0f} mm of the cameras"
         )
@@ -217,9 +217,9 @@ def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
     """
     lines = []
     for name, corners in LINES.items():
-        start, end = (USED_SHARE * (0.5 * np.array(corner) * volume.size) for corner in corners)
+        start, end = (LINE_RATIO * (0.5 * np.array(corner) * volume.size) for corner in corners)
         lines.append(
-            MeasuringLine(name, start, end, LENGTH_SHARES * float(np.linalg.norm(end - start)))
+            MeasuringLine(name, start, end, TEST_LENGTHS * float(np.linalg.norm(end - start)))
         )
     require_rules(lines, volume)
     return tuple(lines)
@@ -240,7 +240,7 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
                 "are needed"
             )
         longest = line.lengths.max()
-        limit = LONGEST_SHARE * volume.diagonal
+        limit = SMALLEST_LENGTH_RATIO * volume.diagonal
         if longest < limit:
             raise AcceptanceError(
                 f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less than "

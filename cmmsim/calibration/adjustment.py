@@ -109,6 +109,7 @@ class RigState:
 
 
 def _moved(transform: Array, change: Array) -> Array:
+    """Return a transform (4, 4) after a small change [dt, dphi] (6,)."""
     moved = transform.copy()
     moved[:3, 3] += change[:3]
     moved[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
@@ -180,8 +181,8 @@ class _Normal:
     def step(self, damping: float) -> tuple[Array, Array]:
         """Return the damped changes of the common unknowns (c,) and of the boards (v, 6)."""
         matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
-        # Focal lengths and distortion terms differ by ten orders of magnitude. Scaling to a unit
-        # diagonal avoids a loss of digits.
+        # focal lengths and distortion terms differ by ten orders of magnitude; scaling to a unit
+        # diagonal avoids a loss of digits
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         common = (
             scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
@@ -224,13 +225,13 @@ def adjust(
         )
     sigma2 = normal.cost / freedom
     shared = shared_errors(scores, information, sigma2)
-    spread = block_diag(free, free, np.eye(POSE))  # (24, c) maps the free parameters to all
+    to_all = block_diag(free, free, np.eye(POSE))  # (24, c) maps the common unknowns to all 24
     return Adjustment(
         state,
         normal.residuals,
         float(np.sqrt(sigma2)),
-        spread @ shared.covariance @ spread.T,
-        spread @ shared.independent @ spread.T,
+        to_all @ shared.covariance @ to_all.T,
+        to_all @ shared.independent @ to_all.T,
         float(eigenvalues[-1] / eigenvalues[0]),
         steps,
         freedom,
@@ -259,7 +260,7 @@ def _minimise(
         elif (
             damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost
         ):
-            # The linear model predicts almost no decrease, so the increase is a rounding error.
+            # the linear model predicts almost no decrease, so the increase is a rounding error
             return state, step
         else:
             damping *= 10.0
@@ -274,6 +275,7 @@ def _minimise(
 def _normal_equations(
     points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array
 ) -> _Normal:
+    """Return the normal equations of all views at a state. See ``adjust`` for the arguments."""
     common = 2 * free.shape[1] + POSE
     views = len(state.left_from_boards)
     residuals = []

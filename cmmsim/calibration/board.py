@@ -46,6 +46,7 @@ class Board(Section):
 
     @model_validator(mode="after")
     def _dots_fit(self) -> Board:
+        """Raise ValueError for dots that nearly touch, or for a radius that is missing or extra."""
         if self.kind == "chessboard":
             if self.radius is not None:
                 raise ValueError("a chessboard has no dots, remove radius")
@@ -79,9 +80,9 @@ class Board(Section):
     def symmetries(self) -> list[NDArray[np.int_]]:
         """Orders (points,) of the board's points that a picture cannot tell apart.
 
-        The orders belong to the unturned board, to half a turn, and to quarter turns if the board
-        has as many rows as columns. An asymmetric grid with an odd number of rows has one order
-        only. The first is the order of ``points``.
+        The first is the order of ``points``. The others follow from half a turn of the board, and
+        from quarter turns if it has as many rows as columns. An asymmetric grid with an odd number
+        of rows has no others.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "asymmetric_dots":

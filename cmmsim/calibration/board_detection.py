@@ -27,16 +27,16 @@ from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-# Share of the board's points that must be measured.
-FEWEST_SHARE = 0.7
-# Largest distance of a point from its place in the plane's perspective image, as a share of the
-# distance between neighbouring points.
+# Fraction of the board's points that must be measured.
+FEWEST_MEASURED = 0.7
+# Largest distance of a point from its place in the plane's perspective image, over the distance
+# between neighbouring points.
 LARGEST_POINT_GAP = 0.25
 # Largest relative difference between the measured and the given radius of the dots. A larger one
 # would make the correction of the dots' centres wrong by more than 20 %.
 LARGEST_RADIUS_GAP = 0.1
-# Half the width of cornerSubPix's window, as a share of the distance between neighbouring corners.
-FINE_WINDOW_SHARE = 0.3
+# Half the width of cornerSubPix's window, over the distance between neighbouring corners.
+FINE_WINDOW_RATIO = 0.3
 
 FIT_ITERATIONS = 5
 # Radius of the fitted surroundings of a dot, and radius from which on pixels belong to the ground,
@@ -48,9 +48,9 @@ SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
 PROBED = 12
 # A fit is rejected if its centre is farther than this from the rough centre, in dot radii.
 LARGEST_MOVE = 0.3
-# The radius comes from the fits if more than this share of them succeed, otherwise from the covered
-# area.
-FITTED_SHARE = 0.5
+# The radius comes from the fits if more than this fraction of them succeed, otherwise from the
+# covered area.
+FEWEST_FITTED = 0.5
 # Samples along each side of the square around a dot in which its area is measured.
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
@@ -62,12 +62,12 @@ PLAIN_NOISE = CameraNoise(
 )
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
 SMALLEST_AREA_PX = 20.0
-# Area of a dot as a share of the image.
+# Largest area of a dot over the area of the image.
 LARGEST_AREA = 0.01
 # OpenCV first searches an image reduced to at most this size, which is faster and has less noise.
 FIND_SIDE_PX = 1600
-# Largest distance of a dot from the grid that the four corners define, as a share of the distance
-# between neighbours.
+# Largest distance of a dot from the grid that the four corners define, over the distance between
+# neighbours.
 LARGEST_GRID_GAP = 0.3
 
 
@@ -100,7 +100,7 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     if found is None:
         return f"no {board.kind} of {board.columns} x {board.rows} found"
     measured = np.isfinite(found).all(axis=1)
-    if measured.sum() < FEWEST_SHARE * len(found):
+    if measured.sum() < FEWEST_MEASURED * len(found):
         other = radius_differs(radius, board.radius)
         why = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" if other else ""
         return f"only {measured.sum()} of {len(found)} points are sharp and whole{why}"
@@ -136,7 +136,10 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
 
 
 def radius_differs(measured: float | None, given: float | None) -> bool:
-    """Tell whether a measured radius contradicts a given one; False if either is missing."""
+    """Return True if a measured radius contradicts that of the board file.
+
+    Returns False if one of them is missing.
+    """
     return (
         measured is not None
         and given is not None
@@ -160,7 +163,7 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
     corners = np.asarray(corners, dtype=np.float32).reshape(-1, 1, 2)
     grid = corners.reshape(rows, columns, 2)
     nearest = min(np.linalg.norm(np.diff(grid, axis=k), axis=2).min() for k in (0, 1))
-    half = max(2, int(FINE_WINDOW_SHARE * nearest))
+    half = max(2, int(FINE_WINDOW_RATIO * nearest))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
     fine = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
     return np.asarray(fine, dtype=float).reshape(-1, 2)
@@ -178,7 +181,7 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
         return None
     shapes = _dot_shapes(rough, board)
     centres, ratios = _refine(bright, rough, shapes, board)
-    if np.isfinite(ratios).mean() > FITTED_SHARE:
+    if np.isfinite(ratios).mean() > FEWEST_FITTED:
         return centres, board.dot_radius * float(np.nanmedian(ratios))
     reach = 0.5 * board.nearest
     return centres, reach * covered_radius(bright, rough, shapes * (reach / board.dot_radius))
@@ -192,7 +195,7 @@ def _refine(
     Dots with windows of the same size are fitted together.
     """
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
-    # The window must not contain neighbouring dots.
+    # the window must not contain neighbouring dots
     reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     fine = np.full_like(rough, np.nan)
@@ -220,7 +223,7 @@ def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
     """
     best = SPREADS_PX[0]
     least = np.inf
-    # The misfit has one minimum: it falls up to the true blur and rises beyond it.
+    # the misfit falls up to the true blur and rises beyond it
     for spread in SPREADS_PX:
         fits = fit_ellipses(
             windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread
@@ -261,12 +264,12 @@ def _without_neighbours(
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Return the median radius of bright dots, as a share of half the distance to a neighbour.
+    """Return the median radius of bright dots, over half the distance to a neighbour.
 
-    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. With
-    grey values, the dot's share of the cell is (mean of the cell - ground) / (dot - ground). The
-    radius is overestimated if a dot is so blurred that its middle is not uniform: by a quarter at
-    2.5 px radius and 1 px of blur.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. From
+    grey values, the dot covers the fraction (mean of the cell - ground) / (dot - ground) of the
+    cell. The radius is overestimated if a dot is so blurred that its middle is not uniform: by a
+    quarter at 2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
@@ -321,15 +324,15 @@ def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
 def _bright_spots(bright: NDArray[np.uint8]) -> Array:
     """Return the centroids (n, 2) px of bright spots that have a plausible area of a dot."""
     _, shown = cv2.threshold(bright, 0.0, 1.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    found = []
+    centroids = []
     for contour in cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
-        of = cv2.moments(contour)
-        if SMALLEST_AREA_PX <= of["m00"] <= LARGEST_AREA * bright.size:
-            x = of["m10"] / of["m00"]
-            y = of["m01"] / of["m00"]
+        moments = cv2.moments(contour)
+        if SMALLEST_AREA_PX <= moments["m00"] <= LARGEST_AREA * bright.size:
+            x = moments["m10"] / moments["m00"]
+            y = moments["m01"] / moments["m00"]
             if shown[round(y), round(x)]:
-                found.append((x, y))
-    return np.array(found).reshape(-1, 2)
+                centroids.append((x, y))
+    return np.array(centroids).reshape(-1, 2)
 
 
 def _sharpest_corners(points: Array) -> Array:
@@ -367,12 +370,13 @@ def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Ar
         )
         if found:
             rough = np.asarray(centres, dtype=float).reshape(-1, 2)
-            # Scaling fixes the outer corner of the first pixel, which is at (-0.5, -0.5).
+            # scaling leaves the outer corner of the first pixel, (-0.5, -0.5), in its place
             return (rough + 0.5) / scale - 0.5
     return None
 
 
 def _blob_detector(pixels: int) -> Any:
+    """Return OpenCV's detector of bright blobs, for images of a number of pixels."""
     opencv: Any = cv2  # the type stubs of OpenCV lack the blob detector
     options = opencv.SimpleBlobDetector_Params()
     options.filterByColor = True

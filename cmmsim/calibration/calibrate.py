@@ -41,17 +41,17 @@ ROUNDS = 5
 TOLERANCE_PX = 1e-4
 # Plausible range of a board's longer side, m. Other values suggest a wrong unit.
 BOARD_SIDES = (0.01, 5.0)
-# Largest share of unused pairs without a warning.
+# Largest fraction of unused pairs without a warning.
 LARGEST_UNUSED = 1.0 / 3.0
-# A right camera that stands to the left of the left camera by more than this share of the baseline
-# is reported.
-LEFTWARD = 0.5
-# Largest standard deviations without a warning, as shares of the focal length and image width.
+# A right camera that stands to the left of the left camera by more than this fraction of the
+# baseline is reported.
+LARGEST_LEFTWARD = 0.5
+# Largest standard deviations without a warning, over the focal length and over the image width.
 LARGEST_FOCAL_STD = 0.003
 LARGEST_CENTRE_STD = 0.005
 # Smallest angle without a warning between the two board normals that differ most, rad (15 degrees).
 SMALLEST_TILT = 0.26
-# Smallest share of the image area within the convex hull of all points without a warning.
+# Smallest fraction of the image within the convex hull of all points without a warning.
 SMALLEST_COVER = 0.4
 FEW_VIEWS = 8
 
@@ -115,6 +115,7 @@ def calibrate(
 
 
 def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> None:
+    """Raise CalibrationError if both cameras see the board in too few pairs."""
     good = sum(pair.both for pair in pairs)
     if good < options.min_images:
         reasons = some([f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both])
@@ -158,7 +159,7 @@ def _without_misfits(
                 f"{usual:.2f} px"
             )
             judged[seen[k]] = judged[seen[k]].without(int(side), reason)
-        # The next round starts where this one ended.
+        # the next round starts where this one ended
         start = solved.state
         boards[seen] = solved.state.left_from_boards
     return judged, [judged[k] for k in seen], solved, sightings
@@ -217,6 +218,7 @@ def _offsets(
 def _used(
     kept: Sequence[PairView], solved: Adjustment, sightings: tuple[Sightings, Sightings]
 ) -> list[UsedView]:
+    """Return the used pairs with the rms residuals of their images."""
     rms = _image_rms(solved, sightings)
     return [
         UsedView(
@@ -243,6 +245,7 @@ def contradictions(board: Board, state: RigState, pairs: Sequence[PairView]) -> 
 
 
 def _dot_radius(board: Board, pairs: Sequence[PairView]) -> list[str]:
+    """Return a line if the dots are not of the size that the board file gives."""
     radii = [
         view.radius
         for pair in pairs
@@ -260,8 +263,9 @@ def _dot_radius(board: Board, pairs: Sequence[PairView]) -> list[str]:
 
 
 def _swapped(state: RigState) -> list[str]:
+    """Return a line if the right camera stands to the left of the left camera."""
     eye = invert(state.right_from_left)[:3, 3]
-    if eye[0] >= -LEFTWARD * np.linalg.norm(eye):
+    if eye[0] >= -LARGEST_LEFTWARD * np.linalg.norm(eye):
         return []
     place = ", ".join(f"{value:.3g}" for value in eye)
     return [
@@ -271,6 +275,7 @@ def _swapped(state: RigState) -> list[str]:
 
 
 def _units(board: Board, state: RigState) -> list[str]:
+    """Return a line if the board is so small or large that its unit is probably wrong."""
     width, height = np.ptp(board.points[:, :2], axis=0)
     if BOARD_SIDES[0] <= max(width, height) <= BOARD_SIDES[1]:
         return []
@@ -284,6 +289,7 @@ def _units(board: Board, state: RigState) -> list[str]:
 
 
 def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
+    """Return a line if many pairs are not used."""
     unused = [pair for pair in pairs if not pair.both]
     if len(unused) <= LARGEST_UNUSED * len(pairs):
         return []

@@ -25,8 +25,9 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left", "rig.covariance")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-# Largest ratio of the two baselines of the calibration and the sensor file without a warning.
-LARGEST_RATIO = 1.5
+# Largest ratio of the calibrated baseline to that of the sensor file, or of the latter to the
+# former, without a warning.
+LARGEST_BASELINE_RATIO = 1.5
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,10 @@ class Calibration:
 
         Rows and columns of fixed parameters are zero.
         """
-        spread = np.eye(len(PARAMETER_NAMES))
-        spread[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
-        return np.asarray(spread @ self.adjustment.covariance @ spread.T)
+        # the adjustment states small rotations, and the parameters are a rotation vector
+        jacobian = np.eye(len(PARAMETER_NAMES))
+        jacobian[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
+        return np.asarray(jacobian @ self.adjustment.covariance @ jacobian.T)
 
     @property
     def known(self) -> KnownRig:
@@ -100,8 +102,8 @@ def _inverse_left_jacobian(vector: Array) -> Array:
     """
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
-    # At small angles the general formula divides rounding errors by the angle squared. The series
-    # does not.
+    # at small angles, the general formula divides rounding errors by the angle squared; the series
+    # does not
     if angle < 1e-4:
         return np.eye(3) - 0.5 * k + k @ k / 12.0
     return (
@@ -111,9 +113,9 @@ def _inverse_left_jacobian(vector: Array) -> Array:
     )
 
 
-def rig_tables(found: Calibration) -> str:
+def rig_tables(calibration: Calibration) -> str:
     """Return the tables of a sensor file with the calibrated cameras and their covariance."""
-    state = found.adjustment.state
+    state = calibration.adjustment.state
     lines = []
     for side, values in zip(SIDES, state.intrinsics, strict=True):
         lines += [
@@ -125,25 +127,25 @@ def rig_tables(found: Calibration) -> str:
         ]
     lines += [
         "[rig.right_from_left]",
-        f"translation = {found.rig.right_from_left[:3, 3].tolist()}  # m",
-        f"rotation_vector = {found.rotation_vector.tolist()}  # rad",
+        f"translation = {calibration.rig.right_from_left[:3, 3].tolist()}  # m",
+        f"rotation_vector = {calibration.rotation_vector.tolist()}  # rad",
         "",
         "[rig.covariance]",
         "matrix = [",
-        *(f"    {row.tolist()}," for row in found.covariance),
+        *(f"    {row.tolist()}," for row in calibration.covariance),
         "]",
     ]
     return "\n".join(lines) + "\n"
 
 
-def as_dict(found: Calibration) -> dict[str, Any]:
+def as_dict(calibration: Calibration) -> dict[str, Any]:
     """Return all results of a calibration as a dictionary for JSON."""
-    solved = found.adjustment
+    solved = calibration.adjustment
     return {
         "opencv": cv2.__version__,
-        "board": found.board.model_dump(),
-        "image_size_px": [found.rig.left.width, found.rig.left.height],
-        "options": {"distortion": found.distortion, "fix_aspect": found.fix_aspect},
+        "board": calibration.board.model_dump(),
+        "image_size_px": [calibration.rig.left.width, calibration.rig.left.height],
+        "options": {"distortion": calibration.distortion, "fix_aspect": calibration.fix_aspect},
         "rms_px": {
             side: float(np.sqrt(np.mean(r**2)))
             for side, r in zip(SIDES, solved.residuals, strict=True)
@@ -158,9 +160,11 @@ def as_dict(found: Calibration) -> dict[str, Any]:
         },
         "parameters": {
             name: {"estimate": float(value), "std": float(std), "free": bool(std > 0.0)}
-            for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)
+            for name, value, std in zip(
+                PARAMETER_NAMES, calibration.values, calibration.std, strict=True
+            )
         },
-        "covariance": {"names": list(PARAMETER_NAMES), "matrix": found.covariance.tolist()},
+        "covariance": {"names": list(PARAMETER_NAMES), "matrix": calibration.covariance.tolist()},
         "used": [
             {
                 "name": view.name,
@@ -169,10 +173,10 @@ def as_dict(found: Calibration) -> dict[str, Any]:
                     solved.state.left_from_boards[view.view]
                 ).tolist(),
             }
-            for view in found.used
+            for view in calibration.used
         ],
-        "rejected": found.rejected,
-        "warnings": found.warnings,
+        "rejected": calibration.rejected,
+        "warnings": calibration.warnings,
     }
 
 
@@ -198,18 +202,18 @@ class SensorTemplate:
                 f"{self.size[0]} x {self.size[1]} px: use a sensor file of the same cameras"
             )
 
-    def filled(self, found: Calibration) -> str:
+    def filled(self, calibration: Calibration) -> str:
         """Return the text of the sensor file with the calibrated cameras.
 
         Raises CalibrationError for images of another size.
         """
-        self.require_size((found.rig.left.width, found.rig.left.height))
-        return self.text + rig_tables(found)
+        self.require_size((calibration.rig.left.width, calibration.rig.left.height))
+        return self.text + rig_tables(calibration)
 
-    def disagreements(self, found: Calibration) -> list[str]:
+    def disagreements(self, calibration: Calibration) -> list[str]:
         """Return a warning if the calibrated baseline differs much from that of the sensor file."""
-        baseline = float(np.linalg.norm(found.rig.right_from_left[:3, 3]))
-        if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_RATIO:
+        baseline = float(np.linalg.norm(calibration.rig.right_from_left[:3, 3]))
+        if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_BASELINE_RATIO:
             return []
         return [
             f"the calibrated cameras stand {baseline:.4g} m apart, but {self.baseline:.4g} m in "

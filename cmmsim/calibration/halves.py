@@ -1,6 +1,6 @@
 """Comparison of two calibrations, each from one half of the pictures.
 
-No other check of a stated covariance works without the true cameras.
+It checks the stated covariance, and does not need the true cameras.
 """
 
 from collections.abc import Callable, Sequence
@@ -101,8 +101,8 @@ def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
     covariance = one.covariance + other.covariance
     free = np.flatnonzero(np.diag(covariance) > 0.0)
     std = np.sqrt(np.diag(covariance)[free])
-    apart = (one.rig.parameters - other.rig.parameters)[free] / std
+    difference = (one.rig.parameters - other.rig.parameters)[free] / std
     values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std, std))
-    # The constraint fx = fy leaves directions without variance, in which both halves agree.
+    # the constraint fx = fy leaves directions without variance, in which both halves agree
     kept = values > len(PARAMETER_NAMES) * np.finfo(float).eps * values[-1]
-    return np.asarray((vectors.T @ apart)[kept] ** 2 / values[kept])
+    return np.asarray((vectors.T @ difference)[kept] ** 2 / values[kept])

@@ -73,6 +73,7 @@ def plate_corners(board: Board) -> Array:
 
 
 def _plate(board: Board, level: float) -> Mesh:
+    """Return the plate of a board with the reflectance ``level``."""
     corners = plate_corners(board)
     size = [*(corners[2, :2] - corners[0, :2]), THICKNESS]
     mesh = trimesh.creation.box(extents=size)
@@ -81,7 +82,7 @@ def _plate(board: Board, level: float) -> Mesh:
 
 
 def _squares(board: Board, level: float) -> list[Mesh]:
-    """Return the dark squares of a chessboard, including those outside its outermost corners."""
+    """Return a chessboard's squares of one colour, also those outside its outermost corners."""
     corners = board.spacing * np.array(
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
     )
@@ -198,6 +199,7 @@ def _poses_of(
 
 
 def _right_eye(rig: StereoRig) -> Array:
+    """Return the position (3,) of the right camera in axes of the left camera, m."""
     return invert(rig.right_from_left)[:3, 3]
 
 
@@ -213,7 +215,7 @@ def _facing(towards: Array) -> Array:
 
 
 def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.bool_]:
-    """Tell whether both cameras see the front of a board at poses (n, 4, 4).
+    """Return a mask (n,) of the poses (n, 4, 4) at which both cameras see the front of a board.
 
     A view at a grazing angle does not count.
     """
@@ -281,8 +283,8 @@ def _reached_tiles(
 ) -> NDArray[np.int_]:
     """Return the first pixels (k, 2) of the tiles within the bounding box of the board's plate."""
     plate = plate_corners(board)
-    share = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
-    outline = ((1.0 - share) * plate + share * np.roll(plate, -1, axis=0)).reshape(-1, 3)
+    fraction = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
+    outline = ((1.0 - fraction) * plate + fraction * np.roll(plate, -1, axis=0)).reshape(-1, 3)
     pixels = camera.project(apply(camera_from_board, outline))[0]
     size = np.array([camera.width, camera.height])
     first = np.clip(pixels.min(axis=0) - margin - 2.0, 0, size - 1).astype(int) // TILE_PX

@@ -3,10 +3,11 @@
 The adjustment assumes that errors of pixels are independent. In photographs a bent board, uneven
 light or the bias of the corner search displaces neighbouring points together. A view then carries
 less information than its number of points suggests. The scores of the views show this, while the
-size of the residuals does not. Let r_v be the residuals of view v, and J_v their derivatives by the
-common unknowns after the view's own pose is eliminated. The score of the view is s_v = J_v' r_v.
-The sum over all views is zero at the solution. Let I_v be the views' reduced normal matrices, which
-add up to N. For independent errors of variance sigma² the covariance of the scores is
+size of the residuals does not. Let r_v be the residuals of view v, and J_v their derivatives with
+respect to the common unknowns after the view's own pose is eliminated. The score of the view is s_v
+= J_v' r_v. The sum over all views is zero at the solution. Let I_v be the views' reduced normal
+matrices, which add up to N. For independent errors of variance sigma², the covariance of the scores
+is
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
@@ -111,10 +112,10 @@ def _enlargement(pulls: Array, ratio: float) -> Array:
     sandwich = pulls.T @ pulls
     mean = np.trace(sandwich) / size
     plain = mean * np.eye(size)
-    apart = np.sum((sandwich - plain) ** 2)
+    distance = np.sum((sandwich - plain) ** 2)
     outer = views * pulls[:, :, None] * pulls[:, None, :]
     scatter = np.sum((outer - sandwich) ** 2) / views**2
-    weight = min(1.0, scatter / apart) if apart > 0.0 else 1.0
+    weight = min(1.0, scatter / distance) if distance > 0.0 else 1.0
     eigenvalues, vectors = np.linalg.eigh(
         (weight * plain + (1.0 - weight) * sandwich) * (ratio / mean)
     )

@@ -17,7 +17,7 @@ from cmmsim.geometry.pose import Array
 SIDES = ("left", "right")
 # Percentile of an image with more than 8 bits that becomes 255. A fixed scale is unsuitable,
 # because images of 12-bit cameras use 1/16 of the range of 16 bits.
-WHITE_SHARE = 99.9
+WHITE_PERCENTILE = 99.9
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
@@ -36,10 +36,11 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
+    """Return the image with grey values from 0 to 255."""
     if image.dtype == np.uint8:
         return image
     values = np.nan_to_num(image.astype(np.float32), posinf=0.0, neginf=0.0)
-    white = max(float(np.percentile(values, WHITE_SHARE)), 1e-9)
+    white = max(float(np.percentile(values, WHITE_PERCENTILE)), 1e-9)
     return np.rint(np.clip(values * (255.0 / white), 0.0, 255.0)).astype(np.uint8)
 
 
@@ -145,6 +146,7 @@ def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
 
 
 def _joined(views: dict[int, BoardView]) -> Sightings:
+    """Return the sightings in all views of one camera, by the index of the view."""
     return Sightings(
         np.concatenate([np.full(len(view.index), k) for k, view in views.items()]),
         np.concatenate([view.index for view in views.values()]),

@@ -21,10 +21,10 @@ from cmmsim.geometry.pose import Array, invert, rigid
 FEWEST_VIEWS = 3
 # Two pictures show the board in the same place if their points differ by less than this, px rms.
 ALIKE_PX = 2.0
-# Poses of the right camera count as the same within this angle, rad, and this share of the
-# baseline.
+# Poses of the right camera count as the same if they differ by less than this angle, rad, and by
+# less than this fraction of the baseline.
 ALIKE_ANGLE = 0.06
-ALIKE_SHARE = 0.12
+ALIKE_SHIFT = 0.12
 MISFIT = (
     "the two poses of the board fit no other pair: the images do not belong together, or the board "
     "moved between the exposures"
@@ -73,7 +73,7 @@ def _one_camera(
             f"{FEWEST_VIEWS} are needed"
         )
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
-    # Two radial terms are enough for start values. The adjustment frees the other terms.
+    # two radial terms are enough for start values; the adjustment frees the other terms
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if radial_terms else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0
@@ -191,7 +191,7 @@ def _alike(places: Array) -> Array:
     """Return the mask (n, n) of pairs of transforms (n, 4, 4) that are nearly equal."""
     shifts = places[:, :3, 3]
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
-    near = gap < ALIKE_SHARE * np.linalg.norm(shifts, axis=1)[:, None]
+    near = gap < ALIKE_SHIFT * np.linalg.norm(shifts, axis=1)[:, None]
     return np.asarray(near & (_angles(places, places[:, :3, :3]) < ALIKE_ANGLE))
 
 
@@ -226,10 +226,10 @@ def _stereo(
         right.append(b.pixels[in_b].astype(np.float32))
     lenses = [(camera_matrix(values), values[4:]) for values in cameras]
     try:
-        found = cv2.stereoCalibrate(
+        results = cv2.stereoCalibrate(
             points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC
         )
     except cv2.error:
         return guess
-    place = rigid(found[5], np.ravel(found[6]))
+    place = rigid(results[5], np.ravel(results[6]))
     return place if np.isfinite(place).all() else guess

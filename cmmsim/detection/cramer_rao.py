@@ -1,13 +1,13 @@
 """The Cramer-Rao bound: the smallest covariance of an unbiased estimate of a disc's centre.
 
-The mean grey value of a pixel is ground + contrast * share. The share of light is the exact
-coverage by the ellipse, blurred by a Gaussian point spread. The unknowns are the centre and shape
-of the ellipse, the contrast and the ground. The grey value is the mean plus normal noise, rounded
-and clipped. The variance of the noise depends on the mean. The Fisher information of a grey value
-is a sum over all its possible numbers.
+The mean grey value of a pixel is ground + contrast * share. The share of light is the fraction of
+the pixel that the ellipse covers, blurred by a Gaussian point spread. The unknowns are the centre
+and shape of the ellipse, the contrast and the ground. The grey value is the mean plus normal noise,
+rounded and clipped. The variance of the noise depends on the mean. The Fisher information of a grey
+value is a sum over all its possible numbers.
 
 If the noise is below half a grey value, the information depends on the position of the mean between
-two whole grey values. No estimator is then unbiased at each single position of a centre. The
+two grey values. No estimator is then unbiased at each single position of a centre. The
 information is therefore averaged over one grey value, and the bound holds on average over unknown
 positions. For stronger noise, averaging changes nothing.
 """
@@ -27,10 +27,10 @@ TABLE_STEPS = 64
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Return the Fisher information, 1 / (grey value)², of a rounded and clipped grey value on its
-    mean.
+    """Return the Fisher information of rounded and clipped grey values on their means.
 
-    Raises CmmError for a camera without noise, for which there is no bound.
+    The unit is 1 / (grey value)². Raises CmmError for a camera without noise, for which there is no
+    bound.
     """
     mean_grey = np.asarray(mean_grey, dtype=float)
     variance, slope = _analog_variance(mean_grey, noise)
@@ -46,8 +46,8 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
         (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None],
     )
     possible = (numbers >= 0) & (numbers <= noise.white_level)
-    # In the upper half the probability is the difference of upper tails, because a difference of
-    # numbers close to one would lose all digits.
+    # in the upper half, the probability is a difference of upper tails, because a difference of
+    # numbers close to one would lose all digits
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
     change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
     usable = possible & (probability > 1e-30)
@@ -99,7 +99,7 @@ def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tup
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
-    """Return the noise variance before rounding, and its derivative by the mean."""
+    """Return the noise variance before rounding, and its derivative with respect to the mean."""
     variance = noise.variance(mean_grey) - 1.0 / (12.0 * noise.frames)
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
@@ -110,7 +110,7 @@ def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array
 
 
 def _rise(limit: Array, slope: Array, variance: Array) -> Array:
-    """Return the standard deviation times the derivative of -ndtr(limit) by the mean.
+    """Return the standard deviation times the derivative of -ndtr(limit) with respect to the mean.
 
     The mean changes both the position and the width of the noise distribution.
     """

@@ -58,11 +58,11 @@ class DetectedCentres:
         optional array is None if one of the results lacks it.
         """
         changed: dict[str, Any] = {}
-        for name, own in vars(self).items():
-            theirs = getattr(others, name)
-            changed[name] = None if own is None or theirs is None else own.copy()
+        for name, old in vars(self).items():
+            other = getattr(others, name)
+            changed[name] = None if old is None or other is None else old.copy()
             if changed[name] is not None:
-                changed[name][at] = theirs[which]
+                changed[name][at] = other[which]
         return replace(self, **changed)
 
 

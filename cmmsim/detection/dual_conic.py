@@ -28,6 +28,7 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_inside
 from cmmsim.geometry.pose import Array
 
+# Central difference along the slope.
 SLOPE = (-0.5, 0.0, 0.5)
 # Smoothing perpendicular to the slope (Scharr): the most isotropic kernel of this size.
 SMOOTHING = (0.1875, 0.625, 0.1875)
@@ -53,7 +54,7 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     )
     normal = np.einsum("inyx,jnyx->nij", basis, basis)
     determined = np.linalg.cond(normal) < 1.0 / SMALLEST_CONDITION
-    # These windows are not good, so any regular matrix can take the place of a singular one.
+    # these windows are not good, so any regular matrix can take the place of a singular one
     normal[~determined] = np.eye(5)
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
@@ -121,7 +122,7 @@ def _filtered(
 
 
 def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
-    """Return the derivative (n, 2, h, h) of the centres, px, by each grey value."""
+    """Return the derivatives (n, 2, h, h) of the centres, px, with respect to the grey values."""
     a = lines.a
     b = lines.b
     c = lines.c
@@ -143,9 +144,7 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
 
 
 def _squared_shape(dual: Array) -> Array:
-    """Return A A' (n, 2, 2) of the ellipse. It is z z' minus the upper left part of C*, with centre
-    z.
-    """
+    """Return A A' (n, 2, 2) of the ellipse: z z' minus the upper left part of C*, with centre z."""
     centre = 0.5 * dual[:, 3:]
     upper_left = np.stack(
         [dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1

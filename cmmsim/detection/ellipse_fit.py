@@ -1,7 +1,7 @@
 """Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows.
 
-The model of a grey value is ground + contrast * share. The share is the exact part of the pixel
-that the ellipse covers. It is blurred by the point spread and, if known, by the movement during the
+The model of a grey value is ground + contrast * share. The share of light is the fraction of the
+pixel that the ellipse covers, blurred by the point spread and, if known, by the movement during the
 exposure. Gauss-Newton solves for the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast,
 ground]. The weight of a grey value is the inverse of the camera's noise variance at the fitted
 value. The inverse of the normal matrix is the covariance of the parameters.
@@ -34,16 +34,16 @@ ELLIPSE_UNKNOWNS = 5
 SMEAR_STEP_PX = 0.2
 # A fit ends with a step shorter than this.
 CONVERGED_PX = 1e-4
-# Rms difference between noise-free images and the model of a pixel, as a share of the contrast.
+# Rms difference between noise-free images and the model of a pixel, over the contrast.
 MODEL_ERROR = 0.0025
 FEWEST_FOR_A_THREAD = 16  # windows
 
 
 @dataclass(frozen=True)
 class EllipseFits(DetectedCentres):
-    """Result of the fits in n windows.
+    """Result of the fits in n windows, with all optional arrays of ``DetectedCentres``.
 
-    It has all optional arrays of ``DetectedCentres``, and contrast and ground (n,) in grey values.
+    ``contrast`` and ``ground`` (n,) are in grey values.
     """
 
     shapes: Array = field()  # without a default, unlike in the base class
@@ -99,7 +99,7 @@ def fit_ellipses(
     covariances = np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     settings = fit_settings(noise, psf_px, iterations)
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
-    # Kernels are compiled for floats in C order.
+    # kernels are compiled for floats in C order
     pixels = np.ascontiguousarray(windows, dtype=float)
 
     def fit(part: slice) -> None:
@@ -121,7 +121,7 @@ def fit_ellipses(
 
 @lru_cache(maxsize=16)
 def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
-    """Return the settings of the fit for windows with this noise and point spread."""
+    """Return the settings of the fit for windows with a noise and a point spread."""
     from cmmsim.detection.fit_kernels import FitSettings
 
     scale = noise.white_level / 255.0
@@ -176,7 +176,7 @@ def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, grou
 
 
 def lies_inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
-    """Tell whether an ellipse lies wholly inside the window and exceeds the smallest radius."""
+    """Return a mask (n,) of ellipses that lie inside the window and exceed the smallest radius."""
     reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
     inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)
     mean = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1])

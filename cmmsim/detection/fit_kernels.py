@@ -69,10 +69,10 @@ def accumulate(
 ) -> float:
     """Fill the lower triangle of the normal matrix (7, 7), and the right-hand side (7,).
 
-    Return the weighted sum of squared residuals. All pixels wholly outside the ellipse have the
-    same mean, and so have all pixels wholly inside. Only the sums of their residuals are needed.
+    Return the weighted sum of squared residuals. All pixels outside the ellipse have the same mean,
+    and so have all pixels inside. Only the sums of their residuals are needed.
     """
-    # For each pixel on the rim: derivatives by the parameters, the residual, and the weight.
+    # for each pixel on the rim: derivatives for the parameters, the residual, and the weight
     rows = np.empty((window.size, UNKNOWNS + 2))
     count = 0
     misfit = 0.0
@@ -100,14 +100,14 @@ def accumulate(
             else:
                 weight = 1.0 / variance_at(mean, settings)
                 change = derivatives[row, column]
-                found = rows[count]
+                pixel = rows[count]
                 misfit += weight * residual * residual
                 for i in range(5):
-                    found[i] = contrast * change[i]
-                found[5] = share
-                found[6] = 1.0
-                found[7] = residual
-                found[8] = weight
+                    pixel[i] = contrast * change[i]
+                pixel[5] = share
+                pixel[6] = 1.0
+                pixel[7] = residual
+                pixel[8] = weight
                 count += 1
     add_products(rows[:count], normal, right)
     dark = 1.0 / variance_at(ground, settings)
@@ -124,8 +124,8 @@ def accumulate(
 def add_products(rows: Array, normal: Array, right: Array) -> None:
     """Fill the normal matrix (7, 7) and the right-hand side (7,) from rows (n, 9).
 
-    A row has the derivatives by seven parameters, the residual, and the weight. Each sum is a
-    separate scalar variable, so that the compiler can use vector instructions.
+    A row has the derivatives with respect to the seven parameters, the residual, and the weight.
+    Each sum is a separate scalar variable, so that the compiler can use vector instructions.
     """
     for i in range(UNKNOWNS):
         s_0 = 0.0
@@ -241,8 +241,8 @@ def light_of_moving(
 ) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) for an ellipse at constant velocity.
 
-    It moves by ``smear`` (2,) px during the exposure, and its parameters belong to the middle of
-    the exposure. The light is integrated by the midpoint rule.
+    The ellipse moves by ``smear`` (2,) px during the exposure, and its parameters are those at the
+    middle of the exposure. The light is integrated by the midpoint rule.
     """
     count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
     if count <= 1:
@@ -278,9 +278,9 @@ def fit_window(
     """Fit one ellipse by Gauss-Newton steps; return the reduced chi-square.
 
     ``parameters`` (7,) contain the start values and are replaced by the result. The fit ends when
-    the ellipse moves by less than ``converged`` px. The normal matrix and the misfit are those from
-    before this last step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its
-    first m parameters.
+    the ellipse moves by less than ``converged`` px. Covariance and chi-square are those from before
+    the last step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m
+    parameters.
     """
     size = len(window)
     mask = np.empty((size, size), np.bool_)
@@ -289,7 +289,7 @@ def fit_window(
     normal = np.empty((UNKNOWNS, UNKNOWNS))
     right = np.empty(UNKNOWNS)
     set_shape(parameters, shape)
-    # The mask of the start is used throughout, so that all steps minimise the same sum.
+    # the mask of the start is used throughout, so that all steps minimise the same sum
     freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
@@ -298,7 +298,7 @@ def fit_window(
             window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right
         )
         for k in range(UNKNOWNS):
-            # Keep the factor finite if the window does not determine a parameter.
+            # keep the factor finite if the window does not determine a parameter
             normal[k, k] += 1e-9
         factor(normal)
         if iteration == settings.iterations:

@@ -20,9 +20,9 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 
-# Threshold for the centroid, as a share of the contrast.
+# Threshold for the centroid, over the contrast.
 THRESHOLD = 0.1
-# Threshold that separates the spot from its surroundings, as a share of the contrast.
+# Threshold that separates the spot from its surroundings, over the contrast.
 CORE_THRESHOLD = 0.4
 
 
@@ -54,7 +54,7 @@ def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
         return no_centres()
     spots = bright_spots(given)
     x, y = _offsets(spots.centroids, given.fit_size)
-    # A pixel's weight has the derivative 1 above the threshold, and 0 below.
+    # a pixel's weight has the derivative 1 above the threshold, and 0 below
     influence = (spots.weights > 0.0) / _total(spots.weights)[:, None, None]
     jacobian = np.stack([x * influence, y * influence], axis=1)
     variance = given.noise.variance(spots.windows)
@@ -91,7 +91,7 @@ def bright_spots(given: SpotWindows) -> BrightSpots:
 def whole_inside(
     centres: Array, spreads: Array, size: int, margin: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Tell whether ellipses lie wholly inside their windows, ``margin`` px away from the sides.
+    """Return a mask (n,) of ellipses that lie ``margin`` px or more inside their windows.
 
     The ellipses have centres (n, 2) and second moments ``spreads`` (n, 2, 2).
     """
@@ -119,10 +119,12 @@ def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
 
 
 def _total(weights: Array) -> Array:
+    """Return the sums (n,) of weights (n, h, h), which are never zero."""
     return np.maximum(weights.sum(axis=(1, 2)), 1e-9)
 
 
 def _centroids(weights: Array) -> Array:
+    """Return the centroids (n, 2) of weights (n, h, h), px."""
     ticks = np.arange(weights.shape[1], dtype=float)
     return (
         np.stack([weights.sum(axis=1) @ ticks, weights.sum(axis=2) @ ticks], axis=1)
@@ -131,6 +133,7 @@ def _centroids(weights: Array) -> Array:
 
 
 def _spreads(weights: Array, centroids: Array) -> Array:
+    """Return the second moments (n, 2, 2) of weights (n, h, h) about the centroids, px²."""
     x, y = _offsets(centroids, weights.shape[1])
     cross = (weights * x * y).sum(axis=(1, 2))
     flat = np.stack(
@@ -146,7 +149,7 @@ def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool
     A disc of radius r has the second moment r² / 4.
     """
     x, y = _offsets(centroids, size)
-    # A flat window has no spread, but must have an inverse.
+    # a flat window has no spread, but must have an inverse
     inverse = np.linalg.inv(spreads + 1e-3 * np.eye(2))[..., None, None]
     reach = inverse[:, 0, 0] * x * x + 2.0 * inverse[:, 0, 1] * x * y + inverse[:, 1, 1] * y * y
     return np.asarray(reach < 4.0 * RING_REACH**2)

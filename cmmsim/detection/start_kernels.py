@@ -8,8 +8,8 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# A pixel above this share of the contrast belongs to the bright spot.
-CORE_SHARE = 0.4
+# A pixel above this fraction of the contrast belongs to the bright spot.
+CORE_THRESHOLD = 0.4
 SMALLEST_START_PX = 1.2
 # Number of histogram bins: one per grey value of 8-bit images.
 RANK_STEPS = 256
@@ -45,7 +45,7 @@ def nth_smallest(values: Array, n: int) -> float:
 
 @compiled
 def all_alike(values: Array) -> bool:
-    """Tell whether all values are the same number."""
+    """Return True if all values are the same number."""
     different = 0
     for value in values:
         different += value != values[0]
@@ -78,18 +78,17 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
             counts[steps[row, column]] += 1
     low, low_before = step_of_rank(counts, low_rank)
     high, high_before = step_of_rank(counts, high_rank)
-    found = np.empty((2, window.size + 1))
+    candidates = np.empty((2, window.size + 1))
     count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
-        # To avoid a branch, every value is stored, and the index advances only for a value that
-        # counts.
+        # to avoid a branch, every value is stored, and the index advances only for a candidate
         for column in range(width):
-            found[0, count[0]] = found[1, count[1]] = window[row, column]
+            candidates[0, count[0]] = candidates[1, count[1]] = window[row, column]
             count[0] += steps[row, column] == low
             count[1] += steps[row, column] == high
     return (
-        nth_smallest(found[0, : count[0]], low_rank - low_before),
-        nth_smallest(found[1, : count[1]], high_rank - high_before),
+        nth_smallest(candidates[0, : count[0]], low_rank - low_before),
+        nth_smallest(candidates[1, : count[1]], high_rank - high_before),
     )
 
 
@@ -119,10 +118,10 @@ def moments(window: Array) -> tuple:
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             # Most pixels fail this comparison, which avoids a division.
-            if window[row, column] - ground < 0.9 * CORE_SHARE * contrast:
+            if window[row, column] - ground < 0.9 * CORE_THRESHOLD * contrast:
                 continue
             share = (window[row, column] - ground) / contrast
-            if share > CORE_SHARE:
+            if share > CORE_THRESHOLD:
                 share = min(share, 1.0)
                 area += share
                 x += share * column

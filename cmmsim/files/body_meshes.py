@@ -1,7 +1,7 @@
 """Bodies of a sensor file that are triangle meshes, and the stickers on their surfaces.
 
 A mesh takes the place of the convex solid that planes and cuts enclose. It is drawn, and it hides
-stickers. The stickers still belong to three planes, because the frame of a body is taught by them.
+stickers. The stickers still belong to three planes, which define the frame of the body.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     import trimesh
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-# m: the room. A larger mesh has a wrong unit.
-LARGEST = 10.0
+# m: length of the largest mesh. A larger one probably has a wrong unit.
+LARGEST_SIZE = 10.0
 # Largest ratio of a mesh's length to the largest distance between its stickers.
-MOST_REACHES = 100.0
-# m: the dark ring of a sticker that lies deeper below the surface would be hidden by the body.
-DEEPEST = 0.0002
-# Share of a triangle by which a line may miss it, so that no line passes between two triangles.
-ON_EDGE = 1e-6
+LARGEST_SIZE_RATIO = 100.0
+# m: depth below the surface up to which the body does not hide the dark ring of a sticker.
+LARGEST_DEPTH = 0.0002
+# Fraction of a triangle by which a line may miss it, so that no line passes between two triangles.
+EDGE_TOLERANCE = 1e-6
 
 
 def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
@@ -48,7 +48,7 @@ def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise SensorFileError(f"{where} has no triangles")
-    # Formats such as GLB store each sharp edge twice, with two normals.
+    # formats such as GLB store each sharp edge twice, with two normals
     mesh = trimesh.Trimesh(mesh.vertices * METRES[section.mesh_unit], mesh.faces)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     mesh.update_faces(mesh.nondegenerate_faces())
@@ -85,13 +85,11 @@ def with_meshes(file: SensorFile, source: str) -> SensorFile:
 
 
 def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
-    """Raise SensorFileError if a mesh is larger than the room, or much larger than the stickers'
-    reach.
-    """
+    """Raise SensorFileError if a mesh is so large that its unit is probably wrong."""
     places = marked_body(name, section).nominal
     reach = float(np.linalg.norm(np.ptp(places, axis=0)))
     size = float(np.max(mesh.extents))
-    if size <= min(LARGEST, MOST_REACHES * reach):
+    if size <= min(LARGEST_SIZE, LARGEST_SIZE_RATIO * reach):
         return
     raise SensorFileError(
         f"{name}.mesh {section.mesh} is {size:g} m long, {size / reach:.0f} times the reach of its "
@@ -102,13 +100,12 @@ def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
 def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Array:
     """Return the heights (n,) of a mesh's surface above places (n, 3), along normals (n, 3), m.
 
-    It is the height of the nearest outer surface. It is NaN where the normal's line misses the
-    mesh.
+    The nearest outer surface counts. The height is NaN if the line along a normal misses the mesh.
     """
     first, second, third = np.moveaxis(np.asarray(mesh.triangles), 1, 0)
     sides = second - first, third - first
     heights = np.full(len(places), np.nan)
-    # The Möller-Trumbore intersection, with all triangles at once.
+    # the Möller-Trumbore intersection, with all triangles at once
     for k, (place, normal) in enumerate(zip(places, normals, strict=True)):
         across = np.cross(normal, sides[1])
         volume = np.einsum("ni,ni->n", sides[0], across)
@@ -118,8 +115,10 @@ def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Arr
             u = np.einsum("ni,ni->n", gap, across) / volume
             v = turned @ normal / volume
             height = np.einsum("ni,ni->n", sides[1], turned) / volume
-            inside = (u >= -ON_EDGE) & (v >= -ON_EDGE) & (u + v <= 1.0 + ON_EDGE)
-        # The volume is below zero where a line along the normal leaves the body.
+            inside = (
+                (u >= -EDGE_TOLERANCE) & (v >= -EDGE_TOLERANCE) & (u + v <= 1.0 + EDGE_TOLERANCE)
+            )
+        # the volume is below zero where a line along the normal leaves the body
         met = inside & (volume < 0.0)
         if met.any():
             heights[k] = height[met][np.abs(height[met]).argmin()]
@@ -153,13 +152,13 @@ def _require_on_surface(mesh: trimesh.Trimesh, body: MarkedBody, radius: float) 
 
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)
     for sticker, place, height in zip(body.sticker_ids, body.nominal, heights, strict=True):
-        # A sticker that juts out over an edge lies near the surface, although not along its normal.
+        # a sticker that juts out over an edge lies near the surface, although not along its normal
         away = float(closest_point_naive(mesh, place[None])[1][0])
-        deep = height > DEEPEST
+        deep = height > LARGEST_DEPTH
         if deep or away > radius:
             words = f"{height:.4g} m below" if deep else f"{away:.4g} m away from"
             raise SensorFileError(
                 f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, at most "
-                f"{DEEPEST if deep else radius:g} m is possible; {body.name}.drop = true moves the "
-                "planes of stickers onto the surface"
+                f"{LARGEST_DEPTH if deep else radius:g} m is possible; {body.name}.drop = true "
+                "moves the planes of stickers onto the surface"
             )

@@ -50,16 +50,16 @@ def pair_images(
         raise error(
             f"{left} is given for both cameras; give one folder of left and one of right images"
         )
-    found = [_image_files(Path(folder), error) for folder in (left, right)]
-    names = [{path.stem for path in side} for side in found]
-    if len(found[0]) != len(found[1]) or (names[0] & names[1] and names[0] != names[1]):
+    files = [_image_files(Path(folder), error) for folder in (left, right)]
+    names = [{path.stem for path in side} for side in files]
+    if len(files[0]) != len(files[1]) or (names[0] & names[1] and names[0] != names[1]):
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise error(
-            f"{left} has {len(found[0])} images and {right} has {len(found[1])}; {HOW_PAIRED}, so "
+            f"{left} has {len(files[0])} images and {right} has {len(files[1])}; {HOW_PAIRED}, so "
             f"each image needs its partner. Only on the left: {some(alone[0])}; only on the right: "
             f"{some(alone[1])}"
         )
-    return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
+    return [ImagePair(a, b) for a, b in zip(*files, strict=True)]
 
 
 def read_pixels(path: Path, error: type[CmmError]) -> NDArray:
@@ -87,6 +87,7 @@ def read_pixels(path: Path, error: type[CmmError]) -> NDArray:
 
 
 def _image_files(folder: Path, error: type[CmmError]) -> list[Path]:
+    """Return the image files of a folder, sorted by name. Raises ``error`` if there are none."""
     if not folder.is_dir():
         raise error(f"no folder {folder}; give one folder of left and one of right images")
     files = sorted(

@@ -9,6 +9,7 @@ from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 Level = Annotated[int, Field(ge=0, le=255)]
+"""Grey level of an 8-bit image."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,11 @@ class Bounds:
     ) -> dict[str, Any]:
         least = min(self.least, 0.0) if self.zero else self.least
         # A field can have narrower limits of its own, which apply as well.
-        shown = handler(schema)
+        inner = handler(schema)
         return {
-            **shown,
-            "minimum": max(least, shown.get("minimum", least)),
-            "maximum": min(self.most, shown.get("maximum", self.most)),
+            **inner,
+            "minimum": max(least, inner.get("minimum", least)),
+            "maximum": min(self.most, inner.get("maximum", self.most)),
         }
 
 

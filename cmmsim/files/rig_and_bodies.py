@@ -31,7 +31,7 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
     """
     position = np.array(section.position)
     target = np.array(section.target)
-    # For a vertical line of sight, the horizontal axis of the cameras is not defined.
+    # for a vertical line of sight, the horizontal axis of the cameras is not defined
     if np.linalg.norm(np.cross(target - position, [0.0, 0.0, 1.0])) < 1e-6:
         raise SensorFileError(
             f"rig.target {list(section.target)} must not be equal to rig.position "
@@ -52,6 +52,7 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
 
 
 def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) -> PinholeCamera:
+    """Return the calibrated camera, or the nominal one if the file has no calibration."""
     if calibrated is None:
         return nominal
     focal_x, focal_y = calibrated.focal_px
@@ -70,16 +71,17 @@ def _require_whole_image(camera: PinholeCamera, name: str) -> None:
         [np.column_stack([x, np.full_like(x, k)]) for k in (y[0], y[-1])]
         + [np.column_stack([np.full_like(y, k), y]) for k in (x[0], x[-1])]
     )
-    found = camera.undistort(border)[1]
-    if not found.all():
+    valid = camera.undistort(border)[1]
+    if not valid.all():
         raise SensorFileError(
             f"rig.{name}.distortion: the image folds back before pixel "
-            f"{np.round(border[~found][0]).tolist()}, {camera.distortion.fold_radius:.4g} focal "
+            f"{np.round(border[~valid][0]).tolist()}, {camera.distortion.fold_radius:.4g} focal "
             "lengths from the optical axis"
         )
 
 
 def _right_from_left(section: RightFromLeft) -> Array:
+    """Return right_from_left (4, 4). Raises SensorFileError for an impossible place."""
     right_from_left = rigid(rotation_exp(np.array(section.rotation_vector)), section.translation)
     right_centre = -right_from_left[:3, :3].T @ right_from_left[:3, 3]
     if np.linalg.norm(right_centre) < SHORTEST_BASELINE:
@@ -168,10 +170,7 @@ def marked_body(name: str, body: Body) -> MarkedBody:
 
 
 def require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the planes of a body meet in one point.
-
-    This point is needed to define the body's frame.
-    """
+    """Raise TeachingError unless the planes of a body meet in one point, the frame's origin."""
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
         raise TeachingError(

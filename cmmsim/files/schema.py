@@ -64,6 +64,7 @@ class Timing(Section):
 
     @model_validator(mode="after")
     def _possible(self) -> Timing:
+        """Raise ValueError for an exposure or a jitter that is too long."""
         if self.exposure * self.frame_rate > 1.0 + 1e-9:
             raise ValueError(
                 f"exposure {self.exposure:g} s is longer than the frame period at "
@@ -82,12 +83,11 @@ class Timing(Section):
         return self.latency + self._widest_deviation
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array:
-        """Draw a random latency (frames,) per frame, s.
+        """Draw a random latency (frames,) for each frame, s.
 
-        It is the time from the middle of the exposure to the use of the pose. It is normal with
-        mean ``latency`` and standard deviation ``latency_jitter``. Deviations from the mean are
-        clipped to 3 standard deviations or to ``latency``, whichever is less. Therefore no latency
-        is negative, and the mean remains ``latency``.
+        Latencies are normal with mean ``latency`` and standard deviation ``latency_jitter``.
+        Deviations from the mean are clipped to 3 standard deviations or to ``latency``, whichever
+        is less, so that no latency is negative and the mean remains ``latency``.
         """
         widest = self._widest_deviation
         return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
@@ -137,9 +137,8 @@ class RigCovariance(Section):
 class Rig(Section):
     """Both cameras and their places.
 
-    If ``distance`` is given, ``position`` is moved along the line to ``target`` until it has this
-    distance from ``target``. ``left`` and ``right`` replace ``focal_px`` and the principal point in
-    the middle of the image. ``right_from_left`` replaces ``baseline`` and the toe-in of both
+    ``distance`` moves ``position`` along the line to ``target``, to this distance from ``target``.
+    ``left`` and ``right`` replace ``focal_px`` and the principal point in the middle of the image. ``right_from_left`` replaces ``baseline`` and the toe-in of both
     cameras towards ``target``.
     """
 
@@ -220,7 +219,7 @@ class Lens(Section):
         0.0, "px", "standard deviation of the Gaussian point spread"
     )
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = quantity(
-        0.0, "", "share of the light that is lost in the farthest corner of the image"
+        0.0, "", "fraction of the light that is lost in the farthest corner of the image"
     )
 
     @model_validator(mode="after")

@@ -26,11 +26,11 @@ def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
 
     A later change replaces an earlier change of the same key.
     """
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in changes.items():
         path = f"{section}{key}"
-        found |= dotted(value, f"{path}.") if isinstance(value, Mapping) else {path: value}
-    return found
+        flat |= dotted(value, f"{path}.") if isinstance(value, Mapping) else {path: value}
+    return flat
 
 
 def require_keys(name: str | Path, changes: object) -> None:
@@ -68,6 +68,7 @@ def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> 
 
 
 def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> None:
+    """Replace the entry with a dotted key. See ``change`` for the arguments and the errors."""
     *sections, key = path.split(".")
     for section in sections:
         content = content.setdefault(section, {})
@@ -84,8 +85,8 @@ def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array
     """Return places (count, 2) [u, v], m, on the one-standard-deviation ellipse of listed places.
 
     ``listed`` (n, 2) are the listed places. Three or more points at equal angles on an ellipse have
-    the same mean and the same second moments, whatever their number. Therefore the accuracy of a
-    plane or a pose improves with the square root of the number of stickers.
+    the same mean and the same second moments, whatever their number. The accuracy of a plane or a
+    pose thus improves with the square root of the number of stickers.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
@@ -171,26 +172,30 @@ def sensor_schema() -> dict[str, Any]:
         if "$ref" in one
     }
     needed = {name: schema["$defs"][table].pop("required", []) for name, table in tables.items()}
-    whole = {
+    complete = {
         "required": schema["required"],
         "properties": {name: {"required": entries} for name, entries in needed.items() if entries},
     }
-    return schema | {"required": ["name"], "if": {"not": {"required": ["based_on"]}}, "then": whole}
+    return schema | {
+        "required": ["name"],
+        "if": {"not": {"required": ["based_on"]}},
+        "then": complete,
+    }
 
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
     """Return the file with ``stickers.per_plane`` stickers on each plane of the platform."""
     count = file.stickers.per_plane
-    room = 2.0 * file.stickers.ring_radius
+    ring_width = 2.0 * file.stickers.ring_radius
     if count is None:
         return file
     planes = {}
     for name, plane in file.platform.planes:
         places = ring_of_stickers(plane.stickers, count)
-        if closest(places) < room:
+        if closest(places) < ring_width:
             raise SensorFileError(
                 f"{source}: with stickers.per_plane = {count}, stickers on plane {name} are "
-                f"{closest(places):.4f} m apart, but their rings need {room:g} m"
+                f"{closest(places):.4f} m apart, but their rings need {ring_width:g} m"
             )
         planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
     platform = file.platform.model_copy(
@@ -208,9 +213,9 @@ def _content(name: str | Path) -> dict[str, Any]:
     basis = own.get("based_on")
     if not isinstance(basis, str):
         return own
-    beside = basis if basis in built_in_names() else Path(name).parent / basis
+    basis_file = basis if basis in built_in_names() else Path(name).parent / basis
     try:
-        base = _table(beside)
+        base = _table(basis_file)
     except UnknownSensorError as error:
         raise SensorFileError(f"sensor file {name}: based_on: {error}") from error
     if "based_on" in base:

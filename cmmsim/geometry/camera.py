@@ -73,10 +73,11 @@ class Distortion:
         return self._distorted(points)[0]
 
     def jacobian(self, points: Array) -> Array:
-        """Return the derivatives (..., 2, 2) of distorted points by undistorted points (..., 2)."""
+        """Return the derivatives (..., 2, 2) of distorted points at undistorted points (..., 2)."""
         return self._distorted(points)[1]
 
     def _distorted(self, points: Array) -> tuple[Array, Array]:
+        """Return the distorted points (..., 2), and their derivatives (..., 2, 2)."""
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import distort_points
 
@@ -87,9 +88,9 @@ class Distortion:
         return distorted.reshape(points.shape), slopes.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
-        """Tell whether the model is valid at undistorted points (..., 2).
+        """Return a mask (...) of the undistorted points (..., 2) at which the model is valid.
 
-        It is valid inside the fold radius if the determinant of the derivative is positive.
+        The model is valid inside the fold radius if the determinant of the derivative is positive.
         """
         within = np.sum(points * points, axis=-1) < self.fold_radius**2
         return within & (np.linalg.det(self.jacobian(points)) > 0.0)
@@ -210,10 +211,10 @@ class PinholeCamera:
         return pixels, ahead & self.shows(pixels)
 
     def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
-        """Tell whether pixels (..., 2) lie inside the image.
+        """Return a mask (...) of the pixels (..., 2) that lie inside the image.
 
         ``margin`` px is the smallest distance to the centres of the outermost pixels; -0.5 allows
-        the whole image.
+        the complete outermost pixels.
         """
         return np.all(
             (pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)),
@@ -221,7 +222,7 @@ class PinholeCamera:
         )
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
-        """Return pixels (..., 2) for ideal pixels (..., 2), and where the model is valid."""
+        """Return pixels (..., 2) for ideal pixels (..., 2), and a mask of valid ones."""
         if self.distortion.is_zero:
             return ideal, np.ones(ideal.shape[:-1], dtype=bool)
         normalised = (ideal - self.centre) / self.focal_lengths
@@ -240,7 +241,7 @@ class PinholeCamera:
         return normalised * self.focal_lengths + self.centre, found
 
     def distortion_jacobian(self, ideal: Array) -> Array:
-        """Return the derivative (..., 2, 2) of the image's pixels by ideal pixels (..., 2)."""
+        """Return the derivatives (..., 2, 2) of the image's pixels at ideal pixels (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
 
@@ -256,7 +257,7 @@ class Optics:
     """Point spread and vignetting of a lens.
 
     ``psf_px`` is the standard deviation of the Gaussian point spread, px. ``vignetting`` is the
-    share of the light that is missing in the corner farthest from the principal point. The loss
+    fraction of the light that is missing in the corner farthest from the principal point. The loss
     grows with the square of the distance from the principal point. If both are zero, the image is
     that of a pinhole camera.
     """
@@ -270,7 +271,7 @@ class Optics:
 
     @property
     def margin_px(self) -> int:
-        """Largest distance in whole px from which light outside a window reaches into it."""
+        """Largest distance, px (an integer), from which light outside a window reaches into it."""
         return ceil(PSF_REACH * self.psf_px)
 
     def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:

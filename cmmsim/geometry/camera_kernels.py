@@ -38,9 +38,9 @@ class Cameras(NamedTuple):
 def distort_point(
     x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float
 ) -> tuple:
-    """Return a distorted point x, y and its derivatives xx, xy, yy by the undistorted point.
+    """Return a distorted point x, y and its derivatives xx, xy, yy at an undistorted point.
 
-    The derivative of x by y equals that of y by x.
+    The matrix of derivatives is symmetric.
     """
     s = x * x + y * y
     radial = 1.0 + s * (k1 + s * (k2 + s * k3))
@@ -57,7 +57,7 @@ def distort_point(
 
 @compiled
 def distort_points(lens: Array, points: Array, distorted: Array, slopes: Array) -> None:
-    """Fill distorted points (n, 2) and their derivatives (n, 2, 2) by the undistorted points.
+    """Fill distorted points (n, 2) and their derivatives (n, 2, 2), ``slopes``.
 
     ``lens`` (5,) is k1, k2, p1, p2, k3, and ``points`` (n, 2) are undistorted.
     """
@@ -122,7 +122,7 @@ def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
 
 @compiled
 def faces(point: Array, normal: Array, grazing: float) -> bool:
-    """Tell whether a sticker at a point (3,) in camera axes faces the camera.
+    """Return True if a sticker at a point (3,) in camera axes faces the camera.
 
     The cosine between its normal and the direction to the camera must exceed ``grazing``.
     """
@@ -147,22 +147,22 @@ def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) 
         return 1.0
     x = camera[2]
     y = camera[3]
-    # The corner of the image's outer edge that is farthest from the principal point.
+    # corner of the image's outer edge that is farthest from the principal point
     farthest_x = max(x + 0.5, size[0] - 0.5 - x)
     farthest_y = max(y + 0.5, size[1] - 0.5 - y)
-    share = ((u - x) ** 2 + (v - y) ** 2) / (farthest_x**2 + farthest_y**2)
-    return max(1.0 - vignetting * share, 0.0)
+    distance_ratio = ((u - x) ** 2 + (v - y) ** 2) / (farthest_x**2 + farthest_y**2)
+    return max(1.0 - vignetting * distance_ratio, 0.0)
 
 
 @compiled
 def point_derivatives(
     move: Array, by_u: float, by_v: float, f_x: float, f_y: float, t_x: float, t_y: float
 ) -> tuple:
-    """Return the derivatives of one pixel coordinate by the three coordinates of a point.
+    """Return the derivatives of one pixel coordinate with respect to the coordinates of a point.
 
-    ``by_u`` and ``by_v`` are the derivatives of the pixel coordinate by the ideal pixel. ``f_x``
-    and ``f_y`` are the focal lengths divided by the depth, and ``t_x`` and ``t_y`` are the
-    normalised image coordinates of the point.
+    ``by_u`` and ``by_v`` are the derivatives of the pixel coordinate with respect to the ideal
+    pixel. ``f_x`` and ``f_y`` are the focal lengths divided by the depth, and ``t_x`` and ``t_y``
+    are the normalised image coordinates of the point.
     """
     in_x = by_u * f_x
     in_y = by_v * f_y
@@ -181,9 +181,9 @@ def add_image(
 ) -> float:  # fmt: skip
     """Add one image's contribution to the normal equations of a point (3,); return r' W r.
 
-    r is the measured ``pixel`` (2,) minus the predicted pixel, J the derivative of the latter by
-    the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I. J' W J is added to the
-    six entries ``normal`` (6,), and J' W r to ``right`` (3,).
+    r is the measured ``pixel`` (2,) minus the predicted pixel, J the derivative of the latter with
+    respect to the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I. J' W J is
+    added to the six entries ``normal`` (6,), and J' W r to ``right`` (3,).
     """
     x = move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3]
     y = move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3]
@@ -194,11 +194,11 @@ def add_image(
     xx = spread[0, 0] + line_variance
     xy = spread[0, 1]
     yy = spread[1, 1] + line_variance
-    share = 1.0 / (xx * yy - xy * xy)
+    inverse_determinant = 1.0 / (xx * yy - xy * xy)
     near = 1.0 / z
-    w_xx = share * yy
-    w_xy = -share * xy
-    w_yy = share * xx
+    w_xx = inverse_determinant * yy
+    w_xy = -inverse_determinant * xy
+    w_yy = inverse_determinant * xx
     f_x = near * camera[0]
     f_y = near * camera[1]
     t_x = near * x
@@ -263,12 +263,12 @@ def triangulate(
         point[2] += z
         if x * x + y * y + z * z < step_tolerance * step_tolerance:
             break
-    # The weights include errors of the rig, but the stated covariance is that of the noise alone.
+    # the weights include errors of the rig, but the stated covariance is that of the noise alone
     trace = spreads[0, 0, 0] + spreads[0, 1, 1] + spreads[1, 0, 0] + spreads[1, 1, 1]
-    share = 0.25 * trace / (0.25 * trace + line_variance)
+    noise_fraction = 0.25 * trace / (0.25 * trace + line_variance)
     for k in range(6):
-        normal[k] /= share
-        inverse[k] *= share
+        normal[k] /= noise_fraction
+        inverse[k] *= noise_fraction
     return gap
 
 

@@ -1,4 +1,4 @@
-"""The image of a disc: its ellipse, the centre of the ellipse, and its share of each pixel.
+"""The image of a disc: its ellipse, the ellipse's centre, and the light in each pixel.
 
 **Ellipse.** Through a perfect lens the image of a disc is exactly an ellipse. Let C be the centre,
 n the unit normal and R the radius of the disc, in camera axes. Then D = C C' - R² (I - n n') is the
@@ -11,8 +11,8 @@ perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's ce
 (X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to a curve, to which an ellipse is fitted.
 With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). Let t
 be the tangent of the unit circle, and J A a the shift of the centre of the fitted ellipse. A fit to
-grey values minimises the squared distance between curve and ellipse along the curve. This is the
-integral of (u'w - u'a)² / |J A t| over the angle of u, so
+grey values minimises the squared distance between curve and ellipse along the curve: the
+integral of (u'w - u'a)² / |J A t| over the angle of u, which gives
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
@@ -100,8 +100,8 @@ def sticker_outlines(
 def distort_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
     """Replace ellipses of a perfect lens by those in the camera's image.
 
-    They have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), px. The distortion is linearised within
-    each ellipse.
+    Ellipses have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), px. The distortion is linearised
+    within each ellipse.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import distort_ellipses
@@ -113,8 +113,9 @@ def distort_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> No
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
     """Return the eccentricities (n, 2) px of the images of n circles.
 
-    They are the centre of the ellipse fitted to the circle's image, minus the image of the circle's
-    centre. Circles have centres (n, 3) m and unit normals (n, 3) in camera axes, and a radius in m.
+    An eccentricity is the centre of the ellipse fitted to a circle's image, minus the image of the
+    circle's centre. Circles have centres (n, 3) m and unit normals (n, 3) in camera axes, and a
+    radius in m.
     """
     middles, shapes = project_discs(camera.ideal, centres, normals, np.full(len(centres), radius))
     projected = camera.project(centres)[0]
@@ -126,7 +127,7 @@ def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius:
 def curvature_shift(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
     """Return the shifts (n, 2) px of the centres of n ellipses due to the curvature of distortion.
 
-    They are the centre of the ellipse fitted to the distorted ellipse, minus the distorted centre
+    A shift is the centre of the ellipse fitted to a distorted ellipse, minus the distorted centre
     of the original ellipse. Ellipses have middles (n, 2) and shapes A (n, 2, 2) in ideal px.
     """
     angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
@@ -150,7 +151,8 @@ def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> t
     The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy, A_yy]. Centres (n,
     2) px are relative to the middle of the window's first pixel. Shapes (n, 2, 2) px are symmetric
     and positive definite. ``psf_px`` is the standard deviation of the point spread; 0 gives the
-    covered share. Raises CmmError for a point spread that is not 0 but narrower than NARROWEST_PX.
+    fraction that the ellipse covers. Raises CmmError for a point spread that is not 0 but narrower
+    than NARROWEST_PX.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import blur_windows

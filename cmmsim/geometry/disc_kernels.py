@@ -1,6 +1,6 @@
-"""Compiled kernels for the ellipses of discs in an image, and their blurred share of pixels.
+"""Compiled kernels for the image ellipses of discs, and for the share of light in each pixel.
 
-``disc_image`` states the formulas.
+``disc_image`` states the formulas. ``rim_kernels`` has the share without blur.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
     maps the unit disc onto the ellipse.
     """
     squared = radius * radius
-    # The dual conic D of ``disc_image``, divided by its last entry D33.
+    # the dual conic D of ``disc_image``, divided by its last entry D33
     depth = centre[2] * centre[2] - squared * (1.0 - normal[2] * normal[2])
     x = (centre[0] * centre[2] + squared * normal[0] * normal[2]) / depth
     y = (centre[1] * centre[2] + squared * normal[1] * normal[2]) / depth
@@ -41,7 +41,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
 def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
     """Return the entries xx, xy, yy of the square root of a positive definite matrix M.
 
-    It is (M + d I) / sqrt(trace M + 2 d) with d² = det M.
+    The square root is (M + d I) / sqrt(trace M + 2 d) with d² = det M.
     """
     d = math.sqrt(max(xx * yy - xy * xy, 0.0))
     scale = math.sqrt(xx + yy + 2.0 * d)
@@ -183,8 +183,8 @@ def fill_blur_weights(
 ) -> None:
     """Fill g and P of ``disc_image`` at the coordinate ``start`` for pixels ``first`` to ``last``.
 
-    ``across`` is g, the share of a point's light that reaches a pixel along one axis. ``passed`` is
-    P, the integral of g from -infinity to ``start``, px.
+    ``across`` is g, the fraction of a point's light that reaches a pixel along one axis. ``passed``
+    is P, the integral of g from -infinity to ``start``, px.
     """
     u = (first - 0.5 - start) / psf_px
     below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
@@ -220,8 +220,8 @@ def blur_window(
     passed_x = np.empty(width)
     across_y = np.empty(height)
     passed_y = np.empty(height)
-    # Contributions to all pixels left of a column.
-    whole = np.zeros((height, width + 1))
+    # contributions to all pixels left of a column
+    to_the_left = np.zeros((height, width + 1))
     m = inverse_shape(shape)
     count = rim_points(shape, psf_px)
     # On the rim, n ds = det(A) A^-T u dt.
@@ -243,8 +243,8 @@ def blur_window(
         fill_blur_weights(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
             through = across_y[row] * n_x
-            # For pixels farther left P is 1. The last loop adds these contributions from the right.
-            whole[row, min(left, width)] += through
+            # for pixels farther left, P is 1; the last loop adds these contributions
+            to_the_left[row, min(left, width)] += through
             for column in range(left, right + 1):
                 shares[row, column] += through * passed_x[column]
                 light = across_y[row] * across_x[column]
@@ -257,7 +257,7 @@ def blur_window(
     for row in range(height):
         through = 0.0
         for column in range(width - 1, -1, -1):
-            through += whole[row, column + 1]
+            through += to_the_left[row, column + 1]
             shares[row, column] += through
 
 

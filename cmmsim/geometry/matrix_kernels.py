@@ -19,7 +19,7 @@ def factor(matrix: Array) -> None:
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
-            # If rounding errors make the matrix indefinite, the pivot becomes a tiny number.
+            # if rounding errors make the matrix indefinite, the pivot becomes a tiny number
             matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
 
 
@@ -68,13 +68,13 @@ def inverse_entries(n: Array, into: Array) -> None:
     c_00 = n[3] * n[5] - n[4] * n[4]
     c_01 = n[2] * n[4] - n[1] * n[5]
     c_02 = n[1] * n[4] - n[2] * n[3]
-    share = 1.0 / (n[0] * c_00 + n[1] * c_01 + n[2] * c_02)
-    into[0] = share * c_00
-    into[1] = share * c_01
-    into[2] = share * c_02
-    into[3] = share * (n[0] * n[5] - n[2] * n[2])
-    into[4] = share * (n[1] * n[2] - n[0] * n[4])
-    into[5] = share * (n[0] * n[3] - n[1] * n[1])
+    inverse_determinant = 1.0 / (n[0] * c_00 + n[1] * c_01 + n[2] * c_02)
+    into[0] = inverse_determinant * c_00
+    into[1] = inverse_determinant * c_01
+    into[2] = inverse_determinant * c_02
+    into[3] = inverse_determinant * (n[0] * n[5] - n[2] * n[2])
+    into[4] = inverse_determinant * (n[1] * n[2] - n[0] * n[4])
+    into[5] = inverse_determinant * (n[0] * n[3] - n[1] * n[1])
 
 
 @compiled

@@ -1,8 +1,8 @@
-"""The frame that three planes define (paper section 4.2).
+"""The frame that three planes A, B and C define (paper section 4.2).
 
-Its origin is the intersection of the planes A, B and C. Its z axis is the normal of A, its x axis
-the intersection line of A and B, and y is the cross product of z and x. A plane is n . p = d with
-the unit normal n.
+The origin is the intersection of the planes. The z axis is the normal of A, the x axis is the
+intersection line of A and B, and y is the cross product of z and x. A plane is n . p = d with the
+unit normal n.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ def fit_plane(
     normal = normal * np.where(_dot(normal, rough_normals) > 0.0, 1.0, -1.0)[..., None]
     # Shift of the plane from the middle, along the normal.
     shift = np.zeros(normal.shape[:-1])
-    # The start is the unweighted plane, so two weighted steps converge to rounding errors.
+    # the start is the unweighted plane, so two weighted steps converge to rounding errors
     for _ in range(2):
         tangents = _tangents(normal)
         jacobian = np.concatenate([arms @ tangents, np.full((*arms.shape[:-1], 1), -1.0)], axis=-1)
@@ -73,7 +73,7 @@ def fit_plane(
         normal = normal + (tangents @ change[..., :2, None])[..., 0]
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     tangents = _tangents(normal)
-    # The fit has the parameters [tilts, shift]. The offset is shift + n . middle.
+    # the fit has the parameters [tilts, shift], and the offset is shift + n . middle
     to_offset = np.zeros((*shift.shape, 3, 3)) + np.eye(3)
     to_offset[..., 2, :2] = (middle[..., None, :] @ tangents)[..., 0, :]
     spread = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
@@ -119,10 +119,13 @@ def frames_of_points(
     """
     planes = []
     for k, name in enumerate(PLANE_NAMES):
-        own = plane_index == k
+        on_plane = plane_index == k
         planes.append(
             fit_plane(
-                points[..., own, :], covariances[..., own, :, :], rough_normals[..., k, :], name
+                points[..., on_plane, :],
+                covariances[..., on_plane, :, :],
+                rough_normals[..., k, :],
+                name,
             )
         )
     normals = np.stack([plane.normal for plane in planes], axis=-2)
@@ -142,13 +145,13 @@ def _tangents(normal: Array) -> Array:
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
-    """Return the derivative (6, 9) of a frame by two tilts and the offset of each plane.
+    """Return the derivatives (6, 9) of a frame with respect to two tilts and the offset per plane.
 
-    It is the derivative of the small change [t, phi] of ``frame_from_planes``. The planes have
-    normals (3, 3) and tangents (3, 3, 2).
+    The frame is that of ``frame_from_planes``, and its changes are small changes [dt, dphi]. The
+    planes have normals (3, 3) and tangents (3, 3, 2).
     """
     x, y, z, origin = frame[:3].T
-    # Derivatives of all normals and offsets by each of the nine parameters.
+    # derivatives of all normals and offsets with respect to each of the nine parameters
     turned = np.zeros((9, 3, 3))
     shifted = np.zeros((9, 3))
     for plane in range(3):

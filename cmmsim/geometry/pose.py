@@ -1,4 +1,4 @@
-"""Poses and transforms.
+"""Poses and transforms, and the covariance of a pose from that of a transform.
 
 A pose is ``[x y z alpha beta gamma]`` in m and rad with R = Rx(alpha) Ry(beta) Rz(gamma) (paper eq.
 1). A transform is a 4x4 matrix with a name of the form output_from_input, such as
@@ -18,7 +18,7 @@ from cmmsim.errors import ShapeError
 Array = NDArray[np.float64]
 
 # Largest accepted deviation of a transform from a rigid one. Single precision is sufficient.
-RIGID = 1e-6
+RIGID_TOLERANCE = 1e-6
 
 
 def frozen(values: ArrayLike) -> Array:
@@ -81,25 +81,25 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
     values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
     rotation = values[:3, :3]
     last = values[3]
-    if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > RIGID:
+    if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > RIGID_TOLERANCE:
         raise ShapeError(
             f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?"
         )
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > RIGID or np.linalg.det(rotation) < 0.0:
+    if error > RIGID_TOLERANCE or np.linalg.det(rotation) < 0.0:
         raise ShapeError(
             f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most "
-            f"{RIGID:g}) and determinant {np.linalg.det(rotation):.6g} (1)"
+            f"{RIGID_TOLERANCE:g}) and determinant {np.linalg.det(rotation):.6g} (1)"
         )
     return values
 
 
 def all_rigid(transforms: Array) -> bool:
-    """Tell whether ``checked_transform`` would accept all transforms (k, 4, 4)."""
+    """Return True if ``checked_transform`` would accept all transforms (k, 4, 4)."""
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import farthest_from_rigid
 
-    return bool(farthest_from_rigid(np.ascontiguousarray(transforms)) <= RIGID)
+    return bool(farthest_from_rigid(np.ascontiguousarray(transforms)) <= RIGID_TOLERANCE)
 
 
 def transform_to_pose(transform: ArrayLike) -> Array:
@@ -190,7 +190,7 @@ def rotation_exp(vector: Array) -> Array:
     angle = float(np.linalg.norm(vector))
     k = skew(vector)
     return (
-        # Written with sinc, Rodrigues' formula loses no digits at small angles.
+        # written with sinc, Rodrigues' formula loses no digits at small angles
         np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
     )
 
@@ -206,7 +206,7 @@ def rotation_log(rotation: Array) -> Array:
     )
     sine = float(np.linalg.norm(axis))
     cosine = 0.5 * (np.trace(rotation) - 1.0)
-    # For a tiny angle the rotation vector equals ``axis`` to first order.
+    # for a tiny angle, the rotation vector equals ``axis`` to first order
     return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)
 
 
@@ -230,9 +230,9 @@ def euler_rates_matrix(pose: Array) -> Array:
 
 
 def pose_jacobian(poses: Array) -> Array:
-    """Return the derivatives (..., 6, 6) of poses by the small errors of their transforms.
+    """Return the derivatives (..., 6, 6) of poses (..., 6) with respect to small errors [dt, dphi].
 
-    Poses are (..., 6), and small errors are [dt, dphi].
+    The small errors are those of the poses' transforms.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import all_angle_rates
@@ -249,7 +249,8 @@ def pose_jacobian(poses: Array) -> Array:
 def pose_covariance(transforms: Array, covariances: Array) -> Array:
     """Return the covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
 
-    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi].
+    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi], which come
+    from ``rigid_kernels`` for a pose that is fitted to points.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_covariances

@@ -18,8 +18,7 @@ class Registration:
     """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
     ``misfit`` (n,) is the squared residual of each point in units of its noise. The expected value
-    is 3 minus the number of the fit's six degrees of freedom that this point determines, which can
-    be a fraction.
+    is 3 minus the point's part of the fit's six degrees of freedom.
     """
 
     transform: Array
@@ -33,16 +32,16 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     The method is a singular value decomposition. The source is (n, 3), or (c, n, 3) with one source
     per target. Weights are (c, n).
     """
-    shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
-    source_means = (shares * source).sum(axis=1)
-    target_means = (shares * targets).sum(axis=1)
+    fractions = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    source_means = (fractions * source).sum(axis=1)
+    target_means = (fractions * targets).sum(axis=1)
     products = (weights[..., None] * (targets - target_means[:, None])).swapaxes(1, 2) @ (
         source - source_means[:, None]
     )
     u, _, vt = np.linalg.svd(products)
     turns = np.ones((len(targets), 3))
-    # The nearest orthogonal matrix can be a reflection. In this case the direction of the smallest
-    # singular value is reversed.
+    # if the nearest orthogonal matrix is a reflection, the direction of the smallest singular value
+    # is reversed
     turns[:, 2] = np.sign(np.linalg.det(u @ vt))
     transforms = np.tile(np.eye(4), (len(targets), 1, 1))
     transforms[:, :3, :3] = (u * turns[:, None]) @ vt

@@ -3,7 +3,8 @@
 A point is known in the axes of a body, and measured with a covariance. ``arm`` is the known point
 rotated by the transform. ``gap`` is the measured point minus the transformed known point. The
 residual of a fitted point has the covariance S - J C J'. S is the covariance of the point's noise,
-C the covariance of the pose, and J the derivative of the point by the pose.
+C the covariance of the small error [dt, dphi] of the transform, which ``solve_step`` computes, and
+J the derivative of the point with respect to this error.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
         push = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
         squared += gap[i] * push
         change[i] += push
-        # Row i of W J. The derivative J of the point by the pose is [I, -skew(arm)].
+        # row i of W J, where J = [I, -skew(arm)]
         by_x = info[i, 2] * y - info[i, 1] * z
         by_y = info[i, 0] * z - info[i, 2] * x
         by_z = info[i, 1] * x - info[i, 0] * y
@@ -46,7 +47,7 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
         normal[5, i] += by_z
         for j in range(i + 1):
             normal[i, j] += info[i, j]
-        # Column i of J' multiplied by that row.
+        # column i of J' multiplied by that row
         if i == 0:
             normal[4, 3] += z * by_x
             normal[5, 3] -= y * by_x
@@ -82,10 +83,10 @@ def solve_step(normal: Array, change: Array, covariance: Array) -> float:
     factor(normal)
     invert_factored(normal, covariance)
     solve_factored(normal, change)
-    less = 0.0
+    decrease = 0.0
     for a in range(6):
-        less += before[a] * change[a]
-    return less
+        decrease += before[a] * change[a]
+    return decrease
 
 
 @compiled
@@ -161,8 +162,8 @@ def residual_misfit(
     """Return the squared residual ``gap`` (3,) in units of its own covariance.
 
     ``residual_entries`` (6,) has the entries of that covariance, see ``residual_covariance``. A
-    direction does not count if the variance of the residual is below the share ``smallest`` of the
-    variance of the point's ``noise`` (3, 3). In such a direction the point alone determines the
+    direction does not count if the variance of the residual is below ``smallest`` times the
+    variance of the point's ``noise`` (3, 3). In such a direction, the point alone determines the
     pose. ``inverse`` (6,) is overwritten.
     """
     xx = residual_entries[0] - smallest * noise[0, 0]
@@ -172,8 +173,8 @@ def residual_misfit(
     yz = residual_entries[4] - smallest * noise[1, 2]
     zz = residual_entries[5] - smallest * noise[2, 2]
     minor = xx * yy - xy * xy
-    whole = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
-    if xx > 0.0 and minor > 0.0 and whole > 0.0:
+    determinant = zz * minor - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
+    if xx > 0.0 and minor > 0.0 and determinant > 0.0:
         inverse_entries(residual_entries, inverse)
         return square_by(inverse, gap[0], gap[1], gap[2])
     return checkable_misfit(gap, noise, residual_entries, smallest)
@@ -193,12 +194,12 @@ def checkable_misfit(gap: Array, noise: Array, residual_entries: Array, smallest
             root[i, k] = rest / lower[i, i]
     matrix = np.empty((3, 3))
     from_entries(residual_entries, matrix)
-    shares, axes = np.linalg.eigh(root @ matrix @ root.T)
+    ratios, axes = np.linalg.eigh(root @ matrix @ root.T)
     whitened = axes.T @ (root @ gap)
     total = 0.0
     for i in range(3):
-        if shares[i] > smallest:
-            total += whitened[i] ** 2 / shares[i]
+        if ratios[i] > smallest:
+            total += whitened[i] ** 2 / ratios[i]
     return total
 
 

@@ -25,8 +25,8 @@ class Cover(NamedTuple):
     past         (h, w + 1), total rise dy of the arcs in a pixel, which contributes to all pixels
                  to the left
     touched      (h, w), True for pixels with arcs
-    derivatives  (h, w, 5), of the shares by [c_x, c_y, A_xx, A_xy, A_yy]; not computed if the shape
-                 is (0, 0, 5)
+    derivatives  (h, w, 5), of the shares with respect to [c_x, c_y, A_xx, A_xy, A_yy]; not computed
+                 if the shape is (0, 0, 5)
     """
 
     shares: Array
@@ -105,9 +105,9 @@ def crossings(centre: float, reach: float, crossed: Array) -> None:
     The first column is the distance of a line from the centre, in units of the half extent
     ``reach`` of the ellipse. The second is half the length of the chord inside the unit circle.
     """
-    share = 1.0 / reach
+    per_reach = 1.0 / reach
     for k in range(len(crossed)):
-        t = (k - 0.5 - centre) * share
+        t = (k - 0.5 - centre) * per_reach
         crossed[k, 0] = t
         crossed[k, 1] = math.sqrt(max(1.0 - t * t, 0.0))
 
@@ -153,8 +153,8 @@ def follow_quarter(
     down_v = 0.0
     down_x = 0.0
     new_row = True
-    left = True
-    while left and not (row == (height if way_y > 0 else -1) or (column < 0 and way_x < 0)):
+    going = True
+    while going and not (row == (height if way_y > 0 else -1) or (column < 0 and way_x < 0)):
         above = row < 0 or row == height
         line_x = column + 0.5 * way_x
         crosses_x = (
@@ -188,7 +188,7 @@ def follow_quarter(
             if above or column == width:
                 to_column = within(down_x, width)
         else:
-            left = False
+            going = False
         # Arcs left of the window cover none of its pixels.
         if not above and column >= 0:
             arcs.rows[count] = row
@@ -261,16 +261,16 @@ def cover_window(
     first = max(within(centre_y - reach, height), 0)
     last = min(within(centre_y + reach, height), height - 1)
     for row in range(first, last + 1):
-        # Add the rise of all arcs farther right. For pixels without arcs the sum is 0 or 1.
+        # add the rise of all arcs farther right; for pixels without arcs, the sum is 0 or 1
         risen = cover.past[row, width]
-        whole = np.rint(risen)
+        filled = np.rint(risen)
         for column in range(width - 1, -1, -1):
             if cover.touched[row, column]:
                 shares[row, column] += risen
                 risen += cover.past[row, column]
-                whole = np.rint(risen)
+                filled = np.rint(risen)
             else:
-                shares[row, column] = whole
+                shares[row, column] = filled
 
 
 @compiled

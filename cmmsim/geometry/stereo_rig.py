@@ -1,7 +1,7 @@
 """Two cameras on one rigid bar, and points triangulated from their images.
 
 The camera frame C of the sensor is the frame of the left camera. Triangulation consists of OpenCV's
-linear method and weighted Gauss-Newton steps.
+linear method and weighted Gauss-Newton steps, which are in ``camera_kernels``.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class StereoRig:
         """
         rotation = self.right_from_left[:3, :3]
         shift = self.right_from_left[:3, 3]
-        # The essential matrix is [t]x R.
+        # the essential matrix is [t]x R
         essential = np.cross(np.eye(3), shift) @ rotation
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
 
@@ -128,19 +128,24 @@ class StereoRig:
     def derivatives(self, points: Array) -> tuple[Array, Array]:
         """Return the derivatives of the pixels of points (n, 3) in both images.
 
-        They are with respect to the points (2, n, 2, 3), and to the rig's parameters (2, n, 2, 24)
-        in the order of PARAMETER_NAMES. The points are in the camera frame C.
+        The derivatives are with respect to the points (2, n, 2, 3), and to the rig's parameters (2,
+        n, 2, 24) in the order of PARAMETER_NAMES. The points are in the camera frame C.
         """
         by_points = np.empty((2, len(points), 2, 3))
         by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
         for side, (camera, move) in enumerate(zip(self.cameras, self.from_camera, strict=True)):
-            known = rotation_log(move[:3, :3]), move[:3, 3], camera.matrix, camera.intrinsics[4:]
-            found = cv2.projectPoints(np.ascontiguousarray(points), *known)[1].reshape(
+            arguments = (
+                rotation_log(move[:3, :3]),
+                move[:3, 3],
+                camera.matrix,
+                camera.intrinsics[4:],
+            )
+            jacobian = cv2.projectPoints(np.ascontiguousarray(points), *arguments)[1].reshape(
                 len(points), 2, -1
             )
-            by_turn = found[..., :3]
-            by_shift = found[..., 3:6]
-            intrinsics = found[..., 6:]
+            by_turn = jacobian[..., :3]
+            by_shift = jacobian[..., 3:6]
+            intrinsics = jacobian[..., 6:]
             by_points[side] = by_shift @ move[:3, :3]
             by_rig[side, ..., 9 * side : 9 * side + 9] = intrinsics
             if side == 1:
@@ -195,7 +200,7 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)
-    # The sum of both optical axes, in the axes of the left camera, is the viewing direction.
+    # the sum of both optical axes, in the axes of the left camera, is the viewing direction
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
     return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(

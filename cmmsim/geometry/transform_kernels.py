@@ -108,8 +108,8 @@ def move_by(transform: Array, change: Array) -> None:
 def make_rigid(transform: Array) -> None:
     """Replace the rotation of a transform (4,4) by the nearest orthogonal matrix.
 
-    Newton's steps R (3 I - R'R) / 2 converge quadratically. The replacement is needed if each
-    transform is a product of the one before, because rounding errors double with each product.
+    Newton's steps R (3 I - R'R) / 2 converge quadratically. The replacement is needed in a chain of
+    transforms, each a product with the one before, because rounding errors double each time.
     """
     square = np.empty((3, 3))
     row = np.empty(3)
@@ -140,12 +140,12 @@ def farthest_from_rigid(transforms: Array) -> float:
         t = transforms[k]
         for i in range(4):
             for j in range(i + 1):
-                wanted = 1.0 if i == j else 0.0
+                expected = 1.0 if i == j else 0.0
                 product = t[0, i] * t[0, j] + t[1, i] * t[1, j] + t[2, i] * t[2, j]
-                off = abs(t[3, j] - wanted) if i == 3 else abs(product - wanted)
-                if not (off < np.inf and abs(t[j, 3]) < np.inf):
+                deviation = abs(t[3, j] - expected) if i == 3 else abs(product - expected)
+                if not (deviation < np.inf and abs(t[j, 3]) < np.inf):
                     return np.inf
-                farthest = max(farthest, off)
+                farthest = max(farthest, deviation)
         determinant = (
             t[0, 0] * (t[1, 1] * t[2, 2] - t[1, 2] * t[2, 1])
             + t[0, 1] * (t[1, 2] * t[2, 0] - t[1, 0] * t[2, 2])
@@ -158,13 +158,13 @@ def farthest_from_rigid(transforms: Array) -> float:
 
 @compiled
 def angle_rates(pose: Array, rates: Array) -> None:
-    """Fill the derivatives (3, 3) of a pose's angles by a small rotation vector in output axes."""
+    """Fill the derivatives (3, 3) of a pose's angles for a small rotation vector in output axes."""
     ca = math.cos(pose[3])
     sa = math.sin(pose[3])
     cb = math.cos(pose[4])
     sb = math.sin(pose[4])
     rates[0, 0] = 1.0
-    # The inverse of the matrix of eq. 2, which is singular at beta = pi/2 and -pi/2.
+    # the inverse of the matrix of eq. 2, which is singular at beta = pi/2 and -pi/2
     rates[0, 1] = sa * sb / cb
     rates[0, 2] = -ca * sb / cb
     rates[1, 0] = 0.0
@@ -190,7 +190,7 @@ def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) 
     ``turn`` (3, 3) rotates these axes to those of the pose.
     """
     rates = np.empty((3, 3))
-    slopes = np.empty((6, 3))  # derivatives of the place by dt, then of the angles by dphi
+    slopes = np.empty((6, 3))  # derivatives d(place)/d(dt), then d(angles)/d(dphi)
     half = np.empty((6, 6))
     angle_rates(pose, rates)
     for i in range(3):

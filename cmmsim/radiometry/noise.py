@@ -30,8 +30,8 @@ GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDArray[T]:
     """Return windows (k, size, size) of an image (height, width).
 
-    Their first pixels ``corners`` (k, 2) are (x, y). Outside of the image, windows repeat the
-    pixels at its edge.
+    ``corners`` (k, 2) are the first pixels (x, y) of the windows. Outside of the image, windows
+    repeat the pixels at its edge.
     """
     ticks = np.arange(size)
     rows = np.clip(corners[:, 1, None] + ticks, 0, image.shape[0] - 1)
@@ -43,9 +43,8 @@ def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDAr
 class FixedPattern:
     """Fixed pattern of one camera: differences between pixels that are the same in every image.
 
-    In EMVA 1288, they are called PRNU and DSNU. ``sensitivity`` is the sensitivity of each pixel
-    relative to the mean. ``offset`` is the deviation of its dark signal, e-. Both arrays have the
-    same shape.
+    ``sensitivity`` is the sensitivity of each pixel relative to the mean (PRNU in EMVA 1288).
+    ``offset`` is the deviation of each pixel's dark signal, e- (DSNU). Both have the same shape.
     """
 
     sensitivity: NDArray[np.float32]
@@ -130,7 +129,7 @@ class CameraNoise:
     def variance(self, mean_grey: Array) -> Array:
         """Return the variance of a grey value with a given mean.
 
-        It is the sum of shot noise, dark noise, fixed pattern and rounding.
+        Shot noise, dark noise, fixed pattern and rounding contribute to it.
         """
         if self.inverted:
             mean_grey = self.white_level - mean_grey
@@ -147,28 +146,28 @@ class CameraNoise:
 
         The ratio is 1 if the noise is at least one grey value, and up to 3 with less noise. With
         little noise, the variance of rounded values depends on the mean. It is largest half-way
-        between two whole numbers, because the noise then decides between rounding up and down.
+        between two integers, because the noise then decides between rounding up and down.
 
         At such a mean, the Fourier series of the rounding error gives the variance of a rounded
         normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). The
         average variance over all means is s² + 1/12. The pixels of a uniform ground all have the
         same mean, so their variance can differ from this average.
         """
-        usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
-        if np.all(usual > NO_SWING):
-            return np.ones(usual.shape)
-        spread = usual[..., None] - 1.0 / 12.0
+        average = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
+        if np.all(average > NO_SWING):
+            return np.ones(average.shape)
+        spread = average[..., None] - 1.0 / 12.0
         k = np.arange(1, ROUNDING_TERMS + 1)
         swing = np.exp(-2.0 * np.pi**2 * k**2 * spread) * (4.0 * spread + 1.0 / (np.pi * k) ** 2)
-        return np.asarray(1.0 + swing.sum(axis=-1) / usual)
+        return np.asarray(1.0 + swing.sum(axis=-1) / average)
 
     @property
     def variance_coefficients(self) -> tuple[float, float, float]:
         """Coefficients of a grey value's variance as a polynomial in its electrons.
 
-        They are the constant, the linear and the quadratic coefficient.
+        The order is constant, linear, quadratic.
         """
-        # Averaging over exposures reduces the temporal noise, but not the fixed pattern.
+        # averaging over exposures reduces the temporal noise, but not the fixed pattern
         temporal = self.gain**2 / self.frames
         pattern = self.gain**2
         return (
@@ -208,10 +207,9 @@ class CameraNoise:
 
         The mean is not rounded, even if the noise is turned off: noise dithers the rounding, so the
         mean of many noisy exposures approaches the unrounded mean. The mean of 30 or more exposures
-        is drawn directly, as one normal number per pixel. This number has the mean and the variance
-        of the mean of rounded and clipped grey values. Its distribution is only approximately
-        right: clipped grey values are skewed, and the mean has steps of 1/frames. Neither matters
-        for sums over the pixels of a sticker.
+        is drawn directly, as one normal number per pixel with the correct mean and variance. Its
+        distribution is only approximately right: clipped grey values are skewed, and the mean has
+        steps of 1/frames. Neither matters for sums over the pixels of a sticker.
         """
         if not self.enabled:
             return np.clip(
@@ -233,9 +231,9 @@ class CameraNoise:
         The random numbers are standard normal, one per pixel.
         """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
-        none = np.empty(0, dtype=np.float32)
+        empty = np.empty(0, dtype=np.float32)
         differing = (
-            (none, none)
+            (empty, empty)
             if pattern is None
             else (pattern.sensitivity.ravel(), pattern.offset.ravel())
         )

@@ -12,7 +12,7 @@ from cmmsim.compilation import Array, compiled
 REACH = 6.0
 # Grey values: from this standard deviation on, rounding adds 1/12 to the variance, and at most 1e-9
 # to the mean.
-SMOOTH = 1.0
+SMOOTH_DEVIATION = 1.0
 SQRT_HALF = math.sqrt(0.5)
 
 
@@ -35,7 +35,7 @@ def expose_pixels(
     dark, black, gain, white = parameters[2:]
     for k in range(len(radiance)):
         electrons = electrons_in(k, radiance, parameters, sensitivity)
-        # The variance of shot noise equals the mean number of electrons (Poisson distribution).
+        # the variance of shot noise equals the mean number of electrons (Poisson distribution)
         noise = normal[k] * np.sqrt(electrons + dark)
         if len(offset):
             noise += offset[k]
@@ -80,12 +80,12 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
     """Return mean and variance of a normal variable after rounding and clipping to 0..white."""
     if deviation == 0.0 or mean - REACH * deviation > white or mean + REACH * deviation < 0.0:
         return min(max(np.rint(mean), 0.0), white), 0.0
-    if deviation < SMOOTH:
-        # With little noise, the steps of rounding matter, so their contributions are summed.
+    if deviation < SMOOTH_DEVIATION:
+        # with little noise, the steps of rounding matter, so their contributions are summed
         low = max(math.floor(mean - REACH * deviation), 0.0)
         above, square = moments_above(low - mean, deviation, white - low)
         return low + above, max(square - above**2, 0.0)
-    # With more noise, only clipping matters: the parts above white and below 0 are subtracted.
+    # with more noise, only clipping matters: the parts above white and below 0 are subtracted
     over, over_square = moments_above(white - mean, deviation, np.inf)
     under, under_square = moments_above(mean, deviation, np.inf)
     lost = over_square + 2.0 * (white - mean) * over + under_square + 2.0 * mean * under
@@ -94,17 +94,15 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
 
 @compiled
 def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
-    """Return the mean and the mean square of the excess of a rounded normal variable over a whole
-    number.
+    """Return mean and mean square of the excess of a rounded normal variable over an integer.
 
-    The whole number lies ``height`` above the mean of the normal variable. The excess is 0 below
-    the whole number, and it is limited to ``most``. The excess is a sum over the steps from one
-    whole number to the next. Each step counts with the probability that the normal variable lies
-    beyond the middle of the step.
+    The integer lies ``height`` above the mean of the normal variable. The excess is 0 below the
+    integer, and it is limited to ``most``. Its mean is a sum over the steps from one integer to the
+    next. Each step counts with the probability that the normal variable lies beyond its middle.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):
-        taken = 0.5 * math.erfc((height + step + 0.5) / deviation * SQRT_HALF)
-        steps += taken
-        squares += (2.0 * step + 1.0) * taken
+        probability = 0.5 * math.erfc((height + step + 0.5) / deviation * SQRT_HALF)
+        steps += probability
+        squares += (2.0 * step + 1.0) * probability
     return steps, squares

@@ -1,4 +1,4 @@
-"""Images for the estimator: whole stereo frames, and windows that are read from them."""
+"""Images for the estimator: stereo frames, and windows that are read from them."""
 
 from __future__ import annotations
 
@@ -101,14 +101,14 @@ class StereoFrame:
 
         highest = max(self.left.max(), self.right.max(), 255)
         both = np.hstack([self.left, self.right]) * (255.0 / highest)
-        share = min(1.0, SHOWN_WIDTH_PX / both.shape[1])
-        size = round(share * both.shape[1]), round(share * both.shape[0])
+        scale = min(1.0, SHOWN_WIDTH_PX / both.shape[1])
+        size = round(scale * both.shape[1]), round(scale * both.shape[0])
         smaller = cv2.resize(both, size, interpolation=cv2.INTER_AREA)
         return cv2.imencode(".png", np.rint(smaller).astype(np.uint8))[1].tobytes()
 
 
 def _in_notebook() -> bool:
-    """Tell whether the code runs in a notebook."""
+    """Return True if the code runs in a notebook."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return shell is not None and hasattr(shell, "kernel")
@@ -116,7 +116,7 @@ def _in_notebook() -> bool:
 
 @runtime_checkable
 class StereoImages(Protocol):
-    """One exposure of two cameras that can be read whole or in parts."""
+    """One exposure of two cameras, of which images or windows can be read."""
 
     def full(self) -> StereoFrame:
         """Return both whole images."""

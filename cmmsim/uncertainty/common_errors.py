@@ -1,4 +1,4 @@
-"""Errors that all poses of a run have in common, from cameras, taught frames and exposure.
+"""Errors that all poses of a run have in common, due to cameras, taught frames and exposure.
 
 The noise of a measured pose is new in every frame. Other errors are constant during a run, because
 they come from parameters that the estimator assumes to be exact: the rig (24 numbers), the taught
@@ -7,7 +7,7 @@ frames of base and platform (12), and the time at which the right camera exposes
 To first order, these errors d change a measured pose by J(pose) d. J is computed without images:
 sticker centres are projected through a rig with errors and triangulated with the known rig.
 Teaching used the same known rig, so the taught frames and sticker places have errors as well. The
-errors at teaching and at a measured pose mostly cancel. Only their difference remains.
+errors at teaching and at a measured pose mostly cancel, and only their difference remains.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ the true to the taught frame, in the axes of base and platform."""
 # Number of poses on the teaching path. The path is smooth, so few poses suffice without noise.
 TEACHING_POSES = 8
 
-# Steps of the rig's parameters for central differences, ten times the errors of a calibration.
+# Steps (24, 24) of the rig's parameters for central differences, one parameter each. They are ten
+# times as large as the errors of a calibration.
 STEPS = np.diag(
     [*2 * (0.1, 0.1, 0.1, 0.1, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *3 * (1e-5,), *3 * (1e-5,)]
 )
@@ -80,11 +81,7 @@ class CommonErrors:
 
 @dataclass(frozen=True)
 class MeasuringGeometry:
-    """Geometry as an estimator knows it.
-
-    It consists of the rig, both bodies, the result of teaching, and the pose ``home`` (6,) at
-    teaching.
-    """
+    """Geometry as an estimator knows it. ``home`` (6,) is the pose of the platform at teaching."""
 
     rig: StereoRig
     platform: MarkedBody
@@ -138,7 +135,7 @@ class MeasuringGeometry:
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
 
     def _by_rig(self, view: _View) -> Array:
-        """Return derivatives (N, 6, 24) of small errors of base_from_platform by the rig.
+        """Return the small errors (N, 6, 24) of base_from_platform per unit of the rig's errors.
 
         The effect of the rig on teaching is included.
         """
@@ -150,10 +147,10 @@ class MeasuringGeometry:
 
     @cached_property
     def taught_by_rig(self) -> tuple[Array, Array]:
-        """Derivatives of errors of teaching by the rig's parameters.
+        """Errors of teaching per unit of the errors of the rig's parameters.
 
-        The first result (6, 24) belongs to small errors of the taught base_from_camera. The second
-        result (24, n, 3) belongs to the taught places of the platform's stickers.
+        The first result (6, 24) are small errors of the taught base_from_camera. The second result
+        (24, n, 3) are errors of the taught places of the platform's stickers.
         """
         if self.taught.by_rig is not None:
             frames = self.taught.by_rig[:6]
@@ -201,9 +198,9 @@ class MeasuringGeometry:
         pixels = np.stack([rig.project(points)[0] for rig in true], axis=1).reshape(2, -1, 2)
         spread = np.broadcast_to(np.eye(2), (*pixels.shape[:2], 2, 2))
         near = np.tile(points, (len(true), 1))
-        found = triangulate(self.rig, pixels[0], pixels[1], spread[0], spread[1], near)
+        triangulated = triangulate(self.rig, pixels[0], pixels[1], spread[0], spread[1], near)
         shape = (len(true), *points.shape)
-        return found.points.reshape(shape), found.covariances.reshape(*shape, 3)
+        return triangulated.points.reshape(shape), triangulated.covariances.reshape(*shape, 3)
 
 
 @dataclass(frozen=True)
@@ -213,8 +210,8 @@ class _View:
     frames  (N, 4, 4), base_from_platform
     seen    (n,), indices of the stickers
     arms    (N, n, 3), from the platform's origin to the stickers, in camera axes
-    slopes  (2, N, n, 2, 3), derivatives of the stickers' pixels by the stickers' points
-    by_rig  (2, N, n, 2, 24), derivatives of the stickers' pixels by the rig's parameters
+    slopes  (2, N, n, 2, 3), derivatives d(pixels)/d(points) of the stickers
+    by_rig  (2, N, n, 2, 24), derivatives d(pixels)/d(rig's parameters) of the stickers
     """
 
     camera_from_base: Array
@@ -226,7 +223,7 @@ class _View:
 
     @property
     def levers(self) -> Array:
-        """Derivatives (N, 6, 6) of small errors of base_from_platform by those of base_from_camera.
+        """Matrices (N, 6, 6) from small errors of base_from_camera to those of base_from_platform.
 
         Both errors are in base axes.
         """
@@ -235,7 +232,7 @@ class _View:
         return levers
 
     def by_taught_frames(self) -> Array:
-        """Return derivatives (N, 6, 12) of small errors of base_from_platform by taught frames."""
+        """Return the small errors (N, 6, 12) of base_from_platform per error of taught frames."""
         turns = np.zeros((len(self.frames), 6, 6))
         turns[:, :3, :3] = turns[:, 3:, 3:] = self.frames[:, :3, :3]
         return np.concatenate([self.levers, turns], axis=2)
@@ -254,13 +251,13 @@ class _View:
         return self.registered(self._points(pixels))
 
     def points_by_rig(self) -> Array:
-        """Return derivatives (N, n, 3, 24) of the triangulated points by the true rig."""
+        """Return the changes (N, n, 3, 24) of triangulated points per unit of the rig's errors."""
         return self._points(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
-        """Return derivatives (N, n, 3, 24) of the expected points by the rig.
+        """Return the changes (N, n, 3, 24) of expected points per unit of the rig's errors.
 
-        ``places`` (24, n, 3) are the derivatives of the taught places.
+        ``places`` (24, n, 3) are the changes of the taught places.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
         return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])
@@ -276,9 +273,9 @@ class _View:
         )
         weighted = np.einsum("nmij,nmik->nmjk", rows, self._information)
         normal = np.einsum("nmij,nmjk->nik", weighted, rows)
-        found = np.linalg.solve(normal, np.einsum("nmij,nmjp->nip", weighted, changes))
+        movement = np.linalg.solve(normal, np.einsum("nmij,nmjp->nip", weighted, changes))
         turn = self.camera_from_base[:3, :3].T
-        return np.concatenate([turn @ found[:, :3], turn @ found[:, 3:]], axis=1)
+        return np.concatenate([turn @ movement[:, :3], turn @ movement[:, 3:]], axis=1)
 
     @property
     def _information(self) -> Array:
@@ -296,6 +293,7 @@ class _View:
 
 
 def _view(geometry: MeasuringGeometry, frames: Array) -> _View:
+    """Return the view of the stickers at poses base_from_platform (N, 4, 4)."""
     camera_from_base = geometry.camera_from_base
     seen = _seen_at_home(geometry)
     arms = np.einsum("nij,mj->nmi", frames[:, :3, :3], geometry.taught.platform_places[seen])

@@ -1,4 +1,4 @@
-"""Residuals of the stickers' pixels in blocks of frames, with derivatives by errors of the rig.
+"""Residuals of the stickers' pixels in blocks of frames, and the effects of errors of the rig.
 
 The residuals of a body are differences between observed and expected pixels. Expected pixels follow
 from taught places and the measured pose. The pose of the platform is estimated from the same
@@ -24,7 +24,7 @@ from cmmsim.uncertainty.common_errors import MeasuringGeometry
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
 """Names of the parameters of a common movement of both cameras.
 
-They describe the movement of the base in camera axes, with rotations about the base's origin.
+The parameters are those of the base's movement in camera axes, with rotations about its origin.
 """
 
 # px: its square is added to the stated variance of a centre, which can be too small.
@@ -37,10 +37,10 @@ class Rows:
     """Residuals of b blocks of frames, with their derivatives.
 
     residuals   (b, m), with variance one or zero in each direction
-    by_drift    (b, m, 30), by changes of the rig's parameters and place since teaching
-    by_start    (b, m, 24), by errors of the rig's parameters that existed at teaching already
-    by_delay    (b, m, 1), by the delay of the right camera's exposure, s
-    by_offsets  (b, m, o), by constant errors of single centres, px
+    by_drift    (b, m, 30), for changes of the rig's parameters and place since teaching
+    by_start    (b, m, 24), for errors of the rig's parameters that existed at teaching already
+    by_delay    (b, m, 1), for the delay of the right camera's exposure, s
+    by_offsets  (b, m, o), for constant errors of single centres, px
     """
 
     residuals: Array
@@ -110,7 +110,7 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> 
         "bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks])
     )
     residuals, roots = _whitened(geometry.rig, blocks)
-    # Orthonormal columns that span the residuals which a change of the pose explains.
+    # orthonormal columns that span the residuals which a change of the pose explains
     by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
 
     def without_pose(values: Array) -> Array:
@@ -135,7 +135,7 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows
     slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
     across = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
     rig_first = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
-    # Derivatives of the taught places by the rig.
+    # derivatives of the taught places with respect to the rig
     taught = np.linalg.solve(across.swapaxes(1, 2) @ across, across.swapaxes(1, 2) @ rig_first)
     by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
     residuals, roots = _whitened(geometry.rig, blocks)
@@ -156,24 +156,25 @@ def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
     sizes = [one.residuals.shape for one in rows]
     first = 0
     before = 0
-    every = np.zeros((sizes[0][0], sum(size for _, size in sizes), 4 * sum(centres)))
+    offsets = np.zeros((sizes[0][0], sum(size for _, size in sizes), 4 * sum(centres)))
     for one, (_, size), count in zip(rows, sizes, centres, strict=False):
-        every[:, first : first + size, 4 * before : 4 * (before + count)] = one.by_offsets
+        offsets[:, first : first + size, 4 * before : 4 * (before + count)] = one.by_offsets
         first = first + size
         before = before + count
     parts = {
         name: np.concatenate([getattr(one, name) for one in rows], axis=1) for name in NOT_OFFSETS
     }
-    return Rows(**parts, by_offsets=every)
+    return Rows(**parts, by_offsets=offsets)
 
 
 NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
 
 
 def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
-    """Return derivatives of the pixels of points (b, k, 3).
+    """Return the derivatives of the pixels of points (b, k, 3).
 
-    They are (2, b, k, 2, 3) by the points, and (2, b, k, 2, 24) by the rig's parameters.
+    The first (2, b, k, 2, 3) are with respect to the points, and the second (2, b, k, 2, 24) to the
+    rig's parameters.
     """
     slopes, by_rig = rig.derivatives(points.reshape(-1, 3))
     return slopes.reshape(2, *points.shape[:2], 2, 3), by_rig.reshape(2, *points.shape[:2], 2, RIG)
@@ -182,8 +183,8 @@ def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
 def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Array]:
     """Return mean differences (b, 4k) between observed and expected pixels of each block.
 
-    They are in units of their standard deviations. The second result contains the square roots (b,
-    k) of their weights.
+    The differences are in units of their standard deviations. The second result contains the square
+    roots (b, k) of their weights.
     """
     weights = 1.0 / (
         np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2
@@ -207,7 +208,7 @@ def _whiten(roots: Array, slopes: Array) -> Array:
 
 
 def _small_movement(arms: Array) -> Array:
-    """Return derivatives (..., 3, 6) of points by a small movement [dt, dphi] of their body.
+    """Return derivatives (..., 3, 6) of points for a small movement [dt, dphi] of their body.
 
     ``arms`` (..., 3) lead from the body's origin to the points.
     """
@@ -217,13 +218,13 @@ def _small_movement(arms: Array) -> Array:
 def _offsets(
     without_pose: Callable[[Array], Array], roots: Array, index: NDArray[np.int_], count: int
 ) -> Array:
-    """Return derivatives (b, 4k, 4 count) of whitened residuals by the offsets of all centres.
+    """Return derivatives (b, 4k, 4 count) of whitened residuals for the offsets of all centres.
 
     The body has ``count`` stickers, of which those with ``index`` (k,) are seen. ``without_pose``
     removes the part that a pose explains.
     """
     blocks, k = roots.shape
-    every = np.zeros((blocks, 4 * k, 2, count, 2))
+    offsets = np.zeros((blocks, 4 * k, 2, count, 2))
     seen = without_pose(np.repeat(np.tile(roots, 2), 2, axis=1)[..., None] * np.eye(4 * k))
-    every[:, :, :, index] = seen.reshape(blocks, 4 * k, 2, k, 2)
-    return every.reshape(blocks, 4 * k, -1)
+    offsets[:, :, :, index] = seen.reshape(blocks, 4 * k, 2, k, 2)
+    return offsets.reshape(blocks, 4 * k, -1)

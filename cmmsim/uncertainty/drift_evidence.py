@@ -1,4 +1,4 @@
-"""Sequential likelihood ratio test for a rig that moves, from residuals, and its findings.
+"""Sequential likelihood ratio test of residuals for a rig that moves, and the finding.
 
 All models of the residuals are Gaussian. In the first model, the rig has not changed since
 calibration and teaching: its errors have the calibration's covariance and are the same in every
@@ -39,14 +39,14 @@ The rates stand for drifts within hours, minutes and seconds.
 """
 
 WALK_FRAMES = 1000
-NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
-# If the named parameters explain this share of the evidence for a drift, no further one is named.
-EXPLAINED = 0.97
+DRIFT_NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
+# If the named parameters explain this fraction of the evidence for a drift, no more are named.
+ENOUGH_EXPLAINED = 0.97
 # Largest number of parameters that a finding names.
 MOST_NAMED = 3
 # A direction is named by the parameters whose components, in units of SIZES, are at least this
 # large.
-LARGE_PART = 0.3
+LEAST_COMPONENT = 0.3
 ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
 
@@ -77,14 +77,14 @@ class Filter:
         self._constant -= 0.5 * squared
 
     def _predict(self, frames: int) -> None:
+        """Let the first unknowns walk for a number of frames."""
         w = len(self._walk)
         walked = frames * self._walk
         if not self.precision[0, 0]:
             self.precision[range(w), range(w)] = 1.0 / walked
             self._constant -= 0.5 * float(np.log(walked).sum())
             return
-        # The unknowns before the step are integrated out and replaced by the unknowns after the
-        # step.
+        # the unknowns before the step are integrated out and replaced by those after the step
         both = np.column_stack([self.precision[:w], self.right[:w]])
         lower, part = _factored(self.precision[:w, :w] + np.diag(1.0 / walked), both)
         self.precision -= part[:, :-1].T @ part[:, :-1]
@@ -95,7 +95,7 @@ class Filter:
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of all residuals so far."""
-        # No update yet.
+        # without an update, the precision is zero
         if not self.precision[0, 0]:
             return 0.0
         lower, part = _factored(self.precision, self.right)
@@ -224,7 +224,7 @@ class Evidence:
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
     """Return information (d, d) and score (d,) about the first d unknowns, without the prior."""
     information, score = filtered.marginal_information(size)
-    # No update yet, so there is no prior to subtract.
+    # without an update, there is no prior to subtract
     if not information.any():
         return information, score
     return information - np.eye(size) / prior_variance, score
@@ -242,8 +242,8 @@ class Movement:
     std: float
 
     def __str__(self) -> str:
-        own = self.name.rpartition(".")[2]
-        unit = own.rpartition("_")[2] if "_" in own else ""
+        entry = self.name.rpartition(".")[2]
+        unit = entry.rpartition("_")[2] if "_" in entry else ""
         return f"{self.name} by {self.amount:.3g} ± {self.std:.1g} {unit}".rstrip()
 
 
@@ -266,7 +266,7 @@ class Finding:
         order of effect. Other parameters with nearly the same effect might be the true cause. Empty
         if no movement was detected.
     explained : float
-        Share of the evidence that the movements explain.
+        Fraction of the evidence that the movements explain.
     from_start : bool
         True if the parameters were probably wrong at teaching already.
     unseen : tuple of str
@@ -309,31 +309,31 @@ class Finding:
 
 
 def movements(drift_information: DriftInformation) -> tuple[tuple[Movement, ...], float]:
-    """Return a few parameters whose movement explains the residuals, and the explained share.
+    """Return a few parameters whose movement explains the residuals, and the explained fraction.
 
     Parameters are chosen one after the other. Each next one explains most, together with those
     chosen before.
     """
     information = drift_information.information
     score = drift_information.score
-    whole = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
+    total = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
     chosen: list[int] = []
-    share = 0.0
-    while len(chosen) < MOST_NAMED and share < EXPLAINED:
+    explained = 0.0
+    while len(chosen) < MOST_NAMED and explained < ENOUGH_EXPLAINED:
         gains = {
             k: _gain(information, score, [*chosen, k]) for k in range(len(score)) if k not in chosen
         }
         best = max(gains, key=lambda k: gains[k])
         chosen.append(best)
-        share = min(gains[best] / max(whole, gains[best], np.finfo(float).tiny), 1.0)
+        explained = min(gains[best] / max(total, gains[best], np.finfo(float).tiny), 1.0)
     part = np.ix_(chosen, chosen)
     amounts = np.linalg.solve(information[part], score[chosen])
-    spread = np.linalg.inv(information[part])
-    found = [
-        Movement(NAMES[k], float(amount * SIZES[k]), float(np.sqrt(variance) * SIZES[k]))
-        for k, amount, variance in zip(chosen, amounts, np.diag(spread), strict=True)
+    covariance = np.linalg.inv(information[part])
+    moved = [
+        Movement(DRIFT_NAMES[k], float(amount * SIZES[k]), float(np.sqrt(variance) * SIZES[k]))
+        for k, amount, variance in zip(chosen, amounts, np.diag(covariance), strict=True)
     ]
-    return tuple(found), share
+    return tuple(moved), explained
 
 
 def unseen_directions(information: Array) -> tuple[str, ...]:
@@ -344,15 +344,18 @@ def unseen_directions(information: Array) -> tuple[str, ...]:
     """
     values, vectors = np.linalg.eigh(information)
     named = [
-        " with ".join(NAMES[k] for k in np.argsort(-np.abs(vector)) if abs(vector[k]) >= LARGE_PART)
+        " with ".join(
+            DRIFT_NAMES[k] for k in np.argsort(-np.abs(vector)) if abs(vector[k]) >= LEAST_COMPONENT
+        )
         for value, vector in zip(values, vectors.T, strict=True)
         if value < 1.0
     ]
-    place = () if len(information) == len(NAMES) else ("place of the whole rig (base pose)",)
+    place = () if len(information) == len(DRIFT_NAMES) else ("place of the whole rig (base pose)",)
     return (*ALWAYS_UNSEEN, *place, *named)
 
 
 def _gain(information: Array, score: Array, chosen: list[int]) -> float:
+    """Return the evidence, twice a log-likelihood, that movements of chosen parameters explain."""
     part = information[np.ix_(chosen, chosen)]
     if np.linalg.eigvalsh(part)[0] <= 0.0:
         return 0.0

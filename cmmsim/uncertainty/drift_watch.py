@@ -21,11 +21,11 @@ from cmmsim.uncertainty.known_rig import KnownRig
 # Probability of a false alarm in a run.
 CHANCE = 0.01
 # Largest number of frames in a block. The residuals of a block are averaged.
-BLOCK = 6
+BLOCK_FRAMES = 6
 # Number of blocks that are evaluated together. Longer runs then need no more memory.
-TOGETHER = 64
+BLOCKS_TOGETHER = 64
 # Fewest stickers of a frame that is used.
-FEWEST = 4
+FEWEST_STICKERS = 4
 # Standard deviation of a centre's error from teaching and image formation. The error is constant
 # while the sticker stands still.
 TAUGHT_OFFSET_PX = 3e-4
@@ -134,13 +134,13 @@ class DriftWatch:
             return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
-        """Use the next frame. ``base`` contains the stickers of the base that it shows.
+        """Use the next frame, with the stickers of the ``base`` that it shows.
 
         For a lost frame, only the time is advanced.
         """
         time = self._frames * self._period
         self._frames += 1
-        if not measurement.ok or len(measurement.target_ids) < FEWEST:
+        if not measurement.ok or len(measurement.target_ids) < FEWEST_STICKERS:
             return
         self._judged += 1
         if not self._continues_block(measurement, base):
@@ -152,7 +152,7 @@ class DriftWatch:
         if self._base is not None and base is not None:
             pixels = base.left_pixels, base.right_pixels
             self._base.add(time, np.zeros(6), pixels, base.pixel_variances)
-        if len(self._platform.times) == BLOCK:
+        if len(self._platform.times) == BLOCK_FRAMES:
             self._end_block(self._frames)
 
     @property
@@ -161,7 +161,7 @@ class DriftWatch:
         self._end_block(self._frames)
         self._evaluate_blocks()
         drift_information = self._evidence.drift_information
-        moved, share = movements(drift_information) if self._noticed is not None else ((), 0.0)
+        moved, explained = movements(drift_information) if self._noticed is not None else ((), 0.0)
         return Finding(
             None if self._noticed is None else self._noticed * self._period,
             self._noticed,
@@ -171,13 +171,13 @@ class DriftWatch:
             self._frames,
             self._judged,
             moved,
-            share,
+            explained,
             self._noticed is not None and drift_information.from_start,
             unseen_directions(self._evidence.sensitivity),
         )
 
     def _continues_block(self, measurement: Measurement, base: StickerObservation | None) -> bool:
-        """Tell whether a frame shows the same stickers as the block that is being filled."""
+        """Return True if a frame shows the same stickers as the block that is being filled."""
         if self._platform is None or not np.array_equal(self._platform_ids, measurement.target_ids):
             return False
         seen = None if base is None or not self.watches_base else base.index
@@ -186,7 +186,7 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _begin_block(self, measurement: Measurement, base: StickerObservation | None) -> None:
-        """Begin a block of frames with the stickers of this frame."""
+        """Begin a block of frames with the stickers of a frame."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
@@ -202,15 +202,12 @@ class DriftWatch:
             return
         self._blocks.append(_Block(self._platform, self._base, end))
         self._platform = self._base = None
-        if len(self._blocks) == TOGETHER:
+        if len(self._blocks) == BLOCKS_TOGETHER:
             self._evaluate_blocks()
 
     def _evaluate_blocks(self) -> None:
-        """Evaluate the finished blocks.
-
-        BLAS is limited to one thread: with more, it takes ten times as long on these small
-        matrices.
-        """
+        """Evaluate the finished blocks."""
+        # with more than one thread, BLAS takes ten times as long for these small matrices
         with self._threads.limit(limits=1, user_api="blas"):
             for block, products in zip(self._blocks, self._products(), strict=True):
                 self._evidence.step(products, block.end - self._counted)
@@ -229,7 +226,7 @@ class DriftWatch:
         alike: dict[tuple[bytes, bytes | None], list[int]] = {}
         for number, block in enumerate(self._blocks):
             alike.setdefault(block.stickers, []).append(number)
-        found: dict[int, Array] = {}
+        products_of: dict[int, Array] = {}
         taught = self.geometry.taught
         centres = len(taught.platform_places), len(taught.base_places)
         for numbers in alike.values():
@@ -240,8 +237,8 @@ class DriftWatch:
             if bases:
                 rows.append(base_rows(self.geometry, bases))
             products = self._evidence.products(stacked(rows, centres[: 1 + self.watches_base]))
-            found |= dict(zip(numbers, products, strict=True))
-        return [found[number] for number in range(len(self._blocks))]
+            products_of |= dict(zip(numbers, products, strict=True))
+        return [products_of[number] for number in range(len(self._blocks))]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ PHOTOGRAPHED = (
 """Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board.
 
 With real photographs, the standard deviations were 1 px for focal lengths and 0.5 px for principal
-points. The other entries are assumed such that they are consistent with these two."""
+points. The other entries are assumed to be consistent with these."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,13 @@ class KnownRig:
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        # The covariance belongs to true minus known parameters, so the draw is subtracted.
+        # the covariance belongs to true minus known parameters, so the draw is subtracted
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
-        """Return the standard deviation, px, of the distance of a point's image from its epipolar
-        line.
+        """Return the standard deviation, px, of distances of images from their epipolar lines.
 
-        Errors of the known rig cause this distance. The result is the largest one over points (n,
+        Errors of the known rig cause these distances. The result is the largest one over points (n,
         3) in the camera frame.
         """
         std = np.sqrt(np.diag(self.covariance))

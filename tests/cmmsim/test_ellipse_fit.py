@@ -12,7 +12,12 @@ from cmmsim.detection import ellipse_fit
 from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
-from cmmsim.detection.start_kernels import CORE_SHARE, SMALLEST_START_PX, bound_radii, two_of_rank
+from cmmsim.detection.start_kernels import (
+    CORE_THRESHOLD,
+    SMALLEST_START_PX,
+    bound_radii,
+    two_of_rank,
+)
 from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
 from tests.cmmsim.sensors import NOISE, random_ellipses
 
@@ -35,7 +40,7 @@ def moments(window):
     ground = grey[len(grey) // 3]
     contrast = max(grey[-6] - ground, 1.0)
     share = ((window - ground) / contrast).ravel()
-    share = np.where(share > CORE_SHARE, np.minimum(share, 1.0), 0.0)
+    share = np.where(share > CORE_THRESHOLD, np.minimum(share, 1.0), 0.0)
     places = np.indices(window.shape)[::-1].reshape(2, -1)
     return (
         ground,
