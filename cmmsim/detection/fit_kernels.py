@@ -13,7 +13,7 @@ import numpy as np
 from cmmsim.compilation import Array, compiled
 from cmmsim.detection.start_kernels import bound_radii, moments, start_ellipse
 from cmmsim.geometry.disc_kernels import blur_window, inverse_shape
-from cmmsim.geometry.matrix_kernels import factor, invert_factored, solve_factored
+from cmmsim.geometry.matrix_kernels import factorise, invert_factored, solve_factored
 from cmmsim.geometry.rim_kernels import cover_window
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
@@ -300,7 +300,7 @@ def fit_window(
         for k in range(UNKNOWNS):
             # keep the factor finite if the window does not determine a parameter
             normal[k, k] += 1e-9
-        factor(normal)
+        factorise(normal)
         if iteration == settings.iterations:
             break
         solve_factored(normal, right)

@@ -138,8 +138,8 @@ class Rig(Section):
     """Both cameras and their places.
 
     ``distance`` moves ``position`` along the line to ``target``, to this distance from ``target``.
-    ``left`` and ``right`` replace ``focal_px`` and the principal point in the middle of the image. ``right_from_left`` replaces ``baseline`` and the toe-in of both
-    cameras towards ``target``.
+    ``left`` and ``right`` replace ``focal_px`` and the principal point in the middle of the image.
+    ``right_from_left`` replaces ``baseline`` and the toe-in of both cameras towards ``target``.
     """
 
     baseline: Length = quantity(..., "m", "distance between the cameras")

@@ -226,7 +226,7 @@ def add_image(
 
 
 @compiled
-def triangulate(
+def triangulate_point(
     cameras: Cameras, pixels: Array, spreads: Array, line_variance: float, step_tolerance: float,
     point: Array, scratch: Array,
 ) -> float:  # fmt: skip
@@ -280,11 +280,11 @@ def triangulate_all(
     """Triangulate n points from pixels (n, 2, 2) with covariances ``spreads`` (n, 2, 2, 2).
 
     ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3) and gaps
-    (n,). See ``triangulate`` for the other parameters.
+    (n,). See ``triangulate_point`` for the other parameters.
     """
     scratch = np.empty((3, 6))
     for n in range(len(points)):
-        gaps[n] = triangulate(
+        gaps[n] = triangulate_point(
             cameras, pixels[n], spreads[n], line_variance, step_tolerance, points[n], scratch
         )  # fmt: skip
         from_entries(scratch[1], covariances[n])

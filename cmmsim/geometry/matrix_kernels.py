@@ -12,7 +12,7 @@ SMALLEST_PIVOT = 1e-300
 
 
 @compiled
-def factor(matrix: Array) -> None:
+def factorise(matrix: Array) -> None:
     """Replace the lower triangle of a symmetric matrix (n,n) by its Cholesky factor."""
     for j in range(len(matrix)):
         for i in range(j, len(matrix)):

@@ -13,7 +13,7 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.matrix_kernels import (
-    factor,
+    factorise,
     from_entries,
     inverse_entries,
     invert_factored,
@@ -80,7 +80,7 @@ def solve_step(normal: Array, change: Array, covariance: Array) -> float:
     ``normal`` is overwritten.
     """
     before = (change[0], change[1], change[2], change[3], change[4], change[5])
-    factor(normal)
+    factorise(normal)
     invert_factored(normal, covariance)
     solve_factored(normal, change)
     decrease = 0.0
@@ -184,7 +184,7 @@ def residual_misfit(
 def checkable_misfit(gap: Array, noise: Array, residual_entries: Array, smallest: float) -> float:
     """Return ``residual_misfit`` from only the directions with enough variance."""
     lower = noise.copy()
-    factor(lower)
+    factorise(lower)
     root = np.zeros((3, 3))  # the inverse of the factor whitens the noise
     for k in range(3):
         for i in range(k, 3):

@@ -20,7 +20,7 @@ from cmmsim.detection.fit_kernels import (
     mask_ring,
 )
 from cmmsim.geometry.camera_kernels import length_of
-from cmmsim.geometry.matrix_kernels import factor, invert_factored
+from cmmsim.geometry.matrix_kernels import factorise, invert_factored
 
 
 class CentreNoise(NamedTuple):
@@ -88,7 +88,7 @@ def fit_covariances(
         )
         for k in range(UNKNOWNS):
             normal[k, k] += 1e-9  # as in fit_window
-        factor(normal)
+        factorise(normal)
         invert_factored(normal, covariances[n])
 
 
@@ -341,7 +341,7 @@ def fit_stickers(
                 root[i, j] = fits.covariances[k, i, j]
         chosen += fits.good[k]
         # Cholesky's factor of the covariance transforms unit noise to the noise of the fit.
-        factor(root)
+        factorise(root)
         for i in range(5):
             off[i] = 0.0
             for j in range(i + 1):

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project, triangulate
+from cmmsim.geometry.camera_kernels import (
+    Cameras,
+    faces,
+    length_of,
+    light_at,
+    project,
+    triangulate_point,
+)
 from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
 from cmmsim.geometry.matrix_kernels import from_entries
 from cmmsim.geometry.transform_kernels import (
@@ -272,7 +279,7 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None
         if found:
             for i in range(3):
                 seen.points[n, i] = expected[i]
-            gap = triangulate(
+            gap = triangulate_point(
                 cameras, frame.pixels[n], frame.spreads[n], limits.line_variance, STEP_TOLERANCE,
                 seen.points[n], scratch,
             )  # fmt: skip
