@@ -61,8 +61,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     commands = problem.commands
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
-    # the functions are kept until the run ends; see `_set_up`
-    memory, record, plan, *_functions = _set_up(problem, commands, compiled)
+    memory, record, plan, *_kept = _set_up(problem, commands, compiled)
     run_kernel = chosen(run_frames, compiled)
     # arrays instead of records, because passing a record costs Numba 8 us at every frame
     arrays = [part if part.ndim else part.base for part in memory]
@@ -103,7 +102,7 @@ def _run_together(
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
     # the noise of all runs is in one array, of which each run reads its own rows
     stacked = _with_noise(problem, noises.reshape(-1, 6))
-    memory, record, plan, functions, *_servo = _set_up(stacked, commands, compiled, runs)
+    memory, record, plan, functions, *_kept = _set_up(stacked, commands, compiled, runs)
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
         memory.task[name] = functions[name].address
     lanes = empty("lanes", sizes)
@@ -231,12 +230,12 @@ def _with_noise(problem: LoopProblem, noise: np.ndarray) -> LoopProblem:
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
-    """Arrays that a run reads, as the kernels need them."""
+    """Arrays that a run reads."""
     ideal = problem.ideal or IDEAL
     start = problem.start
     chart = problem.robot.geometry.chart
     sizes = problem.sizes
-    of_integral = start.joint_integral_sensitivity
+    slope = start.joint_integral_sensitivity
     zeros = np.zeros((sizes.joints, sizes.parameters))
     by_command = zeros if start.command_sensitivity is None else start.command_sensitivity
     arrays = {
@@ -249,9 +248,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if ideal.lost is None else np.ascontiguousarray(ideal.lost),
         "noise": np.zeros((0, 0)) if ideal.noise is None else chart.coordinates(ideal.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": (zeros if of_integral is None else of_integral)[
-            :, problem.columns
-        ],
+        "start_integral_sensitivity": (zeros if slope is None else slope)[:, problem.columns],
         "start_servo_sensitivity": _servo_sensitivity(problem, by_command)[:, problem.columns],
         "start_command_sensitivity": by_command[:, problem.columns],
     }

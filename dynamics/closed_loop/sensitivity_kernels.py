@@ -40,10 +40,9 @@ from dynamics.compiled.kernel import (
 )
 from dynamics.parameters import LANES
 
-# Runge-Kutta method: time of each stage as a fraction of the step, and weight of its slope
+# Runge-Kutta: time of each stage over the step, weight of its slope, index of the end of the step
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-# index of the evaluation at the end of a step
 END = 4
 # rate of the margin, rad/s^2 or N m/s, below which the time of an event has no derivative
 NO_APPROACH = 1e-9
@@ -134,11 +133,7 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
 
 @kernel
 def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes of filtered rates, which precede the torques in `d.k[k]`.
-
-    The derivative of the velocity of a crank with respect to the pose is half of `crank_by_rate`,
-    the derivative of its acceleration with respect to the pose rate.
-    """
+    """Differentiate the slopes of filtered rates, which precede the torques in `d.k[k]`."""
     size = len(at.bias)
     count = len(now.mode)
     width = now.width
@@ -147,6 +142,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
     torque = d.k[k, first + count :]
     copy_rows(slopes, torque, width)
     clear(slopes, width)
+    # d(velocity)/d(pose) is half of `crank_by_rate`, d(acceleration)/d(rate)
     for i in range(count):
         for j in range(size):
             add_row(
@@ -163,10 +159,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit.
-
-    For the factor 0.5 see `filtered_tangent`.
-    """
+    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit."""
     size = len(at.bias)
     width = now.width
     stages = now.stages
@@ -359,7 +352,7 @@ def step_tangent(
 def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Differentiate the stop of joints, which changed the pose rate by `now.change`.
 
-    Differentiated are M change = -J^T impulse (`at.force`), and J rate = 0 of the stopped joints.
+    M change = -J^T impulse (`at.force`), and J rate = 0 at the stopped joints, are differentiated.
     """
     size = len(at.bias)
     width = now.width

@@ -13,6 +13,7 @@ root is the fixed base. The YAML file has these keys:
 Home is the position near zero coordinates in which the loops are closed.
 """
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-MOST_ELEMENTS = 120
+MOST = 120
 """Largest number of links, and of joints, of a robot. The largest example has about forty."""
 
 MOST_COORDINATES = 90
@@ -144,13 +145,10 @@ def _require_once(names: list[str], what: str) -> None:
 
 
 def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
-    """Mechanism of a URDF and the settings of its YAML file."""
     elements = {kind: root.findall(kind) for kind in ("link", "joint")}
     for kind, found in elements.items():
-        if len(found) > MOST_ELEMENTS:
-            raise RobotFileError(
-                f"it has {len(found)} elements {kind}, a robot has at most {MOST_ELEMENTS}"
-            )
+        if len(found) > MOST:
+            raise RobotFileError(f"it has {len(found)} elements {kind}, a robot has at most {MOST}")
         _require_once([str(element.get("name")) for element in found], f"the name of a {kind}")
     new_types = dict(zip(settings["joint_name"], settings["joint_type"], strict=True))
     joints = [_joint(element, new_types.get(element.get("name"))) for element in elements["joint"]]
@@ -207,12 +205,7 @@ def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
         )
     own_kind = KINDS[kind]
     axes = np.array([_numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
-    if (
-        new_type is not None
-        and new_type.startswith("UJOINT_")
-        and set(new_type[7:]) <= set("XYZ")
-        and len(new_type) == 9
-    ):
+    if new_type is not None and re.fullmatch("UJOINT_[XYZ]{2}", new_type):
         own_kind = "universal"
         axes = np.array([np.eye(3)["XYZ".index(letter)] for letter in new_type[7:]])
     elif new_type is not None:
@@ -355,13 +348,13 @@ def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
     rod = None if shape is None else (_float(shape, "length"), _float(shape, "radius"))
     if inertial is None:
         return Solid(name, 0.0, place[:3, 3], np.zeros((3, 3)), axes, rod)
-    inertial_frame = place @ _origin(inertial)
+    frame = place @ _origin(inertial)
     tensor = inertial.find("inertia")
     if tensor is None:
         raise RobotFileError(f"link {name} has an inertial without inertia")
     rows = [[_float(tensor, f"i{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"]
-    turned = inertial_frame[:3, :3] @ np.array(rows) @ inertial_frame[:3, :3].T
-    return Solid(name, _number(inertial, "mass", "value"), inertial_frame[:3, 3], turned, axes, rod)
+    turned = frame[:3, :3] @ np.array(rows) @ frame[:3, :3].T
+    return Solid(name, _number(inertial, "mass", "value"), frame[:3, 3], turned, axes, rod)
 
 
 def _origin(element: Xml.Element) -> np.ndarray:
@@ -391,7 +384,6 @@ def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...
 
 
 def _number(element: Xml.Element, tag: str, key: str) -> float:
-    """Number in an attribute of a tag, or zero if there is no such tag."""
     found = element.find(tag)
     return 0.0 if found is None else _float(found, key)
 

@@ -91,7 +91,7 @@ class PlatformJointMotion:
     ) -> None:
         self.pose = pose
         self.rate = rate
-        self.pose_acceleration = acceleration
+        self.symbols = [pose, rate, acceleration]
         angles = pose[3:6]
         spin = rate[3:6]
         spin_rate = acceleration[3:6]

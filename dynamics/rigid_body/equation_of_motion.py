@@ -75,7 +75,7 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     gravity = ca.DM(geometry.gravity)
     twist = to_twist @ pose_rate
     twist_dot = twist_bias(pose, pose_rate)
-    to_free_twist = to_twist @ basis
+    twist_map = to_twist @ basis
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
     legs, sides = _legs(geometry)
     parts = []
@@ -86,7 +86,7 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         mass = symmetric_from_lower(to_joint.T @ leg.mass(position, bodies) @ to_joint)
         force = leg.force(position, *moving, bodies, gravity)
-        row = leg.gradient(position).T @ to_joint @ to_free_twist
+        row = leg.gradient(position).T @ to_joint @ twist_map
         joint = [leg.acceleration(position, *moving), leg.coordinate(position), row @ rate]
         parts.append([mass, ca.vertcat(force, ca.cross(arm, force)), row, *joint])
     platform = rigid[layout.body_slices[0]]
@@ -98,12 +98,11 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     def end(
         masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]
     ) -> list[ca.SX]:
-        total = symmetric_from_lower(
-            to_free_twist.T @ symmetric_from_lower(sum(masses, mass)) @ to_free_twist
-        )
+        wrench_mass = symmetric_from_lower(sum(masses, mass))
+        total = symmetric_from_lower(twist_map.T @ wrench_mass @ twist_map)
         return [
             total,
-            to_free_twist.T @ sum(forces, bias),
+            twist_map.T @ sum(forces, bias),
             *(ca.vertcat(*row) for row in rows),
             factored(total),
         ]
@@ -116,16 +115,11 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
     (q,) = _coordinates(geometry, "q")
     legs, sides = _legs(geometry)
     pose = _poses(geometry, q, 0 * q, 0 * q)[0]
-    to_free_twist = pose_rate_to_twist(pose) @ pose_basis(geometry)
+    twist_map = pose_rate_to_twist(pose) @ pose_basis(geometry)
     parts = []
     for leg, arm in zip(legs, platform_arms(geometry, pose), strict=True):
-        parts.append(
-            [
-                leg.gradient(pose[0:3] + arm).T
-                @ ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
-                @ to_free_twist
-            ]
-        )
+        to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+        parts.append([leg.gradient(pose[0:3] + arm).T @ to_joint @ twist_map])
 
     def end(rows: Sequence[ca.SX]) -> list[ca.SX]:
         return [ca.vertcat(*rows)]
@@ -139,14 +133,12 @@ def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
     The inputs of a column are pose and rate (m,). Its outputs are J_theta_dot rate (n,), theta
     (n,), its rate (n,), the factor of M (m, m), b (m,) and J_theta (n, m).
     """
-    function_ = motion.whole
-    inputs = function_.sx_in()
+    single = motion.whole
+    inputs = single.sx_in()
     q, rate, *shared = inputs
-    _, bias, jacobian, *joints, factor = function_.call(inputs)
-    lane_function = ca.Function(
-        "motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian]
-    )
-    return ColumnFunction(lane_function, len(shared), LANES, LANES)
+    _, bias, jacobian, *joints, factor = single.call(inputs)
+    lanes = ca.Function("motion_in_lanes", [*shared, q, rate], [*joints, factor, bias, jacobian])
+    return ColumnFunction(lanes, len(shared), LANES, LANES)
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
@@ -202,15 +194,12 @@ def _derivatives(
         )
         by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
         by_rate = gradient.T @ _by_rate(force, joints, number)
-        of_joint = [
-            _by_pose(joint, joints, number) @ basis,
-            _by_rate(joint, joints, number) @ basis,
-        ]
+        derivatives = _by_pose(joint, joints, number), _by_rate(joint, joints, number)
         of_leg = [
             basis.T @ by_pose @ basis,
             basis.T @ by_rate @ basis,
             basis.T @ gradient.T @ local,
-            *of_joint,
+            *(derivative @ basis for derivative in derivatives),
         ]
         parts.append(of_leg[:count])
     platform = _platform_columns(joints, gravity, layout.full[0])
@@ -224,9 +213,7 @@ def _derivatives(
             geometry, joints.pose, to_twist @ joints.rate
         )
         wrench += passive @ rigid[layout.passive]
-    of_platform_alone = [
-        basis.T @ ca.jacobian(wrench, of) @ basis for of in (joints.pose, joints.rate)
-    ]
+    by_platform = [basis.T @ ca.jacobian(wrench, of) @ basis for of in joints.symbols[:2]]
 
     def end(
         by_pose: Sequence[ca.SX],
@@ -240,25 +227,18 @@ def _derivatives(
             columns[:, layout.passive] = basis.T @ passive
         for number, of_leg in enumerate(local):
             slices = layout.leg_slices(number)
-            ends = np.cumsum([0, *(bodies.stop - bodies.start for bodies in slices)]).tolist()
-            for bodies, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
-                columns[:, bodies] = part
+            ends = np.cumsum([0, *(rows.stop - rows.start for rows in slices)]).tolist()
+            for rows, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
+                columns[:, rows] = part
         return [
-            sum(by_pose, of_platform_alone[0]),
-            sum(by_rate, of_platform_alone[1]),
+            sum(by_pose, by_platform[0]),
+            sum(by_rate, by_platform[1]),
             columns,
             *(ca.vertcat(*rows) for rows in of_joints),
         ]
 
     inputs = [*coordinates, torque, rigid, *geometry.symbols]
-    return _parted(
-        name,
-        inputs,
-        parts,
-        end,
-        sides,
-        ([joints.pose, joints.rate, joints.pose_acceleration], motion),
-    )
+    return _parted(name, inputs, parts, end, sides, (joints.symbols, motion))
 
 
 def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
@@ -349,10 +329,8 @@ def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
 
 
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
-    """Expressions evaluated at another motion of the platform."""
-    return ca.substitute(
-        outputs, [joints.pose, joints.rate, joints.pose_acceleration], list(motion)
-    )
+    """Expressions in which the symbols of the platform's motion are replaced by `motion`."""
+    return ca.substitute(outputs, joints.symbols, list(motion))
 
 
 def _leg_derivatives(
@@ -411,6 +389,6 @@ def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
 def _platform_columns(joints: PlatformJointMotion, gravity: ca.DM, full: bool) -> ca.SX:
     """Columns of the platform's own parameters."""
     to_twist = pose_rate_to_twist(joints.pose)
-    twist_dot = to_twist @ joints.pose_acceleration + twist_bias(joints.pose, joints.rate)
+    twist_dot = to_twist @ joints.symbols[2] + twist_bias(joints.pose, joints.rate)
     twist = to_twist @ joints.rate
     return to_twist.T @ platform_columns(joints.pose, twist, twist_dot, gravity, full)
