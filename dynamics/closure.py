@@ -3,7 +3,6 @@
 The gaps of the loops (`rigid_body.jacobians.loop_closure`) depend on the coordinates q of the
 platform and on the geometric numbers. They are zero at a closed pose, from which follows
 
-
     dq/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 
 One compiled function serves all geometries near a nominal one. A search over geometries therefore
