@@ -343,7 +343,7 @@ REFUSED = {
         (
             simulate_servo,
             {"settings": _elastic(1e-3)},
-            r"below the 0.000718 kg m\^2 of crank2 about its axis",
+            r"below the 0.000718 kg m\^2 of crank2 including its motor",
         ),
         (
             simulate_servo,
