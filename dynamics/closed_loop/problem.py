@@ -130,7 +130,7 @@ class LoopProblem:
     @cached_property
     def sizes(self) -> Sizes:
         """Sizes of the robot's equation of motion."""
-        motion, servo_motion = (
+        motion, served = (
             robot.functions["equation_of_motion"] for robot in (self.robot, self.servo_robot)
         )
         return Sizes(
@@ -140,9 +140,7 @@ class LoopProblem:
             filters=motion.outputs[2][0] if self.settings.drives.filter_time else 0,
             gains=len(self.robot.layout.joint_pid_names),
             geometry=max(
-                MOST_NUMBERS * motion.outputs[2][0],
-                len(motion.constants),
-                len(servo_motion.constants),
+                MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(served.constants)
             ),
         )
 
@@ -235,11 +233,9 @@ def with_derivatives(
         raise SimulationError(
             "derivatives exist only for rigid joints: pass settings with elasticity=None"
         )
+    by_start = flag("by_start", by_start, SimulationError)
     derived = dataclasses.replace(
-        problem,
-        sensitivities=True,
-        start_sensitivities=flag("by_start", by_start, SimulationError),
-        groups=groups,
+        problem, sensitivities=True, start_sensitivities=by_start, groups=groups
     )
     if directions is None:
         return derived
