@@ -48,11 +48,12 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
 def checked_directions(
     directions: object, before: object, shape: tuple[int, int], most: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (frames, n, k) of commands of a shape (frames, n), at most so many.
+    """Directions (frames, n, k) of commands of a shape (frames, n), with k <= `most`.
 
     The second array (n, k) has those of the commands from before the start, zero if `before` is
-    None. Raises SimulationError.
+    None. None as `directions` has k = 0. Raises SimulationError.
     """
+    directions = np.zeros((*shape, 0)) if directions is None else directions
     given = np.asarray(directions)
     count = given.shape[2] if given.ndim == 3 else 0
     if count > most:

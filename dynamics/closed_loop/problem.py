@@ -237,7 +237,7 @@ def with_derivatives(
     derived = dataclasses.replace(
         problem, sensitivities=True, start_sensitivities=by_start, groups=groups
     )
-    if directions is None:
+    if directions is None and start_directions is None:
         return derived
     most = 0 if derived.start_sensitivities else most_directions(problem.robot, groups)
     shape = problem.frames, problem.robot.layout.joints
