@@ -110,7 +110,7 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
 
 
 def true_zeros(robot: Robot, switches: PlantSwitches) -> Array:
-    """Return what each joint (n,) of a plant reads too little, rad or m.
+    """Return how much less than its true coordinate each joint (n,) of a plant reads, rad or m.
 
     Raises ScenarioError for a list of a wrong length.
     """

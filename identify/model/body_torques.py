@@ -1,4 +1,4 @@
-"""Torques that bodies and passive joints need along a motion, for a unit of what a model lacks.
+"""Torques that bodies and passive joints need along a motion, per unit of what a model lacks.
 
 The torques of bodies are columns of the regressor of full bodies, and those of passive joints are
 the columns of `dynamics.rigid_body.passive_friction`. Both are evaluated without compiling them, so
@@ -47,14 +47,14 @@ def run_motion(run: "LoopModel", found: ClosedLoopRun) -> RunMotion:
     chart = robot.geometry.chart
     poses = chart.pose(chart.coordinates(found.pose))
     rates = chart.lifted(chart.coordinates(found.pose_rate))
-    gains = make_interp_spline(found.time, rates, k=SPLINE_DEGREE).derivative()(found.time)
+    accelerations = make_interp_spline(found.time, rates, k=SPLINE_DEGREE).derivative()(found.time)
     free = chart.basis
     jacobians = robot.joint_jacobian(poses) @ free
     maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
     return RunMotion(
         poses=poses,
         twists=robot.twist(poses, rates),
-        twist_dots=robot.twist_dot(poses, rates, gains),
+        twist_dots=robot.twist_dot(poses, rates, accelerations),
         joint_rates=joint_rates(run, found),
         torque_maps=maps,
     )

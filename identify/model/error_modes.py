@@ -26,8 +26,7 @@ def error_modes(
     """Return the changes (N, 6, k) of a run's poses by one standard deviation of each error.
 
     They are central differences about the common errors that the model contains, at parameters
-    (p,).
-    shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6) by
+    (p,). shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6) by
     errors that are not simulated, by the place of the error, beside the model's `derived_modes`.
 
     Raises LoopFailure if the model is unstable.

@@ -59,14 +59,14 @@ def run_unseen(
     its own noise stream, and all runs share the taught frames, so the results do not depend on the
     number of workers.
     """
-    how = (plant, sensor, taught, duration_s, seed)
+    arguments = (plant, sensor, taught, duration_s, seed)
     workers = workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = plant.runs.timing.frames(duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
         # For a single process no pool is needed.
         if workers == 1 or len(trajectories) == 1:
-            worker = _Worker(*how)
+            worker = _Worker(*arguments)
             return [
                 worker.run(number, path, advance)
                 for number, path in zip(numbers, trajectories, strict=True)
@@ -74,7 +74,7 @@ def run_unseen(
         context = multiprocessing.get_context("spawn")
         # Workers count frames here, because a callback cannot reach another process.
         counter: Synchronized[int] = context.Value("q", 0)
-        start = partial(_start_worker, counter, *how)
+        start = partial(_start_worker, counter, *arguments)
         with (
             _followed(counter, advance),
             mapped(workers, _run_in_worker, numbers, trajectories, start=start) as runs,
