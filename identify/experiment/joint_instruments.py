@@ -6,7 +6,7 @@ stored in a separate file beside the record.
 The torque is the mean over one frame around the instant of exposure. Under a held command the joint
 controller's torque is a sawtooth in time. Samples at the frames would always fall on the same point
 of the sawtooth, half a jump from the mean, which would look like viscous friction. A real
-instrument has an anti-aliasing filter for this.
+instrument avoids this by an anti-aliasing filter.
 """
 
 from dataclasses import dataclass

@@ -255,7 +255,7 @@ class SensorInLoop:
 
     @property
     def common(self) -> Array:
-        """Covariance (6, 6) of the common error by teaching of all poses near home."""
+        """Covariance (6, 6) of the teaching error, which all poses near home have in common."""
         taught = getattr(self._sensor, "taught", None)
         return (
             np.zeros((6, 6))
