@@ -25,7 +25,14 @@ from identify.commands import app as command_line
 from identify.files.run_folder import load_result
 from identify.own_parts import ESTIMATORS
 from identify.reporting.goals import check_goals
+from identify.scenario import Scenario, load_scenario
+from identify.studies.study_file import load_study
+from tests.benchmarks.test_sensor_speed import GOALS
 from tests.identify.synthetic import SIGMA, quick, run_plant, truth
+from tests.identify.test_interval_coverage import CHANGES, EXPERIMENTS
+
+DEFAULT = "pyrender"
+"""Renderer of a run where it can draw."""
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -67,8 +74,8 @@ def figures_of_each(content, name):
 
 
 def test_the_headline_figures_are_those_of_kept_runs():
-    """Each row with its date; the run of the paper's scenario meets every goal, and every proof
-    passed.
+    """Each row with its date and with what it was measured, by the keys of the kept files; the run
+    of the paper's scenario meets every goal, and every proof passed.
     """
     result = kept("result")
     assert (result["scenario"], len(result["validation"])) == ("paper", 10)
@@ -94,18 +101,37 @@ def test_the_headline_figures_are_those_of_kept_runs():
     assert len(predicted) == 8
     in_a_run = result["sensor"]["stereo_frames_per_second"]
     alone = [frames[f"{renderer}_frames_a_second"] for renderer in ("pyrender", "analytic")]
+    together = frames["images_together_frames_a_second"]
+    paper, quick_one = load_scenario(result["scenario"]), load_scenario("quick")
+    assert {paper.renderer, quick_one.renderer} == {"auto"}
+    assert f"auto, which is {DEFAULT}" in Scenario.model_fields["renderer"].description
+    study = load_study("interval_coverage")
+    drawn = study.changes["scenario.renderer"]
+    by_analytic = f"images by `{CHANGES['renderer']}`"
+    by_default = f"`{paper.robot}`, images by `{DEFAULT}`"
+    robots_done = f"each of {len(predicted)} robots"
+    counted = kept("answers/interval_coverage")["rows"]["done"]
+    pin = kept("speeds")["versions"]["pin"]
     rows = [
-        f"| {unseen[0]:.1f} µm, {unseen[1]:.1f} µrad | `cmmsim run`, {result['date']} |",
-        f"| {seen[0]:.1f} µm, {seen[1]:.1f} µrad | `cmmsim run`, {result['date']} |",
-        f"| {100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} % | `sh "
-        f".ci/thorough`, {proved_on} |",
-        f"| {min(others):.1f} to {max(others):.1f} µm | `sh .ci/thorough`, {robots_on} |",
-        f"| {in_a_run:.0f} | `cmmsim run`, {result['date']} |",
-        f"| {alone[0]:.0f}, {alone[1]:.0f} | `sh .ci/thorough`, {frames_on} |",
-        f"| {min(faster):.1f} to {max(faster):.1f} | `sh .ci/thorough`, {faster_on} |",
+        f"| {unseen[0]:.1f} µm, {unseen[1]:.1f} µrad | {by_default}, 1 record | `cmmsim run`, "
+        f"{result['date']} |",
+        f"| {seen[0]:.1f} µm, {seen[1]:.1f} µrad | {by_default}, {result['sensor']['frames']} "
+        f"frames | `cmmsim run`, {result['date']} |",
+        f"| {100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} % | "
+        f"`{paper.robot}`, {by_analytic}, {EXPERIMENTS} records | `sh .ci/thorough`, {proved_on} |",
+        f"| {min(others):.1f} to {max(others):.1f} µm | each of {len(others)} robots, images by "
+        f"`{DEFAULT}`, 1 record | `sh .ci/thorough`, {robots_on} |",
+        f"| {in_a_run:.0f} | `{paper.robot}`, images by the default renderer `{DEFAULT}`, in the "
+        f"loop | `cmmsim run`, {result['date']} |",
+        f"| {alone[0]:.0f}, {alone[1]:.0f}, {together:.0f} | images by `pyrender` and by `analytic`"
+        f" in one process; by `{GOALS['images together'][0]}` many at once on "
+        f"{kept('speeds')['cores']} cores | `sh .ci/thorough`, {frames_on} |",
+        f"| {min(faster):.1f} to {max(faster):.1f} | each of {len(faster)} robots, Pinocchio {pin},"
+        f" no images | `sh .ci/thorough`, {faster_on} |",
     ]
     undated = (
-        f"| {min(predicted):.0f} to {max(predicted):.0f} % | `cmmsim study interval_coverage` |"
+        f"| {min(predicted):.0f} to {max(predicted):.0f} % | {robots_done}, centres of stickers by "
+        f"`{drawn}`, {counted} records | `cmmsim study interval_coverage` |"
     )
     missing = [row for row in [*rows, undated] if row not in README]
     assert not missing, "the README wants these ends of rows:\n" + "\n".join(missing)

@@ -34,6 +34,26 @@ def lit_evenly(level, seed=0, changes=None):
     return lambda: sensor.look(sensor.home, {"wall": place}).windows(CORNERS, SIZE).astype(float)
 
 
+@pytest.mark.parametrize("bits", [8, 12])
+def test_noise_in_percent_of_white_is_that_of_dark_pixels(bits):
+    """One per cent of the largest grey value, on a black wall without light to scatter."""
+    gain = GAIN * 2 ** (bits - 8)
+    white = 2**bits - 1
+    look = lit_evenly(
+        0.0,
+        changes={
+            "camera.grey_noise_percent": 1.0,
+            "camera.bit_depth": bits,
+            "camera.gain": gain,
+            "camera.black_level": 0.2 * white,
+            "camera.noise": True,
+        },
+    )
+    assert look().std() / white == pytest.approx(0.01, rel=0.05)
+    with pytest.raises(cmmsim.CmmError, match="grey_noise_percent"):
+        cmmsim.load_sensor("ctrack780", 0, {"camera.grey_noise_percent": -1.0})
+
+
 def test_photon_transfer_gives_gain_and_dark_noise():
     """The variance of a pixel's grey value grows with its mean by the gain K; what the dark has is
     the dark noise.

@@ -34,6 +34,9 @@ pytestmark = [
     pytest.mark.xdist_group("coverage"),
 ]  # whose experiments are made once
 
+EXPERIMENTS = 200
+"""Experiments of the proof at full count."""
+
 BLOCK = 10
 """Experiments with one teaching."""
 
@@ -132,7 +135,7 @@ def row_of(number: int, result, truth: np.ndarray) -> dict:
 
 @pytest.fixture(scope="module")
 def rows():
-    return experiment_rows(200, 2)
+    return experiment_rows(EXPERIMENTS, 2)
 
 
 def test_intervals_cover_as_often_as_they_say(rows, record_property):

@@ -188,6 +188,10 @@ def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spr
         boxes = [label.get_window_extent() for label in labels if label.get_text()]
         assert len(boxes) >= 2
         assert not any(one.overlaps(other) for one, other in pairwise(boxes))
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 2
+    assert not legend.get_window_extent().overlaps(axes.get_tightbbox())
+    assert figure.bbox.padded(1).containsx(legend.get_window_extent().x1)
 
 
 def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(
@@ -216,6 +220,8 @@ def test_long_title_stays_within_the_figure_of_a_single_law():
     )
     frame = made_table(study)
     figure = laws_figure(study, frame, [(study.theory[0], check_laws(study, frame)[0])])
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert f"theory: $y \\propto x^{{{study.theory[0].exponent:g}}}$" in said
     figure.draw_without_rendering()
     title = figure.texts[0].get_window_extent()
     assert title.x0 > 0.0
