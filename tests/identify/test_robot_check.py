@@ -4,12 +4,15 @@ limit and leg.
 
 import json
 from importlib import resources
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dynamics import load_robot
+from identify.commands import run_stages
 from identify.commands.help import BEYOND_LIMIT
+from identify.errors import EstimationError
 from identify.scenario import load_scenario
 from identify.verification.robot_check import run_warning
 from tests.identify.commands import command, one_line
@@ -90,7 +93,7 @@ def test_a_bandwidth_that_frames_cannot_show_or_that_is_unstable_fails_with_the_
 
 
 @pytest.mark.slow
-def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
+def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd, monkeypatch):
     """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame
     rate holds.
     """
@@ -123,6 +126,17 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
     assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(
         capfd.readouterr().err
     )
+
+    def begin(*_):
+        raise EstimationError("it has begun")
+
+    stages = SimpleNamespace(is_begun=lambda *_: False, run=begin)
+    monkeypatch.setattr(run_stages, "_pipeline", lambda: stages)
+    out = ("--out", tmp_path / "out", "--quiet")
+    assert command("run", "quick", "--robot", tmp_path / "mine.toml", *out) != 0
+    said = capfd.readouterr().err.splitlines()
+    assert [line.partition(":")[0] for line in said] == ["warning", "error"]
+    assert warned in said[0]
 
 
 def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read(capfd):
