@@ -15,15 +15,15 @@ import numpy as np
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
 from dynamics.geometry import RobotGeometry
-from dynamics.parameters import parameter_layout, passive_parameters
+from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, InList, OnTorques
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.body_torques import (
     RunMotion,
+    body_wrenches,
     by_the_joints,
-    full_regressor,
     passive_columns,
     run_motion,
 )
@@ -115,10 +115,10 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
     model has these parameters.
     """
     layout = robot.layout
-    whole = parameter_layout(robot.geometry.legs, ("all",))
-    regressors = [full_regressor(robot.geometry, one) for one in motions]
     masses = layout.bodies_of(parameters[layout.rigid])[:, 0]
     found = []
+    together = []
+    weights = []
     for kind in dict.fromkeys(one.name for one in layout.kinds):
         own = [
             place
@@ -137,17 +137,15 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
             (PRODUCTS, "kg m2", f"products of inertia of {words}"),
         ):
             for name in names:
-                columns = [
-                    whole.rigid_names.index(f"{layout.bodies[place]}.{name}") for place in own
-                ]
-                weights = masses[own] if unit == "m" else np.ones(len(own))
-                torques = tuple(
-                    by_the_joints(one, regressor[:, :, columns] @ weights)
-                    for one, regressor in zip(motions, regressors, strict=True)
-                )
+                together.append(tuple(f"{layout.bodies[place]}.{name}" for place in own))
+                weights.append(masses[own] if unit == "m" else np.ones(len(own)))
                 axis = name[-1] if unit == "m" else name
-                found.append(Needed(f"{group}, {axis}", unit, group, torques, remedy))
-    return found
+                found.append(Needed(f"{group}, {axis}", unit, group, (), remedy))
+    wrenches = [body_wrenches(robot.geometry, one, tuple(together), weights) for one in motions]
+    return [
+        replace(one, torques=_at_the_joints(motions, wrenches, place))
+        for place, one in enumerate(found)
+    ]
 
 
 def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:

@@ -10,13 +10,15 @@ import xarray as xr
 
 from dynamics import Robot
 from identify.arrays import Array
+from identify.diagnosis.asking import ask_first
 from identify.diagnosis.catalogue import catalogue
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
 from identify.diagnosis.own_cause import check_columns
 from identify.diagnosis.ranking import Rows
-from identify.diagnosis.selection import ask_first, select
+from identify.diagnosis.selection import select
 from identify.errors import EstimationError
+from identify.estimation.bounded_least_squares import AT_BOUND
 from identify.estimation.identification import asked_of, identify, output_error_problem
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
@@ -75,7 +77,10 @@ def diagnose(
     side = asked.side.with_drive(result.drive.law)
     problem = output_error_problem(asked.records, side, asked.settings)
     errors = result.common_errors.learned
-    found = diagnosis_from(problem, result.driven_estimate, causes, errors)
+    costs = dict(zip(result.searches, result.costs, strict=True))["command_driven"]
+    # with common errors, those of the last search are not those of the model under commands
+    settled = not errors and len(costs) <= asked.settings.max_iterations
+    found = diagnosis_from(problem, result.driven_estimate, causes, errors, settled)
     return replace(found, seconds=time.perf_counter() - began)
 
 
@@ -85,12 +90,14 @@ def diagnosis_from(
     start: Array,
     own: Sequence[Cause] = (),
     errors: Mapping[str, float] = MappingProxyType({}),
+    settled: bool = False,
 ) -> Diagnosis:
     """Return the diagnosis of a problem, from parameters (p,) near its optimum.
 
     The joints are driven by the logged commands, since the residuals of a right model are white
     only then. own: causes beside those of the catalogue. errors: estimates, by name, of the errors
     that all poses of the first record have in common, from which the search for them begins.
+    settled: whether the parameters are the optimum under the logged commands already.
 
     Raises EstimationError for a cause of one's own that has no column and for drives that took
     torques, and LoopFailure if the model is unstable.
@@ -100,14 +107,21 @@ def diagnosis_from(
         raise EstimationError(
             "the drives took torques: a record is diagnosed only where they took joint commands"
         )
-    # an estimate that is still under way would be accused of what it has not reached yet
     problem = _with_errors(problem.driven_by_commands(), errors)
-    problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
-    found = search_with_common_errors(problem, [start], lambda n=1: None)
-    problem = found.linearised()
-    optimum = found.solution
-    causes = (*catalogue(problem, optimum.parameters), *own)
-    point, first = ask_first(problem, optimum.parameters, optimum.at_bound, causes)
+    if settled:
+        bounds = problem.bounds
+        coordinates = bounds.coordinates(start)
+        scale = bounds.spread(coordinates, problem.guess.std)
+        at_bound = coordinates <= bounds.lower + AT_BOUND * scale
+    else:
+        # an estimate that is still under way would be accused of what it has not reached yet
+        problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
+        found = search_with_common_errors(problem, [start], lambda n=1: None)
+        problem = found.linearised()
+        start = found.solution.parameters
+        at_bound = found.solution.at_bound
+    causes = (*catalogue(problem, start), *own)
+    point, first = ask_first(problem, start, at_bound, causes)
     check_columns(tuple(own), first.columns[:, len(causes) - len(own) :])
     selected = select(problem, point, causes, first)
     rows = Rows.of(problem, point.residual)

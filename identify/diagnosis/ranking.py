@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from identify.arrays import Array, triangular_factor
+from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.explanation import (
@@ -39,6 +39,9 @@ EXACT = 0.999
 
 NEAR = 9.0
 """Difference of two statistics that chance may make, in units of the noise."""
+
+ROUNDING = 1e-13
+"""Share of the largest eigenvalue of the products of columns that is rounding."""
 
 FEW = 3
 """Largest number of causes alone that are compared with a group."""
@@ -153,9 +156,7 @@ def rank(
     share = misfit_of(rows, left).share_of_model
     # what one of them leaves is hardly less than what all of them have to explain
     beyond = share * rows.spread(rows.colour(left), projected) if share else None
-    # in as many rows as columns, these have the same products with each other and the residuals
-    triangle = triangular_factor(projected, left)
-    inner, rest = triangle[:, :-1], triangle[:, -1]
+    inner, rest = in_few_rows(projected, left)
     ranked = []
     for one in every:
         places = list(one.places)
@@ -185,6 +186,21 @@ def rank(
     chance = min(_exactly(first, len(every), left, rows).chance, chance)
     found_first = replace(first, chance=chance)
     return (found_first, *(one for one in ranked if one is not first))
+
+
+def in_few_rows(columns: Array, residual: Array) -> tuple[Array, Array]:
+    """Return columns (k, k) and residuals (k,) with the same products as columns (m, k) have.
+
+    They follow from the eigenvectors of the products of the columns in units of their lengths.
+    Directions that are nothing but rounding are left out.
+    """
+    lengths = np.linalg.norm(columns, axis=0)
+    unit = columns / np.where(lengths > 0, lengths, 1.0)
+    squares, turned = np.linalg.eigh(unit.T @ unit)
+    kept = squares > ROUNDING * squares[-1]
+    roots = np.sqrt(squares[kept])
+    rest = turned[:, kept].T @ (unit.T @ residual) / roots
+    return roots[:, None] * turned[:, kept].T * lengths, rest
 
 
 def _exactly(one: Ranked, count: int, left: Array, rows: Rows) -> Ranked:

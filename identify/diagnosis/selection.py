@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dynamics import DynamicsError
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, with_causes
+from identify.diagnosis.asking import Asked, ask
+from identify.diagnosis.cause import Cause
 from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.linearisation import Linearisation, each_residuals, linearisation
+from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import (
     ALIKE,
     EXACT,
@@ -25,7 +26,6 @@ from identify.diagnosis.ranking import (
     misfit_of,
     rank,
 )
-from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -37,6 +37,16 @@ MOST = 3
 
 CLOSE = 0.8
 """Share of the best statistic from which on a cause that is tried at a size is fitted, too."""
+
+LOOSE = 0.3
+"""The same share, where the best candidate leaves some of the misfit when it is fitted."""
+
+RIVALS = 3
+"""Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
+"""
+
+INEXACT = 1e-3
+"""Share of a fitted cost by which two fits can differ, as each follows the motion only so far."""
 
 
 @dataclass(frozen=True)
@@ -78,93 +88,21 @@ class Selection:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Causes as they are asked at an optimum, and their columns (m, k) there.
+class State:
+    """Selected candidates so far, their optimum, and what is asked there.
 
-    A cause that is tried at some sizes has the difference to the largest gain there as its column,
-    by its size. It is returned with that size alone.
+    places: those of the fitted causes in the catalogue. causes: the catalogue with the causes as
+    they were fitted. fresh: whether columns are those at this optimum. ranking: of the candidates
+    that are left.
     """
 
+    chosen: tuple[Selected, ...]
+    places: tuple[int, ...]
+    point: Point
     causes: tuple[Cause, ...]
-    columns: Array
-
-
-def ask(
-    problem: OutputErrorProblem, point: Point, causes: Sequence[Cause], places: tuple[int, ...]
-) -> Asked:
-    """Return the causes at an optimum with those at some places fitted."""
-    sizes = np.zeros(len(causes))
-    sizes[list(places)] = point.sizes
-    asked = to_ask(causes, places)
-    columns = np.zeros((len(point.residual), len(causes)))
-    columns[:, list(places)] = point.columns
-    found = linearisation(problem, point.parameters, causes, sizes, asked)
-    columns[:, asked] = found.by_causes
-    return _tried(problem, point, causes, sizes, asked, columns)
-
-
-def ask_first(
-    problem: OutputErrorProblem,
-    parameters: Array,
-    at_bound: NDArray[np.bool_],
-    causes: Sequence[Cause],
-) -> tuple[Point, Asked]:
-    """Return the optimum (p,) of a problem without any cause, and the causes there.
-
-    at_bound (p,): coordinates of the parameters that are held at their bounds. One run of the model
-    is differentiated for both.
-    """
-    sizes = np.zeros(len(causes))
-    asked = to_ask(causes, ())
-    found = linearisation(problem, parameters, causes, sizes, asked)
-    alone = replace(found, by_causes=found.by_causes[:, :0])
-    point = Point.of(problem, (), parameters, at_bound, sizes[:0], alone)
-    columns = np.zeros((len(found.residual), len(causes)))
-    columns[:, asked] = found.by_causes
-    return point, _tried(problem, point, causes, sizes, asked, columns)
-
-
-def to_ask(causes: Sequence[Cause], places: tuple[int, ...]) -> list[int]:
-    """Return the places of causes that can be asked beside those at other places.
-
-    A companion has no effect before its cause is there.
-    """
-    beside = [one.companion for one in causes if one.companion is not None]
-    return [
-        place
-        for place, one in enumerate(causes)
-        if place not in places and not any(one is companion for companion in beside)
-    ]
-
-
-def _tried(
-    problem: OutputErrorProblem,
-    point: Point,
-    causes: Sequence[Cause],
-    sizes: Array,
-    asked: Sequence[int],
-    columns: Array,
-) -> Asked:
-    """Return causes with columns (m, k), after those that are tried at some sizes.
-
-    sizes (k,): those at the optimum. asked: places of the causes that are asked.
-    """
-    chosen = list(causes)
-    left = point.beside_all.part(point.residual)
-    there = with_causes(problem, causes, sizes)
-    tried = [(place, size) for place in asked for size in causes[place].tried]
-    ends = [causes[place].change(there, size) for place, size in tried]
-    gains = np.zeros(len(causes))
-    for (place, size), end in zip(tried, each_residuals(ends, point.parameters), strict=True):
-        if end is None:
-            continue
-        column = ((end - point.residual) / size)[:, None]
-        judged = score(point.beside_all.part(column), left, np.linalg.norm(column, axis=0))
-        if judged.sizes[0] > 0 and judged.statistic > gains[place]:
-            gains[place] = judged.statistic
-            columns[:, place] = column[:, 0]
-            chosen[place] = replace(causes[place], tried=(size,))
-    return Asked(tuple(chosen), columns)
+    asked: Asked
+    ranking: tuple[Ranked, ...]
+    fresh: bool = True
 
 
 def select(
@@ -176,48 +114,93 @@ def select(
     """
     rows = Rows.of(problem, point.residual)
     first = rank(asked.causes, asked.columns, point.residual, point.beside, rows)
-    chosen: tuple[Selected, ...] = ()
-    places: tuple[int, ...] = ()
-    now = point
-    ranking = first
-    catalogue = tuple(causes)
-    fresh = True
-    while len(chosen) < MOST and ranking and ranking[0].chance <= CHANCE:
-        # columns follow what was fitted only so far, and those that are not new less
-        followed = 1 - (EXACT if fresh else ALIKE) ** 2
-        if ranking[0].score.statistic < followed * (point.cost - now.cost):
+    now = State((), (), point, tuple(causes), asked, first)
+    while len(now.chosen) < MOST:
+        more = _with_next(problem, now, point.cost, rows)
+        if more is None:
             break
-        alike = indistinguishable(ranking, rows, now.beside_all.part(now.residual))
-        best = alike[0]
-        trial = _trial(problem, now, asked, places, best)
-        rival = _rival(asked.causes, best, ranking)
-        other = rival and _trial(problem, now, asked, places, rival)
-        if rival and other and (trial is None or other.point.cost < trial.point.cost - NEAR):
-            # fitted, the two can be told apart
-            trial = other
-            best = rival
-            alike = (rival,)
-        if trial is None:
-            break
-        names = tuple(one.candidate.name for one in alike[1:])
-        one = Selected(best, trial.added, now.cost - trial.point.cost, names)
-        places = trial.places
-        chosen = _of_places((*chosen, one), places)
-        now = trial.point
-        catalogue = _with_fitted(catalogue, places, now.causes)
-        fresh = misfit_of(rows, now.residual).significant
-        if fresh:
-            asked = ask(problem, now, catalogue, places)
-        else:
-            asked = replace(asked, causes=_with_fitted(asked.causes, places, now.causes))
-        ranking = tuple(
-            one
-            for one in rank(asked.causes, asked.columns, now.residual, now.beside_all, rows)
-            if not set(one.candidate.places) <= set(places)
-            and not _excluded(causes, one.candidate.places, places)
+        now = _exchanged(problem, more, point.cost, rows) if more.fresh else more
+    before, after = (misfit_of(rows, one.residual) for one in (point, now.point))
+    return Selection(now.chosen, now.places, now.point, first, before, after)
+
+
+def _with_next(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State | None:
+    """Return the state with the best of the candidates that are left, or None if none counts.
+
+    cost: that without any cause.
+    """
+    if not now.ranking or now.ranking[0].chance > CHANCE:
+        return None
+    # columns follow what was fitted only so far, and those that are not new less
+    followed = 1 - (EXACT if now.fresh else ALIKE) ** 2
+    if now.ranking[0].score.statistic < followed * (cost - now.point.cost):
+        return None
+    trial, alike = _best_fitted(problem, now, rows)
+    if trial is None:
+        return None
+    names = tuple(one.candidate.name for one in alike[1:])
+    one = Selected(alike[0], trial.added, now.point.cost - trial.point.cost, names)
+    chosen = _of_places((*now.chosen, one), trial.places)
+    return _state(problem, now, chosen, trial.places, trial.point, rows)
+
+
+def _state(
+    problem: OutputErrorProblem,
+    before: State,
+    chosen: tuple[Selected, ...],
+    places: tuple[int, ...],
+    point: Point,
+    rows: Rows,
+    left_out: tuple[int, ...] = (),
+) -> State:
+    """Return the state at an optimum with the causes at some places.
+
+    All are asked anew while noise does not explain what is left. left_out: places of causes that
+    are not asked.
+    """
+    causes = _with_fitted(before.causes, places, point.causes)
+    fresh = misfit_of(rows, point.residual).significant
+    if fresh:
+        asked = ask(problem, point, causes, places)
+    else:
+        asked = replace(
+            before.asked, causes=_with_fitted(before.asked.causes, places, point.causes)
         )
-    before, after = (misfit_of(rows, one.residual) for one in (point, now))
-    return Selection(chosen, places, now, first, before, after)
+    ranking = tuple(
+        one
+        for one in rank(asked.causes, asked.columns, point.residual, point.beside_all, rows)
+        if not set(one.candidate.places) <= {*places, *left_out}
+        and not _excluded(causes, one.candidate.places, places)
+    )
+    return State(chosen, places, point, causes, asked, ranking, fresh)
+
+
+def _exchanged(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State:
+    """Return a state with another cause in place of one that is there or not, if that is better.
+
+    Such a cause has no size that could become insignificant. It can take up what several causes
+    make together, and is asked again once one of these is fitted. cost: that without any cause.
+    """
+    for one in now.chosen[:-1]:
+        if all(now.causes[place].step for place in one.places):
+            continue
+        stay = [k for k, place in enumerate(now.places) if place not in one.places]
+        sizes = now.point.sizes[stay]
+        places = tuple(now.places[k] for k in stay)
+        free = np.zeros(len(stay), dtype=bool)
+        start = now.point.parameters
+        try:
+            fitted = _fitted(problem, start, now.causes, places, sizes, sizes, free, None)
+        except DynamicsError:
+            continue
+        others = tuple(other for other in now.chosen if other is not one)
+        without = _state(problem, now, _of_places(others, fitted[0]), *fitted, rows, one.places)
+        found = _with_next(problem, without, cost, rows)
+        if found and found.point.cost < now.point.cost - max(NEAR, INEXACT * now.point.cost):
+            *kept, last = found.chosen
+            gain = cost - found.point.cost - sum(other.gain for other in kept)
+            return replace(found, chosen=(*kept, replace(last, gain=gain)))
+    return now
 
 
 def _with_fitted(
@@ -239,6 +222,38 @@ class FittedCandidate:
     added: tuple[int, ...]
     places: tuple[int, ...]
     point: Point
+
+
+def _best_fitted(
+    problem: OutputErrorProblem, now: State, rows: Rows
+) -> tuple[FittedCandidate | None, tuple[Ranked, ...]]:
+    """Fit the best candidate of a state's ranking beside the causes that it has.
+
+    Where that leaves some of the misfit, others that columns cannot tell from it are fitted, too.
+    Returns the best fit, or None where none helps, and its candidate with all like it.
+    """
+    point, asked, places = now.point, now.asked, now.places
+    alike = indistinguishable(now.ranking, rows, point.beside_all.part(point.residual))
+    first = _trial(problem, point, asked, places, alike[0])
+    leaves = first is not None and misfit_of(rows, first.point.residual).significant
+    rival = _rival(asked.causes, alike[0], now.ranking, LOOSE if leaves else CLOSE)
+    others = () if rival is None else (rival,)
+    if leaves:
+        others = (*others, *alike[1 : 1 + RIVALS])
+    fits = [(alike[0], first)]
+    fits += [(one, _trial(problem, point, asked, places, one)) for one in others]
+    helping = [(one, fit) for one, fit in fits if fit is not None]
+    if not helping:
+        return None, alike
+    lead, best = min(helping, key=lambda pair: pair[1].point.cost)
+    near = best.point.cost + max(NEAR, INEXACT * best.point.cost)
+    if first is not None and first.point.cost <= near:
+        lead, best = alike[0], first
+    # fitted, the others can be told apart
+    apart = [id(one) for one, fit in fits if fit is None or fit.point.cost > near]
+    if lead is rival:
+        alike = ()
+    return best, (lead, *(one for one in alike if one is not lead and id(one) not in apart))
 
 
 def _trial(
@@ -273,14 +288,16 @@ def _trial(
     return FittedCandidate(added, kept, point) if enough and set(added) & set(kept) else None
 
 
-def _rival(causes: Sequence[Cause], best: Ranked, ranking: Sequence[Ranked]) -> Ranked | None:
+def _rival(
+    causes: Sequence[Cause], best: Ranked, ranking: Sequence[Ranked], share: float
+) -> Ranked | None:
     """Return a cause that may do better than the best candidate once it is fitted, or None.
 
-    The statistic of one that is tried at a size is the roughest.
+    The statistic of one that is tried at a size is the roughest, and at least a share of the best.
     """
     for one in ranking:
         cause = causes[one.candidate.places[0]]
-        close = one.score.statistic > CLOSE * best.score.statistic
+        close = one.score.statistic > share * best.score.statistic
         if cause.tried and close and cause.group != causes[best.candidate.places[0]].group:
             return one
     return None

@@ -13,7 +13,7 @@ one place of all legs, because they are made alike. The errors act as torques at
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.loop_parameters import check_parameter_set
-from identify.model.body_torques import full_regressor, passive_columns, run_motion
+from identify.model.body_torques import body_wrenches, passive_columns, run_motion
 from identify.model.error_modes import differentiated
 from identify.scenario import Model
 
@@ -143,17 +143,17 @@ def _torques(run: "LoopModel", parameters: Array, found: ClosedLoopRun) -> Array
     needs at rest before the motion.
     """
     geometry = run.robot.geometry
-    passive = passive_parameters(geometry.legs)
-    whole = replace(geometry, full_bodies=("all",), passive_friction=passive).layout.rigid_names
     stds = run.common.body_std
-    changes = np.zeros((len(whole), len(stds)))
-    for one in _errors(run.robot):
-        if one.name in stds:
-            rows = [whole.index(name) for name in one.parameters]
-            changes[rows, list(stds).index(one.name)] = stds[one.name]
+    # the standard deviations are in the order of the errors, those of bodies first
+    own = [one for one in _errors(run.robot) if one.name in stds]
+    together = tuple(one.parameters for one in own if one.owners)
+    weights = [np.full(len(one.owners), stds[one.name]) for one in own if one.owners]
+    passive = passive_parameters(geometry.legs)
+    places = [passive.index(one.parameters[0]) for one in own if not one.owners]
     motion = run_motion(run, found)
-    columns = [full_regressor(geometry, motion), passive_columns(geometry, motion)]
-    wrenches = np.concatenate(columns, axis=2) @ changes
+    of_joints = passive_columns(geometry, motion)[:, :, places] * [*stds.values()][len(together) :]
+    of_bodies = body_wrenches(geometry, motion, together, weights)
+    wrenches = np.concatenate([of_bodies, of_joints], axis=2)
     torques = np.einsum("tij,tjk->kti", motion.torque_maps, wrenches)
     if run.settings.drives.torques or not run.drive_law(parameters).integrates:
         return np.asarray(torques)

@@ -5,6 +5,7 @@ the columns of `dynamics.rigid_body.passive_friction`. Both are evaluated withou
 that a robot in another form costs no time.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -74,18 +75,35 @@ def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
     return np.asarray(torques - torques[0])
 
 
+Together = tuple[tuple[str, ...], ...]
+"""Names of parameters of full bodies that act together, for each of k wrenches."""
+
+
 @lru_cache(maxsize=8)
-def _regressor_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the regressor (6, r) of a geometry whose bodies are all full, as a CasADi function."""
+def _body_function(geometry: RobotGeometry, together: Together) -> ca.Function:
+    """Return the wrenches (6, k) of `body_wrenches` for given weights, as a CasADi function."""
     given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
     full = replace(geometry, full_bodies=("all",))
-    return function("regressor", given, [rigid_body_regressor(full, *given)])
+    regressor = rigid_body_regressor(full, *given)
+    places = [[full.layout.rigid_names.index(name) for name in names] for names in together]
+    weights = ca.SX.sym("weights", sum(map(len, places)))
+    parts = ca.vertsplit(weights, [0, *np.cumsum([len(own) for own in places]).tolist()])
+    columns = [regressor[:, own] @ part for own, part in zip(places, parts, strict=True)]
+    return function("body_wrenches", [*given, weights], [ca.horzcat(*columns)])
 
 
-def full_regressor(geometry: RobotGeometry, motion: RunMotion) -> Array:
-    """Return the regressor (N, 6, r) of full bodies along a motion."""
-    regressor = _regressor_function(geometry)
-    found = regressor(motion.poses.T, motion.twists.T, motion.twist_dots.T).full()
+def body_wrenches(
+    geometry: RobotGeometry, motion: RunMotion, together: Together, weights: Sequence[Array]
+) -> Array:
+    """Return the wrenches (N, 6, k) of parameters of full bodies along a motion.
+
+    weights: for each wrench, the values of the parameters that act together.
+    """
+    if not together:
+        return np.zeros((len(motion.poses), 6, 0))
+    given = motion.poses.T, motion.twists.T, motion.twist_dots.T
+    values = np.tile(np.concatenate(weights)[:, None], len(motion.poses))
+    found = _body_function(geometry, together)(*given, values).full()
     return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
