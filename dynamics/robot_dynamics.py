@@ -14,8 +14,8 @@ from dynamics.robot_platform import CONDITION_LIMIT
 class RobotDynamics(RobotKinematics):
     """Matrices, wrenches and torques of a robot. See `Robot`.
 
-    An array of all parameters, such as the estimate of an identification, also counts as dynamic
-    parameters. Its gains have no effect.
+    An array of all parameters, such as an estimate, can be passed as dynamic parameters. Its gains
+    have no effect.
     """
 
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
@@ -282,13 +282,10 @@ class RobotDynamics(RobotKinematics):
         return poses
 
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
-        """Dynamic parameters as an array, by default `nominal_parameters`.
-
-        The gains are left out of all parameters, as an identification returns them.
-        """
+        """Dynamic parameters as an array, by default `nominal_parameters`."""
         if parameters is None:
             return self.nominal_parameters
-        whole = len(self.layout.names)
-        if isinstance(parameters, np.ndarray) and parameters.shape[-1:] == (whole,):
+        with_gains = (len(self.layout.names),)
+        if isinstance(parameters, np.ndarray) and parameters.shape[-1:] == with_gains:
             parameters = parameters[..., self.layout.dynamic]
         return self.layout.check(parameters, batch=True)

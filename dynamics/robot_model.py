@@ -19,14 +19,14 @@ from dynamics.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """Robot whose dynamic parameters are its nominal ones, such as an identified robot.
+    """Robot that always has its nominal dynamic parameters, such as an identified robot.
 
     Attributes
     ----------
     robot : Robot
-        The robot. Its other methods also use its nominal parameters by default.
+        Robot with its nominal parameters.
     source : str
-        Text for the headers of files, which states where the numbers come from.
+        Source of the parameters, for the headers of files.
 
     Examples
     --------
@@ -67,7 +67,7 @@ class RobotModel:
         theta_ddot: ArrayLike,
         initial_pose: ArrayLike | None = None,
     ) -> np.ndarray:
-        """Actuator torques of a motion that is given in joint coordinates.
+        """Actuator torques of a motion in joint coordinates.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class RobotModel:
         For parameters and errors see `tau_of_joints`.
         """
         theta = rows("theta", theta, self.robot.layout.joints)
-        rate, gain = (
+        rate, acceleration = (
             floats(name, value, theta.shape, error=ShapeError)
             for name, value in (("theta_dot", theta_dot), ("theta_ddot", theta_ddot))
         )
@@ -118,17 +118,18 @@ class RobotModel:
         basis = self.robot.geometry.chart.basis
         jacobian = self.robot.joint_jacobian(pose) @ basis
         twist = _solved(jacobian, rate) @ basis.T
-        bend = np.squeeze(self._bend(pose.T, twist.T).full().T)
-        return pose, twist, _solved(jacobian, gain - bend.reshape(gain.shape)) @ basis.T
+        # a CasADi function has one motion per column
+        bias = self._bias_acceleration(pose.T, twist.T).full().T.reshape(acceleration.shape)
+        return pose, twist, _solved(jacobian, acceleration - bias) @ basis.T
 
     @cached_property
-    def _bend(self) -> ca.Function:
-        """Accelerations of the joints in a motion without twist_dot: J_dot twist."""
+    def _bias_acceleration(self) -> ca.Function:
+        """Accelerations J_dot twist of the joints in a motion without twist_dot."""
         pose = ca.SX.sym("pose", 6)
         twist = ca.SX.sym("twist", 6)
         rates = self.robot.casadi("joint_jacobian")(pose) @ twist
-        along = ca.solve(pose_rate_to_twist(pose), twist)
-        return ca.Function("bend", [pose, twist], [ca.jtimes(rates, pose, along)])
+        pose_rate = ca.solve(pose_rate_to_twist(pose), twist)
+        return ca.Function("bias", [pose, twist], [ca.jtimes(rates, pose, pose_rate)])
 
     def casadi(self, name: str) -> ca.Function:
         """CasADi function with the numbers of this model in place of the input `parameters`.
@@ -154,19 +155,18 @@ class RobotModel:
         >>> RobotModel(robot).casadi("inverse_dynamics").name_in()
         ['pose', 'twist', 'twist_dot']
         """
-        whole = self.robot.casadi(name)
-        if "parameters" not in whole.name_in():
-            return whole
-        given = {
-            key: ca.SX.sym(key, whole.size1_in(key))
-            for key in whole.name_in()
+        function = self.robot.casadi(name)
+        if "parameters" not in function.name_in():
+            return function
+        inputs = {
+            key: ca.SX.sym(key, function.size1_in(key))
+            for key in function.name_in()
             if key != "parameters"
         }
-        numbers = ca.DM(self.robot.nominal_parameters)
-        found = whole.call(given | {"parameters": numbers})
-        outputs = whole.name_out()
+        results = function.call(inputs | {"parameters": ca.DM(self.robot.nominal_parameters)})
+        names = function.name_out()
         return ca.Function(
-            name, list(given.values()), [found[key] for key in outputs], list(given), outputs
+            name, list(inputs.values()), [results[key] for key in names], list(inputs), names
         )
 
     def mjcf(self, allow_unphysical_inertia: bool = False) -> str:
@@ -213,6 +213,6 @@ class RobotModel:
 
 
 def _solved(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Solutions (..., m) of square systems."""
-    found: np.ndarray = np.linalg.solve(matrices, vectors[..., None])[..., 0]
-    return found
+    """Solutions (..., m) of square systems of equations."""
+    solutions: np.ndarray = np.linalg.solve(matrices, vectors[..., None])[..., 0]
+    return solutions

@@ -37,8 +37,8 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
         "",
     ]
     kinds = [type(leg).model_fields["type"].default for leg in geometry.legs]
-    form = (kinds[0], len(kinds), geometry.chart.name) if len(set(kinds)) == 1 else None
-    family = next((name for name, one in FAMILIES.items() if one == form), None)
+    platform_form = (kinds[0], len(kinds), geometry.chart.name) if len(set(kinds)) == 1 else None
+    family = next((name for name, form in FAMILIES.items() if form == platform_form), None)
     lines.append(f"name = {json.dumps(robot.name)}")
     lines.append(
         f"family = {json.dumps(family)}" if family else f"chart = {json.dumps(geometry.chart.name)}"
@@ -64,7 +64,7 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
 
 
 def _columns(legs: Sequence[Leg]) -> list[str]:
-    """Lines with the fields of all legs. A column of equal values is written as one value."""
+    """Lines with the fields of all legs. If all legs have the same value, it is written once."""
     lines = []
     for name in type(legs[0]).model_fields:
         column = [getattr(leg, name) for leg in legs]

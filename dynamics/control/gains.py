@@ -104,32 +104,32 @@ def design_servo(
     return servo(best.x)
 
 
-SPEEDS = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
-"""Speeds, rad/s, of the slowest motion under designed drives, in the order in which they are tried.
+DRIVE_FREQUENCIES = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
+"""Lowest natural frequencies, rad/s, of designed drives, in the order in which they are tried.
 
 The first is that of the built-in robots.
 """
-DAMPINGS = (0.35, 0.5, 0.7)
-"""Damping ratios of the slowest motion under designed drives, in the order of trial."""
+DRIVE_DAMPINGS = (0.35, 0.5, 0.7)
+"""Damping ratios at the lowest natural frequency of designed drives, in the order of trial."""
 INTEGRAL_RATE = 1.1
 """Ratio li / lp of designed drives, 1/s, as in the paper."""
-ENOUGH = 1.5
-"""Factor by which all gains of the servo can grow under designed drives."""
+WANTED_MARGIN = 1.5
+"""Gain margin of the servo at which the search for drives ends."""
 
 
 @dataclass(frozen=True)
 class DesignedDrives:
-    """Gains of the drives by design, and what they give.
+    """Gains of the drives by design, and the motion of the joints with them.
 
-    `gains` (3,) are lp, li and ld. `felt` are the smallest and the largest inertia that a motion of
-    the joints meets, kg m^2 or kg. `speeds` are the fastest and the slowest motion under lp, rad/s,
-    and `damping` is the damping ratio of the slowest. `margin` is the smallest factor of the gains
-    of the servo at the limit of stability.
+    `gains` (3,) are lp, li and ld. `inertias` are the smallest and the largest eigenvalue of the
+    inertia matrix at the joints, kg m^2 or kg. `frequencies` are the highest and the lowest natural
+    frequency with lp, rad/s, and `damping` is the damping ratio at the lowest. `margin` is the
+    smallest `gain_margin` of a servo.
     """
 
     gains: np.ndarray
-    felt: tuple[float, float]
-    speeds: tuple[float, float]
+    inertias: tuple[float, float]
+    frequencies: tuple[float, float]
     damping: float
     margin: float
 
@@ -139,35 +139,39 @@ def design_drives(
 ) -> DesignedDrives:
     """Gains of the joint PID that all joints share, for which the servo of each loop is stable.
 
-    The largest inertia at home gets the speed and the damping of the built-in robots. Other speeds
-    and dampings are tried if the gains of a servo could not grow by `ENOUGH`. `dynamic` are sets of
+    The largest inertia at home gets the natural frequency and the damping of the built-in robots.
+    Others are tried if the gain margin of a servo is below `WANTED_MARGIN`. `dynamic` are sets of
     dynamic parameters (p,), the first one for the design. Raises SimulationError, with the largest
-    eigenvalue of the best gains, if there are no such gains.
+    gain margin found, if there are no such gains.
     """
     pose = robot.home_pose
     zero = np.zeros(len(robot.layout.joint_pid_names))
     push = stability.torque_motion(robot, np.concatenate([dynamic[0], zero]), pose)[1]
-    felt = 1 / np.linalg.eigvalsh(robot.coordinate_jacobian(pose) @ push)[::-1]
+    inertias = 1 / np.linalg.eigvalsh(robot.coordinate_jacobian(pose) @ push)[::-1]
     best = None
-    for damping in DAMPINGS:
-        for speed in SPEEDS:
-            lp = felt[-1] * speed**2
-            exact = lp, INTEGRAL_RATE * lp, 2 * damping * speed * felt[-1]
+    for damping in DRIVE_DAMPINGS:
+        for frequency in DRIVE_FREQUENCIES:
+            lp = inertias[-1] * frequency**2
+            exact = lp, INTEGRAL_RATE * lp, 2 * damping * frequency * inertias[-1]
             gains = np.array([float(f"{gain:.3g}") for gain in exact])
             each = np.tile(gains, len(robot.layout.joint_pid_names) // len(gains))
             margins = [
-                stability.gain_margin(robot, np.concatenate([own, each]), loop, pose)
-                for own in dynamic
+                stability.gain_margin(robot, np.concatenate([values, each]), loop, pose)
+                for values in dynamic
                 for loop in loops
             ]
-            speeds = float(np.sqrt(lp / felt[0])), float(speed)
-            found = DesignedDrives(
-                gains, (float(felt[0]), float(felt[-1])), speeds, damping, min(margins)
+            drives = DesignedDrives(
+                gains,
+                (float(inertias[0]), float(inertias[-1])),
+                (float(np.sqrt(lp / inertias[0])), float(frequency)),
+                damping,
+                min(margins),
             )
-            if found.margin >= ENOUGH:
-                return found
-            if best is None or not best.margin >= found.margin:
-                best = found
+            if drives.margin >= WANTED_MARGIN:
+                return drives
+            # also replaces a best margin that is NaN
+            if best is None or not best.margin >= drives.margin:
+                best = drives
     if best is None or not best.margin > 1:
         raise SimulationError(
             f"no gains of the drives of {robot.name} make the servo stable at "

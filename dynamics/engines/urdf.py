@@ -1,10 +1,10 @@
 """URDF of a robot and YAML of its closures, in the convention that `urdf_import` reads.
 
-URDF knows only trees. The last body of each leg ends in a frame `end_...` that coincides with a
-frame `seat_...` of the platform, and the YAML lists these pairs. The platform floats, or hangs on
-the first leg by a spherical joint. Actuated joints are written at zero, and passive joints as they
-are at home. A universal joint is two revolute joints with a hub between them. A spherical joint is
-written as a revolute joint, and the YAML names it.
+URDF can describe only trees. The last body of each leg ends in a frame `end_...` that coincides
+with a frame `seat_...` of the platform, and the YAML lists these pairs of frames. The platform
+floats, or hangs on the first leg by a spherical joint. Actuated joints are written at coordinate
+zero, and passive joints as they are at home. A universal joint is two revolute joints with a hub
+between them. A spherical joint is written as a revolute joint, and the YAML names it.
 """
 
 from xml.sax.saxutils import quoteattr
@@ -19,7 +19,7 @@ from dynamics.pseudo_inertia import about_centre
 from dynamics.robot import Robot
 
 Places = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Origin (3,), m, and axes (3, 3) of each link by name, in the axes of the base."""
+"""Origin (3,), m, and axes (3, 3) of each link, in the axes of the base."""
 
 
 def urdf_texts(
@@ -44,7 +44,7 @@ def urdf_texts(
     turn = base_from_platform(robot.home_pose)
     places: Places = {"base": (np.zeros(3), np.eye(3)), "platform": (robot.home_pose[:3], turn)}
     lines = [_link("base"), _link("platform", bodies[0])]
-    balls: list[str] = []
+    spherical: list[str] = []
     loops: list[list[str]] = []
     if not platform_on_a_leg:
         lines.append(_joint("platform", "floating", "base", "platform", places))
@@ -56,7 +56,7 @@ def urdf_texts(
         axis = home.axes[number].T @ home.axes[part.before] @ segment.axis
         lines.append(_link(name, part.share * bodies[part.body], segment.centre))
         if segment.joint == "ball":
-            balls.append(name)
+            spherical.append(name)
         if segment.joint == "universal":
             hub = f"hub_{name}"
             lines.append(_link(hub))
@@ -65,23 +65,23 @@ def urdf_texts(
             before = hub
             axis = np.array([1.0, 0.0, 0.0])
         kind = "prismatic" if segment.joint == "slide" else "revolute"
-        turned = 0.0
+        coordinate = 0.0
         more = ""
         if segment.actuated:
             name = robot.joint_names[part.leg]
             limit = robot.travel_limit
-            turned = at_home[part.leg]
+            coordinate = at_home[part.leg]
             more = f'<dynamics friction="{dry[part.leg]!r}" damping="{viscous[part.leg]!r}"/>'
             more += f'<limit lower="{-limit!r}" upper="{limit!r}" effort="1" velocity="1"/>'
-        lines.append(_joint(name, kind, before, part.name, places, axis, turned, more))
+        lines.append(_joint(name, kind, before, part.name, places, axis, coordinate, more))
         if part.last:
             end, seat = f"end_{part.name}", f"seat_{part.name}"
             place = home.origin[number] + home.axes[number] @ segment.end
             places |= {end: (place, home.axes[number]), seat: (place, turn)}
             lines += [_link(end), _link(seat)]
             lines.append(_joint(f"to_{end}", "fixed", part.name, end, places))
-            if platform_on_a_leg and not loops and "hanging" not in balls:
-                balls.append("hanging")
+            if platform_on_a_leg and not loops and "hanging" not in spherical:
+                spherical.append("hanging")
                 lines.append(_joint("hanging", "revolute", end, seat, places))
                 lines.append(_joint("to_platform", "fixed", seat, "platform", places))
             else:
@@ -91,8 +91,8 @@ def urdf_texts(
         "closed_loop": loops,
         "type": ["3d"] * len(loops),
         "name_mot": list(robot.joint_names),
-        "joint_name": balls,
-        "joint_type": ["SPHERICAL"] * len(balls),
+        "joint_name": spherical,
+        "joint_type": ["SPHERICAL"] * len(spherical),
     }
     text = "\n".join([f"<robot name={quoteattr(robot.name)}>", *lines, "</robot>"])
     return text, "\n".join(f"{key}: {value}" for key, value in closures.items())
@@ -103,14 +103,14 @@ def _link(
     inertia: np.ndarray | None = None,
     reference: np.ndarray | tuple[int, ...] = (0, 0, 0),
 ) -> str:
-    """Link without a body, or with a body (10,) about a reference point (3,)."""
+    """Link without a body, or with inertial parameters (10,) about a reference point (3,), m."""
     if inertia is None:
         return f'<link name="{name}"/>'
-    off, tensor = about_centre(inertia)
+    centre, tensor = about_centre(inertia)
     mass = inertia[0]
     (xx, xy, xz), (yy, yz), (zz,) = tensor[0], tensor[1, 1:], tensor[2, 2:]
     moments = f'ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="{xy}" ixz="{xz}" iyz="{yz}"'
-    place = f'<origin xyz="{_numbers(np.array(reference) + off)}"/>'
+    place = f'<origin xyz="{_numbers(np.array(reference) + centre)}"/>'
     return (
         f'<link name="{name}"><inertial>{place}<mass value="{mass}"/><inertia {moments}/>'
         "</inertial></link>"
@@ -124,21 +124,26 @@ def _joint(
     child: str,
     places: Places,
     axis: np.ndarray | tuple[int, ...] = (1, 0, 0),
-    turned: float = 0.0,
+    coordinate: float = 0.0,
     more: str = "",
 ) -> str:
-    """Joint that is where the child is at home, less the coordinate that it has there."""
-    at, axes = places[parent]
-    point, turn = places[child]
+    """Joint with a coordinate, rad or m, at home, where parent and child have their `places`.
+
+    `more` has further elements of the joint.
+    """
+    parent_origin, parent_axes = places[parent]
+    origin, axes = places[child]
     axis = np.array(axis, dtype=float)
+    # URDF needs the place of the child at coordinate zero
     if kind == "prismatic":
-        point = point - turned * turn @ axis
+        origin = origin - coordinate * axes @ axis
     else:
-        turn = turn @ Rotation.from_rotvec(-turned * axis).as_matrix()
-    angles = Rotation.from_matrix(axes.T @ turn).as_euler("xyz", suppress_warnings=True)
-    origin = f'<origin xyz="{_numbers(axes.T @ (point - at))}" rpy="{_numbers(angles)}"/>'
+        axes = axes @ Rotation.from_rotvec(-coordinate * axis).as_matrix()
+    angles = Rotation.from_matrix(parent_axes.T @ axes).as_euler("xyz", suppress_warnings=True)
+    xyz = _numbers(parent_axes.T @ (origin - parent_origin))
     ends = f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{_numbers(axis)}"/>'
-    return f'<joint name="{name}" type="{kind}">{origin}{ends}{more}</joint>'
+    place = f'<origin xyz="{xyz}" rpy="{_numbers(angles)}"/>'
+    return f'<joint name="{name}" type="{kind}">{place}{ends}{more}</joint>'
 
 
 def _numbers(values: np.ndarray) -> str:
