@@ -106,13 +106,13 @@ def _run_together(
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
         memory.task[name] = functions[name].address
     lanes = empty("lanes", sizes)
-    at = np.zeros((runs, 5), memory.evaluations.dtype)
+    evaluations = np.zeros((runs, 5), memory.evaluations.dtype)
     now = np.repeat(memory.now.reshape(1), runs).view(np.recarray)
     now["first_row"] = frames * np.arange(runs)
     lanes.shared = memory.now.known.inputs[2 * sizes.coordinates :]
     # lanes without a run use the first state, so that their numbers are valid
     lanes.states = np.tile(memory.now.state[: 2 * sizes.coordinates], (LANES, 1)).T
-    chosen(run_lanes, compiled)(memory.task, now, at, memory.tangent, plan, record, lanes)
+    chosen(run_lanes, compiled)(memory.task, now, evaluations, memory.tangent, plan, record, lanes)
     results: list[ClosedLoopRun | LoopFailure] = []
     unmeasured = np.full((frames, 6), np.nan)
     for lane, noise in enumerate(noises):
@@ -340,7 +340,7 @@ def _fill(
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
-    # the last inputs of a function are parameters and geometric numbers, which never change
+    # the last inputs are constant: parameters and geometric numbers, for all stages (columns) alike
     for inputs, function, constants in (
         (now.known.inputs, functions["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),

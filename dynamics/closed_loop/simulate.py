@@ -290,7 +290,7 @@ def differentiate_commands(
         As for `differentiate_servo`.
     directions : ndarray, shape (frames, n, k), optional
         Directions of the commands along which the poses are differentiated, too, at most
-        `most_directions`. They are not combined with `by_start`. With `times`, the direction of a
+        `most_directions`. They cannot be combined with `by_start`. With `times`, the direction of a
         row of NaN must be that of the command before.
     start_directions : ndarray, shape (n, k), optional
         The same for the last command from before the start. The default is zero.

@@ -109,10 +109,10 @@ class FunctionBody:
         values = GraphValues(self, graph, [])
         columns = [[""] * len(outputs) for outputs in graph.outputs]
         for group in lane_groups(graph):
-            for few in group.split(max(1, MOST_LANES // self._beside)):
-                width = lanes_for(len(few.lanes))
-                for row, vector in enumerate(self._group(few, values, width)):
-                    for lane, part in enumerate(few.lanes):
+            for part_group in group.split(max(1, MOST_LANES // self._beside)):
+                width = lanes_for(len(part_group.lanes))
+                for row, vector in enumerate(self._group(part_group, values, width)):
+                    for lane, part in enumerate(part_group.lanes):
                         columns[part][row] = self._entry(vector, lane, width)
         return columns
 
@@ -171,7 +171,9 @@ class FunctionBody:
     def _call(self, name: str, operands: list[str], kind: str) -> str:
         """Write a call, and return the name of its result."""
         self.called.add(f"{kind} @{name}({', '.join([kind] * len(operands))})")
-        return self.new(f"call {kind} @{name}({', '.join(f'{kind} {of}' for of in operands)})")
+        return self.new(
+            f"call {kind} @{name}({', '.join(f'{kind} {operand}' for operand in operands)})"
+        )
 
     def _vector(self, entries: list[str], width: int) -> str:
         """Vector of numbers, or of several numbers side by side for each entry.
@@ -206,20 +208,20 @@ class FunctionBody:
         filled = entries + entries[:1] * (width - len(entries))
         if all(entry.startswith("0x") for entry in filled):
             return f"<{', '.join(f'double {entry}' for entry in filled)}>"
-        if (known := self._vectors.get(tuple(filled))) is None:
-            known = "poison"
-            once = len(set(filled)) == 1
-            for lane, entry in enumerate(filled[: 1 if once else width]):
-                known = self.new(
-                    f"insertelement {type_name(width)} {known}, double {entry}, i64 {lane}"
+        if (vector := self._vectors.get(tuple(filled))) is None:
+            vector = "poison"
+            all_equal = len(set(filled)) == 1
+            for lane, entry in enumerate(filled[: 1 if all_equal else width]):
+                vector = self.new(
+                    f"insertelement {type_name(width)} {vector}, double {entry}, i64 {lane}"
                 )
-            if once:
+            if all_equal:
                 mask = f"<{width} x i32> zeroinitializer"
-                known = self.new(
-                    f"shufflevector {type_name(width)} {known}, {type_name(width)} poison, {mask}"
+                vector = self.new(
+                    f"shufflevector {type_name(width)} {vector}, {type_name(width)} poison, {mask}"
                 )
-            self._vectors[tuple(filled)] = known
-        return known
+            self._vectors[tuple(filled)] = vector
+        return vector
 
     def _entry(self, vector: str, part: int, width: int) -> str:
         """Number of a part in a vector, or its numbers side by side."""

@@ -182,17 +182,17 @@ def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Grap
 def lane_groups(graph: Graph) -> list[Group]:
     """Sort the parts, which are the outputs of a graph, into groups of parts that are alike."""
     everywhere = _needed_by(graph)
-    alike: dict[str, list[tuple[int, Group]]] = {}
+    alike: dict[str, list[Group]] = {}
     for part, outputs in enumerate(graph.outputs):
-        lone = _own_steps(graph, everywhere, part, outputs)
+        single = _own_steps(graph, everywhere, part, outputs)
         form = repr(
             [
                 (name, [_form(k) for k in operands])
-                for name, operands in [*lone.steps, ("", lone.outputs)]
+                for name, operands in [*single.steps, ("", single.outputs)]
             ]
         )
-        alike.setdefault(form, []).append((part, lone))
-    return [_together(group) for group in alike.values()]
+        alike.setdefault(form, []).append(single)
+    return [_together(singles) for singles in alike.values()]
 
 
 def _needed_by(graph: Graph) -> list[bool]:
@@ -245,16 +245,14 @@ def _form(operand: Operand) -> int:
     return operand if isinstance(operand, int) else -1
 
 
-def _together(group: list[tuple[int, Group]]) -> Group:
-    """Group of parts that are alike, from the number and the steps of each part."""
-    parts = [lane for _, lane in group]
-    names = [name for name, _ in parts[0].steps]
-    operands = [
-        _across(of) for of in zip(*[[of for _, of in lane.steps] for lane in parts], strict=True)
-    ]
-    lanes = tuple(part for part, _ in group)
+def _together(singles: list[Group]) -> Group:
+    """Group of parts that are alike, from groups of one lane each."""
+    names = [name for name, _ in singles[0].steps]
+    operands = [[operands for _, operands in single.steps] for single in singles]
     return Group(
-        lanes, list(zip(names, operands, strict=True)), _across([lane.outputs for lane in parts])
+        tuple(single.lanes[0] for single in singles),
+        list(zip(names, map(_across, zip(*operands, strict=True)), strict=True)),
+        _across([single.outputs for single in singles]),
     )
 
 

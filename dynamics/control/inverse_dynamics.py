@@ -71,7 +71,7 @@ class Model:
     friction : FrictionLaw
         Law of joint friction.
     doubt : float
-        Expected rate of change of the errors of the torques, relative to the torque at rest, 1/s.
+        Expected rate at which errors of torques change, relative to the torque at rest, 1/s.
 
     Examples
     --------

@@ -106,45 +106,45 @@ class Observer:
         """Set state and covariance at the start."""
         blocks = self._prediction.blocks
         robot = self._model.robot
-        torque = robot.static_torque(pose, self._model.dynamic)
+        static_torque = robot.static_torque(pose, self._model.dynamic)
         basis = robot.geometry.chart.basis
         self._state = np.zeros(blocks.size)
         self._state[blocks.coordinates] = robot.coordinates(pose)
         if self._drives.torques:
-            self._state[blocks.torque] = torque - holding
+            self._state[blocks.torque] = static_torque - holding
         else:
             self._state[blocks.integral] = self._model.held(pose, self._drives)[1]
-        scale = np.abs(torque).mean()
-        # The random walk changes as much per frame period as the error of the model, whose change
-        # is smooth along a motion.
+        torque_scale = np.abs(static_torque).mean()
+        # The random walk changes as much in a frame period as the error of the model, which
+        # changes smoothly along a motion.
         walk = np.zeros(blocks.size)
-        doubt = np.zeros(blocks.size)
-        factor = TORQUE_COMMAND_FACTOR if self._drives.torques else 1.0
-        walk[blocks.torque] = factor * self._model.doubt * scale * np.sqrt(self._period)
+        deviation = np.zeros(blocks.size)
+        model_error = TORQUE_COMMAND_FACTOR if self._drives.torques else 1.0
+        walk[blocks.torque] = model_error * self._model.doubt * torque_scale * np.sqrt(self._period)
         self._walk = np.diag(walk**2)
         jacobian = robot.coordinate_jacobian(pose)
         mass = basis.T @ robot.mass_matrix(pose, self._model.dynamic) @ basis
         # inertia at each joint while the other joints are free
         inertia = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
-        doubt[blocks.coordinates] = PLACE_DOUBT
-        doubt[blocks.rates] = RATE_DOUBT
-        doubt[blocks.torque] = TORQUE_DOUBT * scale
-        doubt[blocks.viscous] = VISCOUS_DOUBT * inertia
-        self._covariance = np.diag(doubt**2)
+        deviation[blocks.coordinates] = PLACE_DOUBT
+        deviation[blocks.rates] = RATE_DOUBT
+        deviation[blocks.torque] = TORQUE_DOUBT * torque_scale
+        deviation[blocks.viscous] = VISCOUS_DOUBT * inertia
+        self._covariance = np.diag(deviation**2)
         self._covariance[blocks.offset, blocks.offset] = basis.T @ common @ basis
         # the offset of the sensor is in every measured pose
         self._output_map = np.zeros((len(mass), blocks.size))
         self._output_map[:, blocks.coordinates] = np.eye(len(mass))
         self._output_map[:, blocks.offset] = np.eye(len(mass))
-        # derivatives of the covariance with respect to the logarithms of the two scales
+        self._log_scales = np.zeros(2)
+        # derivatives of the covariance with respect to the logarithms of the scales
         self._by_scale = np.zeros((2, blocks.size, blocks.size))
-        self._scale = np.zeros(2)
         self._information = np.diag(PRIOR_INFORMATION)
 
     @property
     def scales(self) -> np.ndarray:
         """Estimated factors (2,) of the covariances of the walk and of the sensor's noise."""
-        return np.exp(self._scale)
+        return np.exp(self._log_scales)
 
     @property
     def disturbance(self) -> np.ndarray:
@@ -200,7 +200,7 @@ class Observer:
         """Update the state, the covariance and the scales by measured coordinates (m,)."""
         output_map = self._output_map
         basis = self._model.robot.geometry.chart.basis
-        noise = np.exp(self._scale[1]) * basis.T @ noise @ basis
+        noise = np.exp(self._log_scales[1]) * basis.T @ noise @ basis
         innovation = measured - output_map @ self._state
         inverse = np.linalg.inv(output_map @ self._covariance @ output_map.T + noise)
         by_scale = output_map @ self._by_scale @ output_map.T
@@ -226,7 +226,8 @@ class Observer:
         self._by_scale = remaining @ self._by_scale @ remaining.T
         self._by_scale[1] += gain @ noise @ gain.T
         # a step of at most a half in the logarithm, because the gradient of one frame is noisy
-        self._scale = self._scale + np.clip(np.linalg.solve(self._information, gradient), -0.5, 0.5)
+        step = np.linalg.solve(self._information, gradient)
+        self._log_scales = self._log_scales + np.clip(step, -0.5, 0.5)
 
     def _moved(
         self, time: float, state: np.ndarray, covariance: np.ndarray, by_scale: np.ndarray | None
@@ -245,7 +246,7 @@ class Observer:
             end = at + (until - at) / np.ceil((until - at) / LONGEST_STEP)
             command, rate = self._acting((at + end) / 2)
             state, errors = self._prediction.step(state, covariance, command, rate, end - at)
-            walked = np.exp(self._scale[0]) * (end - at) * self._walk
+            walked = np.exp(self._log_scales[0]) * (end - at) * self._walk
             covariance = errors @ covariance @ errors.T + walked
             if by_scale is not None:
                 by_scale[:] = errors @ by_scale @ errors.T

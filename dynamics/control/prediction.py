@@ -99,8 +99,8 @@ class Prediction:
         A step in which a joint comes to rest or breaks away is halved until this changes its
         velocity by less than the standard deviation of the velocity.
         """
-        after, errors, turns = self._once(state, covariance, command, command_rate, length)
-        if not turns or length < SHORTEST_HALVED:
+        after, errors, too_long = self._once(state, covariance, command, command_rate, length)
+        if not too_long or length < SHORTEST_HALVED:
             return after, errors
         midway, first = self.step(state, covariance, command, command_rate, length / 2)
         after, second = self.step(
@@ -127,25 +127,26 @@ class Prediction:
             return after, errors, False
         by_rates = jacobian @ errors[blocks.rates]
         velocity = jacobian @ after[blocks.rates]
-        # effect of a torque over the step
-        pushed = errors[blocks.moving, blocks.torque]
-        turned = jacobian @ pushed[blocks.rates]
+        # change of state and of joint velocities by a torque over the step
+        state_by_torque = errors[blocks.moving, blocks.torque]
+        velocity_by_torque = jacobian @ state_by_torque[blocks.rates]
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
-        level, gains = expected_dry_friction(velocity, width, turned, largest, smooth)
+        level, gains = expected_dry_friction(velocity, width, velocity_by_torque, largest, smooth)
         # friction at one joint changes the velocities, and thus the friction, of the others
         gain = np.linalg.solve(
-            np.eye(len(level)) + gains[:, None] * (turned - np.diag(np.diag(turned))),
+            np.eye(len(level))
+            + gains[:, None] * (velocity_by_torque - np.diag(np.diag(velocity_by_torque))),
             np.diag(gains),
         )
-        after[blocks.moving] -= pushed @ level
-        errors[blocks.moving] -= pushed @ gain @ by_rates
-        moved = np.maximum(
+        after[blocks.moving] -= state_by_torque @ level
+        errors[blocks.moving] -= state_by_torque @ gain @ by_rates
+        speed = np.maximum(
             np.abs(jacobian @ state[blocks.rates]), np.abs(jacobian @ after[blocks.rates])
         )
         # velocity that additional friction could remove
-        unused = np.diag(turned) * (largest - np.abs(level))
-        return after, errors, bool((np.minimum(moved, unused) > width).any())
+        unused = np.diag(velocity_by_torque) * (largest - np.abs(level))
+        return after, errors, bool((np.minimum(speed, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
         """Largest dry friction (n,) at joint velocities, and the velocity of its change of sign."""
@@ -168,12 +169,12 @@ class Prediction:
         augmented = np.zeros((by_state.shape[1] + 1, by_state.shape[1] + 1))
         augmented[moving, :-1] = length * by_state
         augmented[moving, -1] = length * slope
-        moved = expm(augmented)
+        transition = expm(augmented)
         after = state.copy()
         errors = np.eye(self.blocks.size)
-        after[moving] += moved[moving, -1]
-        errors[moving, moving] = moved[moving, moving]
-        errors[moving, constant] = moved[moving, constant]
+        after[moving] += transition[moving, -1]
+        errors[moving, moving] = transition[moving, moving]
+        errors[moving, constant] = transition[moving, constant]
         return after, errors, jacobian
 
     def _slope(
@@ -185,7 +186,7 @@ class Prediction:
         """
         blocks = self.blocks
         law = self._law
-        pid = not self._drives.torques
+        by_pid = not self._drives.torques
         li = law.li
         ld = law.ld
         stiffness = law.lp + law.lx
@@ -197,7 +198,7 @@ class Prediction:
         velocity = jacobian @ rate
         error = command - angle[:, 0]
         by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
-        torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
+        torque = by_error + ld * (law.rate_weight * command_rate - velocity) if by_pid else command
         limit = self._drives.torque_limit
         integral_rate = error
         if limit is not None:
@@ -206,49 +207,49 @@ class Prediction:
             integral_rate = np.where(winds_up, law.lx * velocity / np.where(li, li, 1.0), error)
             torque = np.clip(torque, -limit, limit)
         push = np.linalg.solve(mass, jacobian.T)
-        falling = np.linalg.solve(mass, bias[:, 0])
+        bias_acceleration = np.linalg.solve(mass, bias[:, 0])
         viscous = self._viscous + state[blocks.viscous]
         net = torque + state[blocks.torque] - viscous * velocity
-        acceleration = push @ net - falling
+        acceleration = push @ net - bias_acceleration
         arguments = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*arguments))
         # the derivative of the joint accelerations with respect to the rates is 2 J_theta_dot
-        damping = (ld * pid + viscous)[:, None]
+        damping = (ld * by_pid + viscous)[:, None]
         by_state = np.zeros((blocks.moving.stop, blocks.offset.start))
         by_state[blocks.coordinates, blocks.rates] = np.eye(len(rate))
-        of_rates = by_state[blocks.rates]
-        of_rates[:, blocks.coordinates] = push @ (
-            (-stiffness * pid)[:, None] * jacobian - damping * (turning / 2)
+        rate_rows = by_state[blocks.rates]
+        rate_rows[:, blocks.coordinates] = push @ (
+            (-stiffness * by_pid)[:, None] * jacobian - damping * (turning / 2)
         )
-        of_rates[:, blocks.coordinates] -= np.linalg.solve(mass, by_q)
-        of_rates[:, blocks.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
-        of_rates[:, blocks.integral] = li * pid * push
-        of_rates[:, blocks.torque] = push
-        of_rates[:, blocks.viscous] = -push * velocity
-        by_state[blocks.integral, blocks.coordinates] = -pid * jacobian
-        return np.concatenate([rate, acceleration, pid * integral_rate]), by_state, jacobian
+        rate_rows[:, blocks.coordinates] -= np.linalg.solve(mass, by_q)
+        rate_rows[:, blocks.rates] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
+        rate_rows[:, blocks.integral] = li * by_pid * push
+        rate_rows[:, blocks.torque] = push
+        rate_rows[:, blocks.viscous] = -push * velocity
+        by_state[blocks.integral, blocks.coordinates] = -by_pid * jacobian
+        return np.concatenate([rate, acceleration, by_pid * integral_rate]), by_state, jacobian
 
 
 def expected_dry_friction(
     velocity: np.ndarray,
     width: np.ndarray,
-    turned: np.ndarray,
+    velocity_by_torque: np.ndarray,
     largest: np.ndarray,
     smooth: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected dry friction (n,) over a step, and its gain (n,) for errors of the joint velocities.
 
     `velocity` (n,) is the velocity after the step without dry friction. Its errors are normal, with
-    standard deviations `width` (n,). `turned` (n, n) is the change of the velocities by a torque
-    over the step, and `largest` (n,) is the largest torque. The torque changes its sign over the
-    velocity `smooth`.
+    standard deviations `width` (n,). `velocity_by_torque` (n, n) is the change of the velocities by
+    a torque over the step, and `largest` (n,) is the largest torque. The torque changes its sign
+    over the velocity `smooth`.
 
     With this gain, propagated errors have the variance of the velocity after dry friction, which
     stops a part of the distribution. The slope of the expected torque would give another variance.
     """
-    own_effect = np.diag(turned)
+    own_effect = np.diag(velocity_by_torque)
     reach = np.maximum(own_effect * largest + smooth, LEAST_REACH * width)
-    others = turned - np.diag(own_effect)
+    others = velocity_by_torque - np.diag(own_effect)
     # Newton's method; in its initial guess, each joint slips or rests as if it were alone
     level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
     for _ in range(MOST_ITERATIONS):

@@ -57,7 +57,7 @@ def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnF
 
 
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
-    """Function of the derivatives of the slope of a state, and of the net torque of joints.
+    """Function for the derivatives of the slope of a state, and of the net joint torques.
 
     No joint sticks here, and the platform has m coordinates. All columns share the following inputs
     of one stage (stages are side by side in memory): the outputs of `motion_derivatives`; J_theta
@@ -66,8 +66,9 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     integral of the error, and the rate of the command.
 
     The inputs of each column are the derivatives of pose and rate (m,), of joint integral, command
-    and its rate (n,), and, at a fixed state, of -M q_ddot - b (m,) and of the torque (n,). Its
-    outputs are the derivatives of rate, acceleration (m,), command error and torque (n,).
+    and command rate (n,), and, at a fixed state, of -M q_ddot - b (m,), here `push`, and of the
+    torque (n,), here `direct`. The outputs of a column are the derivatives of rate, acceleration
+    (m,), command error and torque (n,).
     """
     n = layout.joints
     by_pose, by_rate, factor = (ca.SX.sym(name, m, m) for name in ("by_pose", "by_rate", "factor"))

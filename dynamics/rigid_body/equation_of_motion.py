@@ -77,17 +77,17 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     twist_dot = twist_bias(pose, pose_rate)
     twist_map = to_twist @ basis
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
-    legs, sides = _legs(geometry)
+    legs, branches = _legs(geometry)
     parts = []
     for number, (leg, arm) in enumerate(zip(legs, platform_arms(geometry, pose), strict=True)):
-        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        bodies = [rigid[body] for body in layout.leg_slices(number)]
         position = pose[0:3] + arm
-        moving = joint_motion(arm, twist, twist_dot)
+        motion = joint_motion(arm, twist, twist_dot)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         mass = symmetric_from_lower(to_joint.T @ leg.mass(position, bodies) @ to_joint)
-        force = leg.force(position, *moving, bodies, gravity)
+        force = leg.force(position, *motion, bodies, gravity)
         row = leg.gradient(position).T @ to_joint @ twist_map
-        joint = [leg.acceleration(position, *moving), leg.coordinate(position), row @ rate]
+        joint = [leg.acceleration(position, *motion), leg.coordinate(position), row @ rate]
         parts.append([mass, ca.vertcat(force, ca.cross(arm, force)), row, *joint])
     platform = rigid[layout.body_slices[0]]
     mass = platform_mass(pose, platform)
@@ -107,13 +107,13 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
             factored(total),
         ]
 
-    return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides)
+    return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, branches)
 
 
 def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
     """Function q (m,) -> J_theta (n, m), which the servo needs at a measured pose."""
     (q,) = _coordinates(geometry, "q")
-    legs, sides = _legs(geometry)
+    legs, branches = _legs(geometry)
     pose = _poses(geometry, q, 0 * q, 0 * q)[0]
     twist_map = pose_rate_to_twist(pose) @ pose_basis(geometry)
     parts = []
@@ -124,7 +124,7 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
     def end(rows: Sequence[ca.SX]) -> list[ca.SX]:
         return [ca.vertcat(*rows)]
 
-    return _parted("servo_jacobian", [q, *geometry.symbols], parts, end, sides)
+    return _parted("servo_jacobian", [q, *geometry.symbols], parts, end, branches)
 
 
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
@@ -149,7 +149,7 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
     the joint accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot.
     The solution for q_ddot itself is never differentiated.
     """
-    q, rate, acceleration = _coordinates(geometry, "q", "rate", "gain")
+    q, rate, acceleration = _coordinates(geometry, "q", "rate", "acceleration")
     motion = _poses(geometry, q, rate, acceleration)
     return _derivatives(
         "motion_derivatives", geometry, [q, rate, acceleration], motion, ca.DM(geometry.gravity)
@@ -184,22 +184,22 @@ def _derivatives(
     torque = ca.SX.sym("torque", layout.joints)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
     joints = _joints(geometry)
-    legs, sides = _legs(geometry)
+    legs, branches = _legs(geometry)
     parts = []
     for number, leg in enumerate(legs):
-        bodies = [rigid[one] for one in layout.leg_slices(number)]
+        bodies = [rigid[body] for body in layout.leg_slices(number)]
         gradient = joints.gradient[number]
-        local, net_force, force, joint = _leg_derivatives(
+        leg_columns, net_force, force, theta_ddot = _leg_derivatives(
             leg, joints.of(number), torque[number], bodies, gravity
         )
         by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
         by_rate = gradient.T @ _by_rate(force, joints, number)
-        derivatives = _by_pose(joint, joints, number), _by_rate(joint, joints, number)
         of_leg = [
             basis.T @ by_pose @ basis,
             basis.T @ by_rate @ basis,
-            basis.T @ gradient.T @ local,
-            *(derivative @ basis for derivative in derivatives),
+            basis.T @ gradient.T @ leg_columns,
+            _by_pose(theta_ddot, joints, number) @ basis,
+            _by_rate(theta_ddot, joints, number) @ basis,
         ]
         parts.append(of_leg[:count])
     platform = _platform_columns(joints, gravity, layout.full[0])
@@ -213,32 +213,34 @@ def _derivatives(
             geometry, joints.pose, to_twist @ joints.rate
         )
         wrench += passive @ rigid[layout.passive]
-    by_platform = [basis.T @ ca.jacobian(wrench, of) @ basis for of in joints.symbols[:2]]
+    by_pose_and_rate = [
+        basis.T @ ca.jacobian(wrench, symbol) @ basis for symbol in joints.symbols[:2]
+    ]
 
     def end(
         by_pose: Sequence[ca.SX],
         by_rate: Sequence[ca.SX],
-        local: Sequence[ca.SX],
+        leg_columns: Sequence[ca.SX],
         *of_joints: Sequence[ca.SX],
     ) -> list[ca.SX]:
         columns = ca.SX.zeros(basis.shape[1], layout.rigid.stop)
         columns[:, of_platform] = basis.T @ platform
         if passive.shape[1]:
             columns[:, layout.passive] = basis.T @ passive
-        for number, of_leg in enumerate(local):
+        for number, of_leg in enumerate(leg_columns):
             slices = layout.leg_slices(number)
             ends = np.cumsum([0, *(rows.stop - rows.start for rows in slices)]).tolist()
             for rows, part in zip(slices, ca.horzsplit(of_leg, ends), strict=True):
                 columns[:, rows] = part
         return [
-            sum(by_pose, by_platform[0]),
-            sum(by_rate, by_platform[1]),
+            sum(by_pose, by_pose_and_rate[0]),
+            sum(by_rate, by_pose_and_rate[1]),
             columns,
             *(ca.vertcat(*rows) for rows in of_joints),
         ]
 
     inputs = [*coordinates, torque, rigid, *geometry.symbols]
-    return _parted(name, inputs, parts, end, sides, (joints.symbols, motion))
+    return _parted(name, inputs, parts, end, branches, (joints.symbols, motion))
 
 
 def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
@@ -254,8 +256,9 @@ def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
             ca.jacobian(gradient, position), position, joints.position[number]
         )
         at_joint = ca.substitute(gradient, position, joints.position[number])
-        along = joints.velocity[number].T @ curvature @ joints.gradient[number]
-        rows.append(at_joint.T @ joints.gradient_rate[number] + along)
+        # the velocity of A and the gradient of the leg both depend on q
+        by_gradient = joints.velocity[number].T @ curvature @ joints.gradient[number]
+        rows.append(at_joint.T @ joints.gradient_rate[number] + by_gradient)
     outputs = [ca.vertcat(*rows) @ pose_basis(geometry)]
     return function(
         "rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion)
@@ -279,7 +282,7 @@ def _poses(
 def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
     """Motion of the joints A, with symbols for pose, rate and acceleration."""
     return PlatformJointMotion(
-        geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")]
+        geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration")]
     )
 
 
@@ -288,44 +291,45 @@ def _parted(
     inputs: list[ca.SX],
     parts: list[list[ca.SX]],
     end: Callable[..., list[ca.SX]],
-    sides: tuple[ca.SX, np.ndarray],
-    at: tuple[Sequence[ca.SX], Sequence[ca.SX]] = ((), ()),
+    branches: tuple[ca.SX, np.ndarray],
+    substitution: tuple[Sequence[ca.SX], Sequence[ca.SX]] = ((), ()),
 ) -> PartedFunction:
     """Function that consists of expressions of each leg, and of expressions that depend on them.
 
-    `end` is called with the first expression of all legs, then the second, and so on. The symbols
-    at[0] are replaced by the expressions at[1].
+    `end` is called with the first expression of all legs, then the second, and so on. `branches`
+    are those of `_legs`. `substitution` has symbols and the expressions that replace them.
     """
-    columns = [ca.vertcat(*(ca.densify(ca.vec(one)) for one in part)) for part in parts]
+    old, new = map(list, substitution)
+    columns = [ca.vertcat(*(ca.densify(ca.vec(entry)) for entry in part)) for part in parts]
     symbols = [
         ca.SX.sym(f"leg{number}", column.numel()) for number, column in enumerate(columns, 1)
     ]
     outputs = end(*zip(*map(_shaped, symbols, parts), strict=True))
     return PartedFunction(
-        function(f"{name}_parts", [*inputs, sides[0]], ca.substitute(columns, *map(list, at))),
-        function(name, [*inputs, *symbols], ca.substitute(outputs, *map(list, at))),
-        sides[1],
+        function(f"{name}_parts", [*inputs, branches[0]], ca.substitute(columns, old, new)),
+        function(name, [*inputs, *symbols], ca.substitute(outputs, old, new)),
+        branches[1],
     )
 
 
 def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
-    """Split a column into matrices of the same shapes as others."""
-    ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
+    """Split a column into matrices of the same shapes as those of `like`."""
+    ends = np.cumsum([0, *(matrix.numel() for matrix in like)]).tolist()
     return [
-        ca.reshape(own, *one.shape)
-        for own, one in zip(ca.vertsplit(column, ends), like, strict=True)
+        ca.reshape(entries, *matrix.shape)
+        for entries, matrix in zip(ca.vertsplit(column, ends), like, strict=True)
     ]
 
 
 def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
-    """Legs with symbols for their branches, and these symbols with their values.
+    """Legs with symbols for the signs of their branches, and the symbols with their values.
 
-    Legs that differ only in this sign then have the same expressions.
+    Legs that differ only in their branch then have the same expressions.
     """
-    sides = ca.SX.sym("sides", len(geometry.legs))
-    pairs = zip(geometry.legs, ca.vertsplit(sides), strict=True)
+    symbols = ca.SX.sym("sides", len(geometry.legs))
+    pairs = zip(geometry.legs, ca.vertsplit(symbols), strict=True)
     values = np.array([leg.side for leg in geometry.legs], dtype=float)
-    return [leg.model_copy(update={"branch": side}) for leg, side in pairs], (sides, values)
+    return [leg.model_copy(update={"branch": symbol}) for leg, symbol in pairs], (symbols, values)
 
 
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
@@ -348,21 +352,21 @@ def _leg_derivatives(
     position, velocity, acceleration = (
         ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")
     )
-    moving = leg.force(position, velocity, acceleration, bodies, gravity)
-    units = [ca.SX.sym("parameters", own.numel()) for own in bodies]
-    linear = leg.force(position, velocity, acceleration, units, gravity)
-    columns = ca.jacobian(linear, ca.vertcat(*units))
-    force = moving - leg.gradient(position) * torque
+    load = leg.force(position, velocity, acceleration, bodies, gravity)
+    parameters = [ca.SX.sym("parameters", body.numel()) for body in bodies]
+    load_of_parameters = leg.force(position, velocity, acceleration, parameters, gravity)
+    columns = ca.jacobian(load_of_parameters, ca.vertcat(*parameters))
+    force = load - leg.gradient(position) * torque
     by_acceleration = leg.mass(position, bodies)
-    joint = leg.acceleration(position, velocity, acceleration)
+    theta_ddot = leg.acceleration(position, velocity, acceleration)
     expressions = [
         columns,
         force,
         ca.jacobian(force, position),
         ca.jacobian(force, velocity),
         by_acceleration,
-        ca.jacobian(joint, position),
-        ca.jacobian(joint, velocity),
+        ca.jacobian(theta_ddot, position),
+        ca.jacobian(theta_ddot, velocity),
         leg.gradient(position).T,
     ]
     inputs = [position, velocity, acceleration]

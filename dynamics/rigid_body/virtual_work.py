@@ -47,14 +47,14 @@ def rigid_body_regressor(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
         slices = layout.leg_slices(number)
-        bodies = [ca.SX.sym("parameters", own.stop - own.start) for own in slices]
+        bodies = [ca.SX.sym("parameters", body.stop - body.start) for body in slices]
         force = leg.force(pose[0:3] + arm, *joint_motion(arm, twist, twist_dot), bodies, gravity)
         # the force is linear in the parameters
         forces = ca.jacobian(force, ca.vertcat(*bodies))
         wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
         ends = np.cumsum([0, *(body.numel() for body in bodies)]).tolist()
-        for own, wrench in zip(slices, ca.horzsplit(wrenches, ends), strict=True):
-            columns[:, own] = wrench
+        for body, wrench in zip(slices, ca.horzsplit(wrenches, ends), strict=True):
+            columns[:, body] = wrench
     columns[:, layout.passive] = passive_friction_columns(geometry, pose, twist)
     return columns
 
@@ -98,7 +98,7 @@ def inertial_wrench(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
         motion = joint_motion(arm, twist, twist_dot)
-        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        bodies = [rigid[body] for body in layout.leg_slices(number)]
         force = leg.force(pose[0:3] + arm, *motion, bodies, gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
     return total
@@ -111,7 +111,7 @@ def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
-        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        bodies = [rigid[body] for body in layout.leg_slices(number)]
         at_joint = leg.mass(pose[0:3] + arm, bodies)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
@@ -134,7 +134,7 @@ def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.
     for number, (leg, arm) in enumerate(
         zip(geometry.legs, platform_arms(geometry, pose), strict=True)
     ):
-        bodies = [rigid[own] for own in layout.leg_slices(number)]
+        bodies = [rigid[body] for body in layout.leg_slices(number)]
         position = pose[0:3] + arm
         coriolis = leg.coriolis(position, twist[0:3] + ca.cross(omega, arm), bodies)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
