@@ -23,7 +23,7 @@ from identify.reporting.figures.overview import overview_figure
 from identify.reporting.figures.paths import excitation_figure
 from identify.reporting.figures.style import COMPONENTS, WIDTH
 from identify.reporting.run_data import RunData
-from identify.scene import StereoView, View, Workcell, scene_figure, workcell
+from identify.scene import StereoView, Viewpoint, Workcell, scene_figure, workcell
 from identify.scene.drawings import draw_scene
 from identify.verification.against_mujoco import PAPER, figure_8, judge
 
@@ -114,7 +114,7 @@ def _instants(cell: Workcell, times: Array, poses: Array) -> Figure:
     figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
     panels = figure.subplots(2, 3).ravel()
     for axes, time, pose in zip(panels, times, poses, strict=True):
-        draw_scene(axes, cell, pose, View(), rays=False, labels=False)
+        draw_scene(axes, cell, pose, Viewpoint(), rays=False, labels=False)
         axes.set_title(f"{time:.1f} s")
     return figure
 

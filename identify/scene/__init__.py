@@ -8,7 +8,7 @@
 
 from identify.scene.camera_images import Found, StereoView, stereo_view
 from identify.scene.drawings import overview_figure, scene_figure, stereo_figure
-from identify.scene.painter import View
+from identify.scene.painter import Viewpoint
 from identify.scene.replay import write_page
 from identify.scene.replayed_motion import Motion, motion_at_home, read_motion
 from identify.scene.workcell import Solid, ViewingCamera, Workcell, workcell
@@ -18,8 +18,8 @@ __all__ = [
     "Motion",
     "Solid",
     "StereoView",
-    "View",
     "ViewingCamera",
+    "Viewpoint",
     "Workcell",
     "motion_at_home",
     "overview_figure",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cmmsim.geometry.pose import apply
 from identify.arrays import Array
 from identify.scene.camera_images import StereoView
-from identify.scene.painter import Painter, View, extent, tube
+from identify.scene.painter import Painter, Viewpoint, extent, tube
 from identify.scene.workcell import Solid, ViewingCamera, Workcell
 
 SOLIDS = {"platform": "#a9bdd0", "base": "#b8b3a6"}
@@ -44,7 +44,7 @@ def scene_figure(
     cell: Workcell,
     pose: Array | None = None,
     *,
-    view: View | None = None,
+    viewpoint: Viewpoint | None = None,
     size: tuple[float, float] = (7.0, 5.0),
     rays: bool = True,
     labels: bool = True,
@@ -59,7 +59,7 @@ def scene_figure(
     ----------
     pose
         Pose (6,) of the platform [m, rad], by default home.
-    view
+    viewpoint
         Direction from which the scene is seen.
     size
         Width and height, in inches.
@@ -67,7 +67,7 @@ def scene_figure(
         Whether rays and labels are drawn.
     """
     figure = Figure(figsize=size, layout="constrained")
-    draw_scene(figure.add_subplot(), cell, _at(cell, pose), view or View(), rays, labels)
+    draw_scene(figure.add_subplot(), cell, _at(cell, pose), viewpoint or Viewpoint(), rays, labels)
     return figure
 
 
@@ -90,18 +90,18 @@ def overview_figure(
     cell: Workcell,
     view: StereoView,
     *,
-    towards: View | None = None,
+    viewpoint: Viewpoint | None = None,
     size: tuple[float, float] = (10.0, 5.2),
     arrows: float | None = None,
 ) -> Figure:
     """Draw the scene, and beside it both camera images with the detected ellipses.
 
-    The scene has the pose of ``view``, and is seen from the direction ``towards``. For ``size`` and
+    The scene has the pose of ``view``, and is seen from ``viewpoint``. For ``size`` and
     ``arrows`` see `stereo_figure`. Raises dynamics.UnreachablePoseError or dynamics.ChartError.
     """
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplot_mosaic([["scene", "left"], ["scene", "right"]], width_ratios=[2.6, 1.0])
-    draw_scene(panels["scene"], cell, view.pose, towards or View(), rays=True, labels=True)
+    draw_scene(panels["scene"], cell, view.pose, viewpoint or Viewpoint(), rays=True, labels=True)
     for side, name in enumerate(SIDES):
         draw_image(panels[name], view, side, arrows)
         panels[name].set(xlabel="", xticks=[], yticks=[])
@@ -110,14 +110,14 @@ def overview_figure(
 
 
 def draw_scene(
-    axes: Axes, cell: Workcell, pose: Array, view: View, rays: bool, labels: bool
+    axes: Axes, cell: Workcell, pose: Array, viewpoint: Viewpoint, rays: bool, labels: bool
 ) -> None:
     """Draw a scene into axes, as `scene_figure` does."""
     placed = cell.placed(pose)
     rods = cell.rods(pose)
     solids = [apply(place, body.vertices) for body, place in placed]
     shown = [*solids, rods.reshape(-1, 3), *(camera.frustum(FRUSTUM_M) for camera in cell.cameras)]
-    painter = Painter(view, *extent(shown))
+    painter = Painter(viewpoint, *extent(shown))
     for body, place in placed:
         _solid(painter, body, place)
     for part, ends in zip(cell.parts, rods, strict=True):

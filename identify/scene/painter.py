@@ -28,7 +28,7 @@ SHADE = 0.62
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """Direction and distance from which a scene is seen.
 
     The azimuth is the angle from the x axis about z. The distance is measured from the middle of
@@ -46,14 +46,14 @@ class Painter:
     Centre (3,) and size of the scene are in m.
     """
 
-    def __init__(self, view: View, centre: Array, size: float) -> None:
-        azimuth, elevation = np.deg2rad([view.azimuth_deg, view.elevation_deg])
+    def __init__(self, viewpoint: Viewpoint, centre: Array, size: float) -> None:
+        azimuth, elevation = np.deg2rad([viewpoint.azimuth_deg, viewpoint.elevation_deg])
         level = np.cos(elevation)
         back = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
         across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        self._eye = centre + view.distance * size * back
+        self._eye = centre + viewpoint.distance * size * back
         self._axes = np.column_stack([across, np.cross(back, across), back])
-        self._far = view.distance * size
+        self._far = viewpoint.distance * size
         self._piece = PIECE * size
         self._pieces: list[tuple[float, Array, tuple, tuple, float]] = []
 

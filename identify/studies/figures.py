@@ -20,7 +20,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from identify.arrays import Array
 from identify.files.atomic import figure_bytes, write_files
 from identify.reporting.figures import panel_grid
-from identify.studies.labels import axis_label, number, setting
+from identify.studies.labels import axis_label, setting, short_number
 from identify.studies.study_file import Law, Study
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
@@ -194,8 +194,8 @@ def map_figure(
             axes.text(
                 column, row, f"{value:.3g}", ha="center", va="center", color=ink, fontsize="small"
             )
-        axes.set_xticks(range(table.shape[1]), [number(value) for value in table.columns])
-        axes.set_yticks(range(table.shape[0]), [number(value) for value in table.index])
+        axes.set_xticks(range(table.shape[1]), [short_number(value) for value in table.columns])
+        axes.set_yticks(range(table.shape[0]), [short_number(value) for value in table.index])
         axes.set_xlabel(axis_label(paths[1], study))
         axes.set_ylabel(axis_label(paths[0], study))
         axes.spines[:].set_visible(False)
@@ -334,7 +334,7 @@ def scale(axes: Axes, factor: pd.Series) -> None:
             if factor.nunique() <= MOST_TICKS
             else _log_ticks(*axes.get_xlim())
         )
-        letters = max(len(number(float(value))) for value in levels)
+        letters = max(len(short_number(float(value))) for value in levels)
         room = 0.02 + LETTER * letters  # the longest number, and a gap
         _set_ticks(axes.xaxis, _far_apart(levels, *axes.get_xlim(), room))
     drawn = np.concatenate(
@@ -374,7 +374,7 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 def _set_ticks(axis: Axis, values: list[float]) -> None:
     axis.set_major_locator(FixedLocator(values))
-    axis.set_major_formatter(FuncFormatter(lambda value, place: number(float(value))))
+    axis.set_major_formatter(FuncFormatter(lambda value, place: short_number(float(value))))
     axis.set_minor_locator(NullLocator())
 
 

@@ -74,10 +74,10 @@ def axis_label(name: str, study: Study, per: str | None = None) -> str:
 
 def setting(path: str, value: object) -> str:
     """Return a factor and its value for a legend, such as "frame rate 10 Hz"."""
-    return " ".join(filter(None, (_plain_name(path), number(value), factor_unit(path))))
+    return " ".join(filter(None, (_plain_name(path), short_number(value), factor_unit(path))))
 
 
-def number(value: object) -> str:
+def short_number(value: object) -> str:
     """Format a float with four digits, or with all digits before the point if there are more."""
     if not isinstance(value, float):
         return str(value)

@@ -37,7 +37,7 @@ from identify.scene import (
     workcell,
 )
 from identify.scene.gltf import gltf
-from identify.scene.painter import Painter, View
+from identify.scene.painter import Painter, Viewpoint
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import changed_robot_file, rss6
 
@@ -125,7 +125,7 @@ def test_bodies_in_the_gltf_file_stand_where_the_robot_has_them(name):
 
 
 def test_what_is_nearer_hides_what_is_farther():
-    painter = Painter(View(0.0, 0.0), np.zeros(3), 1.0)  # looks along -x
+    painter = Painter(Viewpoint(0.0, 0.0), np.zeros(3), 1.0)  # looks along -x
     for x, colour in ((0.2, "#ff0000"), (-0.2, "#0000ff"), (0.0, "#00ff00")):
         box = trimesh.creation.box((0.05, 0.4, 0.4))
         painter.faces(box.vertices + np.array([x, 0, 0]), box.faces, colour)

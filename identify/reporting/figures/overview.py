@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from identify.arrays import Array
 from identify.reporting.figures.paths import round_down
 from identify.reporting.figures.style import WIDTH
-from identify.scene import StereoView, View, Workcell, stereo_figure
+from identify.scene import StereoView, Viewpoint, Workcell, stereo_figure
 from identify.scene.drawings import FOUND, SIDES, draw_scene, show_image
 
 OVERVIEW = (4.8, 4.9)
@@ -31,7 +31,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     beneath = 0.0 if view is None else BENEATH
     figure = Figure(figsize=(width, height * (1 - BENEATH + beneath)))
     axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
-    draw_scene(axes, cell, pose, View(), rays=True, labels=True)
+    draw_scene(axes, cell, pose, Viewpoint(), rays=True, labels=True)
     if view is not None:
         # The images are square, but coordinates are shares of a figure that is not.
         side = (beneath - 0.05) * height / width

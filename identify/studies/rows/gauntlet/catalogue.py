@@ -9,7 +9,7 @@ from identify.studies.rows.gauntlet.trouble import Draw, Laboratory, Trouble
 
 INSIDE: dict[str, Draw] = {
     "zero of a joint": mechanical.zero,
-    "geometry": mechanical.number,
+    "geometry": mechanical.geometric_number,
     "command scale": measured.scale,
     "latency": measured.latency,
     "clock drift": measured.drift,
@@ -23,7 +23,7 @@ INSIDE: dict[str, Draw] = {
     "products of inertia": bodies.products_of_inertia,
     "gross errors": measured.gross_errors,
     "stated noise": measured.stated_noise,
-    "several numbers of the geometry": mechanical.numbers,
+    "several numbers of the geometry": mechanical.geometric_numbers,
     "passive friction": mechanical.passive_friction,
     "centre of mass in the legs": bodies.centre_of_leg_bodies,
     "load that is not stated": bodies.load,

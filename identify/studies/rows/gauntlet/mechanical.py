@@ -63,7 +63,7 @@ def zero(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     )
 
 
-def number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+def geometric_number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw a number of the geometry that is off, other than a zero."""
     geometry = lab.robot.geometry
     places = [
@@ -88,7 +88,7 @@ def number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     )
 
 
-def numbers(lab: Laboratory, rng: np.random.Generator) -> Trouble:
+def geometric_numbers(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw several numbers of the geometry of one kind that are off, other than zeros."""
     geometry = lab.robot.geometry
     kinds: dict[str, list[int]] = {}
