@@ -61,7 +61,7 @@ def camera_matrix(values: Array) -> Array:
     return np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
 
 
-def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
+def computed_pixels(values: Array, points: Array) -> tuple[Array, Array, Array]:
     """Return the pixels (n, 2) of points (n, 3) in camera axes, and the pixels' derivatives.
 
     The derivatives are with respect to the intrinsics (n, 2, 9) and to the points (n, 2, 3), px/m.
@@ -147,13 +147,13 @@ class Adjustment:
 class _Normal:
     """Normal equations of each view.
 
-    ``matrix`` (v, s, s) and right-hand ``side`` (v, s) have s = c + 6 unknowns: first the c common
-    ones, then the pose of the view's board. ``residuals`` (m, 2) belong to each camera, px.
-    ``cost`` is the sum of the squared residuals of both cameras, px².
+    ``matrix`` (v, s, s) and the right-hand side ``rhs`` (v, s) have s = c + 6 unknowns: first the c
+    common ones, then the pose of the view's board. ``residuals`` are those of each camera (m, 2),
+    px. ``cost`` is the sum of the squared residuals of both cameras, px².
     """
 
     matrix: Array
-    side: Array
+    rhs: Array
     residuals: tuple[Array, Array]
     cost: float
 
@@ -174,21 +174,19 @@ class _Normal:
         common, mixed, boards = self.blocks(damping)
         eliminated = np.linalg.solve(boards, mixed.swapaxes(1, 2)).swapaxes(1, 2)
         matrix = np.asarray(common - eliminated @ mixed.swapaxes(1, 2), dtype=np.float64)
-        return matrix, self.side[:, COMMON] - np.einsum(
-            "vci,vi->vc", eliminated, self.side[:, BOARD]
-        )
+        return matrix, self.rhs[:, COMMON] - np.einsum("vci,vi->vc", eliminated, self.rhs[:, BOARD])
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Return the damped changes of the common unknowns (c,) and of the boards (v, 6)."""
-        matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
+        matrix, rhs = (part.sum(axis=0) for part in self.reduced(damping))
         # focal lengths and distortion terms differ by ten orders of magnitude; scaling to a unit
         # diagonal avoids a loss of digits
         scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
         common = (
-            scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+            scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * rhs, rcond=1e-15)[0]
         )
         _, mixed, boards = self.blocks(damping)
-        rest = self.side[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
+        rest = self.rhs[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
         return common, np.linalg.solve(boards, rest[..., None])[..., 0]
 
 
@@ -206,7 +204,7 @@ def adjust(
 
     state, steps = _minimise(build, start, free)
     normal = build(state)
-    size = normal.side.shape[1] - POSE
+    size = normal.rhs.shape[1] - POSE
     freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
     if freedom < 1:
         raise CalibrationError(
@@ -257,9 +255,7 @@ def _minimise(
             damping = max(0.1 * damping, 1e-12)
             if gain < SMALLEST_GAIN:
                 return state, step
-        elif (
-            damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost
-        ):
+        elif damping > 1e6 or abs(common @ normal.rhs[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost:
             # the linear model predicts almost no decrease, so the increase is a rounding error
             return state, step
         else:
@@ -280,7 +276,7 @@ def _normal_equations(
     views = len(state.left_from_boards)
     residuals = []
     matrix = np.zeros((views, common + POSE, common + POSE))
-    sides = np.zeros((views, common + POSE))
+    rhs = np.zeros((views, common + POSE))
     for side, seen in enumerate(sightings):
         computed, by_common, by_board = _predict(points, seen, state, side, free)
         error = seen.pixels - computed
@@ -294,12 +290,10 @@ def _normal_equations(
             matrix[v, COMMON, COMMON] += jc.T @ jc
             matrix[v, COMMON, BOARD] += jc.T @ jb
             matrix[v, BOARD, BOARD] += jb.T @ jb
-            sides[v, COMMON] += jc.T @ e
-            sides[v, BOARD] += jb.T @ e
+            rhs[v, COMMON] += jc.T @ e
+            rhs[v, BOARD] += jb.T @ e
     cost = float(sum(np.sum(r**2) for r in residuals))
-    return _Normal(
-        matrix, sides, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf
-    )
+    return _Normal(matrix, rhs, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf)
 
 
 def _predict(
@@ -311,9 +305,9 @@ def _predict(
     board (m, 2, 6).
     """
     k = free.shape[1]
-    moves = state.left_from_boards[seen.view]
-    turned = np.einsum("mij,mj->mi", moves[:, :3, :3], points[seen.point])
-    places = turned + moves[:, :3, 3]
+    left_from_board = state.left_from_boards[seen.view]
+    turned = np.einsum("mij,mj->mi", left_from_board[:, :3, :3], points[seen.point])
+    places = turned + left_from_board[:, :3, 3]
     place_by_board = np.concatenate(
         [np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2
     )
@@ -323,7 +317,7 @@ def _predict(
         places = apply(state.right_from_left, places)
         place_by_board = rotation @ place_by_board
     ahead = places[:, 2] > 1e-6
-    pixels, by_intrinsics, by_place = project(
+    pixels, by_intrinsics, by_place = computed_pixels(
         state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0])
     )
     # A step that puts a board behind a camera must not count as an improvement.

@@ -92,14 +92,14 @@ def _moments(shares: Array) -> tuple[float, float]:
     The views' shares W_v (v, c, c) add up to the unit matrix.
     """
     squares = shares @ shares
-    traced = float(np.einsum("vii->", squares))
+    trace_sum = float(np.einsum("vii->", squares))
     all_views = squares.sum(axis=0)
     variance = (
-        traced
+        trace_sum
         - 2.0 * float(np.einsum("vij,vji->", squares, shares))
         + float(np.sum(all_views * all_views.T))
     )
-    return shares.shape[1] - traced, 2.0 * variance
+    return shares.shape[1] - trace_sum, 2.0 * variance
 
 
 def _enlargement(pulls: Array, ratio: float) -> Array:
@@ -111,12 +111,12 @@ def _enlargement(pulls: Array, ratio: float) -> Array:
     views, size = pulls.shape
     sandwich = pulls.T @ pulls
     mean = np.trace(sandwich) / size
-    plain = mean * np.eye(size)
-    distance = np.sum((sandwich - plain) ** 2)
+    target = mean * np.eye(size)
+    distance = np.sum((sandwich - target) ** 2)
     outer = views * pulls[:, :, None] * pulls[:, None, :]
     scatter = np.sum((outer - sandwich) ** 2) / views**2
     weight = min(1.0, scatter / distance) if distance > 0.0 else 1.0
     eigenvalues, vectors = np.linalg.eigh(
-        (weight * plain + (1.0 - weight) * sandwich) * (ratio / mean)
+        (weight * target + (1.0 - weight) * sandwich) * (ratio / mean)
     )
     return np.asarray((vectors * np.maximum(eigenvalues, 1.0)) @ vectors.T)

@@ -146,11 +146,13 @@ def _read_alike(
     right_from_left (4, 4).
     """
     orders = board.symmetries
-    turned = [_symmetry_motion(board, order) for order in orders]
-    names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
-    places = np.stack([from_right[k] @ turned[j] @ invert(from_left[k]) for k, j in names])
+    symmetry_motions = [_symmetry_motion(board, order) for order in orders]
+    candidates = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
+    places = np.stack(
+        [from_right[k] @ symmetry_motions[j] @ invert(from_left[k]) for k, j in candidates]
+    )
     alike = _alike(places)
-    pair_of = np.array([k for k, _ in names])
+    pair_of = np.array([k for k, _ in candidates])
     support = np.array([len(set(pair_of[row])) for row in alike])
     angle = _angles(places, np.eye(3)[None])[:, 0]
     # Among orders with equal support, the one with the smallest angle between the cameras is most
@@ -162,14 +164,14 @@ def _read_alike(
             f"only {support[best]} of {count} pairs agree on the place of the right camera: the "
             "images of a pair were not taken together, or the folders are paired wrongly"
         )
-    chosen = {names[i][0]: i for i in np.flatnonzero(alike[best])}
+    chosen = {candidates[i][0]: i for i in np.flatnonzero(alike[best])}
     read = list(pairs)
     for k, pair in enumerate(pairs):
         if pair.both and k not in chosen:
             read[k] = PairView(pair.name, MISFIT, MISFIT)
         elif pair.both and not isinstance(pair.right, str):
             read[k] = PairView(
-                pair.name, pair.left, pair.right.read_as(orders[names[chosen[k]][1]])
+                pair.name, pair.left, pair.right.read_as(orders[candidates[chosen[k]][1]])
             )
     return read, from_right | {k: places[i] @ from_left[k] for k, i in chosen.items()}, places[best]
 

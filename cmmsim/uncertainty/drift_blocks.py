@@ -133,10 +133,13 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows
     move = geometry.camera_from_base
     arms = blocks[0].places @ move[:3, :3].T
     slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
-    across = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
-    rig_first = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
+    sticker_slopes = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
+    sticker_by_rig = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
     # derivatives of the taught places with respect to the rig
-    taught = np.linalg.solve(across.swapaxes(1, 2) @ across, across.swapaxes(1, 2) @ rig_first)
+    taught = np.linalg.solve(
+        sticker_slopes.swapaxes(1, 2) @ sticker_slopes,
+        sticker_slopes.swapaxes(1, 2) @ sticker_by_rig,
+    )
     by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
     residuals, roots = _whitened(geometry.rig, blocks)
     return Rows(

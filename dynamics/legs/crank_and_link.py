@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def centred(bodies: Sequence[ca.SX]) -> bool:
     """Return True if all bodies are centred, with four parameters."""
-    return all(own.numel() == len(INERTIAL) for own in bodies)
+    return all(body.numel() == len(INERTIAL) for body in bodies)
 
 
 def full_force(
@@ -55,18 +55,22 @@ def full_force(
 def _link_load(
     leg: "LegVectors", motion: "LegMotion", ten: ca.SX, gravity: ca.DM
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Force (3,) on the link and moments about x and y of its middle, in its axes (3, 3)."""
+    """Force (3,) on the link, moments about x and y of its middle, and its axes (3, 3).
+
+    Components are in these axes: p, q of the angular velocity, u, v of the angular acceleration,
+    and x, y, z of the acceleration of the middle relative to gravity.
+    """
     mass, sx, sy, sz, xx, yy, _, xy, xz, yz = ca.vertsplit(ten)
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
     p, q = (ca.dot(axes[:, k], motion.angular_velocity) for k in range(2))
     u, v = (ca.dot(axes[:, k], motion.angular_acceleration) for k in range(2))
-    falling = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
-    x, y, z = ca.vertsplit(axes.T @ falling)
-    turned = p * sx + q * sy
+    acceleration = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
+    x, y, z = ca.vertsplit(axes.T @ acceleration)
+    spin_moment = p * sx + q * sy
     square = p * p + q * q
     push = ca.vertcat(
-        mass * x + v * sz + p * turned - sx * square,
-        mass * y - u * sz + q * turned - sy * square,
+        mass * x + v * sz + p * spin_moment - sx * square,
+        mass * y - u * sz + q * spin_moment - sy * square,
         mass * z + u * sy - v * sx - sz * square,
     )
     spun = xz * p + yz * q

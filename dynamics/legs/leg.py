@@ -7,8 +7,8 @@ of eq. 23, with Jacobians with respect to the velocity of A (3 columns) instead 
 columns). It needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
-work. A kind can also define closed forms that are faster. Its inverse kinematics is the method
-`coordinate`, in `rss`, `pss` and `ups`. Vectors are in the axes of the base, and A is given by its
+work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
+method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, and A is given by its
 position (3,) in them. Units are SI. The actuated coordinate is in rad for a rotating actuator, and
 in m for a sliding one.
 """
@@ -275,9 +275,9 @@ class Leg(BaseModel, ABC):
         """Second time derivative of the coordinate."""
         at = ca.SX.sym("position", 3)
         moving = ca.SX.sym("velocity", 3)
-        bend = ca.jtimes(ca.dot(self.gradient(at), moving), at, moving)
-        bend = ca.substitute(bend, ca.vertcat(at, moving), ca.vertcat(position, velocity))
-        return ca.dot(self.gradient(position), acceleration) + bend
+        bias = ca.jtimes(ca.dot(self.gradient(at), moving), at, moving)
+        bias = ca.substitute(bias, ca.vertcat(at, moving), ca.vertcat(position, velocity))
+        return ca.dot(self.gradient(position), acceleration) + bias
 
     def force(
         self,
@@ -291,17 +291,22 @@ class Leg(BaseModel, ABC):
 
         `bodies` has the inertial parameters of each body, 4 if it is centred or 10 if it is full.
         """
-        at, moving, gaining = (ca.SX.sym(name, 3) for name in "pva")
+        # symbols, with respect to which the maps can be differentiated
+        at, moving, accelerating = (ca.SX.sym(name, 3) for name in "pva")
         parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3)
         for inertia, centre_map, spin_map, spin in self._maps(at, moving, parameters):
-            centre_gain = centre_map @ gaining + ca.jtimes(centre_map @ moving, at, moving)
-            spin_gain = spin_map @ gaining + ca.jtimes(spin, at, moving)
-            push, moment = inertia.load(centre_gain - gravity, spin, spin_gain)
+            centre_acceleration = centre_map @ accelerating + ca.jtimes(
+                centre_map @ moving, at, moving
+            )
+            spin_acceleration = spin_map @ accelerating + ca.jtimes(spin, at, moving)
+            push, moment = inertia.load(centre_acceleration - gravity, spin, spin_acceleration)
             total += centre_map.T @ push
             total += spin_map.T @ moment
         return _replaced(
-            total, (at, moving, gaining, *parameters), (position, velocity, acceleration, *bodies)
+            total,
+            (at, moving, accelerating, *parameters),
+            (position, velocity, acceleration, *bodies),
         )
 
     def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
@@ -343,17 +348,19 @@ class Leg(BaseModel, ABC):
         """
         maps_of_bodies = []
         spins = self.angular_velocities(position, velocity)
-        for kind, own, place, spin in zip(
+        for kind, parameters, place, spin in zip(
             self.bodies, bodies, self.placements(position), spins, strict=True
         ):
             maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
-            maps_of_bodies.append((spatial_inertia(own, place.axes, kind.moments), *maps, spin))
+            maps_of_bodies.append(
+                (spatial_inertia(parameters, place.axes, kind.moments), *maps, spin)
+            )
         return maps_of_bodies
 
 
 def _symbols_for(bodies: Sequence[ca.SX]) -> list[ca.SX]:
     """Symbols for the inertial parameters of bodies."""
-    return [ca.SX.sym(f"i{k}", own.numel()) for k, own in enumerate(bodies)]
+    return [ca.SX.sym(f"i{k}", body.numel()) for k, body in enumerate(bodies)]
 
 
 def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
