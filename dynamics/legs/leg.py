@@ -8,9 +8,9 @@ columns). It needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
 work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
-method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, and A is given by its
-position (3,) in them. Units are SI. The actuated coordinate is in rad for a rotating actuator, and
-in m for a sliding one.
+method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, and A is given
+by its position (3,) in them. Units are SI. The actuated coordinate is in rad for a rotating
+actuator, and in m for a sliding one.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cmmsim.calibration import CalibrationError, CalibrationOptions, PairView, calibrate
-from cmmsim.calibration.adjustment import project
+from cmmsim.calibration.adjustment import computed_pixels
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_detection import BoardView
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
@@ -73,7 +73,7 @@ def noisy_pairs(seed, count=12, noise=0.05, board=BOARD, tilt=0.6):
 
 def test_projection_and_its_derivatives():
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.2], [0.5, 0.4, 2.0], (20, 3))
-    pixels, by_intrinsics, by_points = project(LEFT, points)
+    pixels, by_intrinsics, by_points = computed_pixels(LEFT, points)
     np.testing.assert_allclose(pixels, brown(LEFT, points), atol=1e-9)
     for k, step in enumerate(1e-5 * np.maximum(np.abs(LEFT), 0.1)):
         change = step * np.eye(9)[k]
