@@ -163,7 +163,7 @@ class Rig(Section):
 
     @property
     def exact(self) -> bool:
-        """True if the estimator takes the rig, and all frames taught with it, as exact."""
+        """True if the estimator takes the rig and its exposures as exact."""
         return self.known == "exact" and self.right_later_std_s == 0.0
 
 
