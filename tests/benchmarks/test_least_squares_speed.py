@@ -84,7 +84,7 @@ def residuals(problem, values):
     known = np.append(
         (values - problem.guess.values) / problem.guess.std, place @ values - measured
     )
-    seen = [run.whiten(run.model_poses(values) - run.measured).ravel() for run in problem.runs]
+    seen = [run.whiten(run.simulate(values).pose - run.measured).ravel() for run in problem.runs]
     return np.concatenate([known, *seen])
 
 

@@ -87,7 +87,7 @@ def unseen_error(scenario, parameters, seed=7):
     """RMS (6,) of a model against the noise-free plant on a trajectory it has not seen."""
     record, run = run_plant(scenario, seed=0, sigma=np.zeros(6), trajectory_seed=seed)
     problem = problem_of([record], scenario)
-    return np.sqrt(np.mean((problem.runs[0].model_poses(parameters) - run.pose) ** 2, axis=0))
+    return np.sqrt(np.mean((problem.runs[0].simulate(parameters).pose - run.pose) ** 2, axis=0))
 
 
 @pytest.mark.parametrize("jitter", [False, True])
@@ -303,7 +303,7 @@ def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_
     """Of poses, starting guess and anchor together, off the optimum."""
     run = identified_model(record, side_of(scenario))
     loop = simulate_servo(rss6(), truth(), run.reference, side_of(scenario).settings)
-    assert np.array_equal(run.model_poses(truth()), loop.pose)
+    assert np.array_equal(run.simulate(truth()).pose, loop.pose)
     whole = problem_of([record], scenario)
     at = 1.01 * truth()
     for problem in (whole, whole.driven_by_commands()):
@@ -391,7 +391,7 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
     dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):
-        identified_model(good, side_of(slow)).model_poses(unstable)
+        identified_model(good, side_of(slow)).simulate(unstable).pose
     for scenario, record, parameters, true in (
         (quick(), dark, truth(), plant),
         (slow, good, unstable, plant_29hz),
