@@ -391,7 +391,7 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
     dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):
-        identified_model(good, side_of(slow)).simulate(unstable).pose
+        identified_model(good, side_of(slow)).simulate(unstable)
     for scenario, record, parameters, true in (
         (quick(), dark, truth(), plant),
         (slow, good, unstable, plant_29hz),
