@@ -32,13 +32,14 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.scene_bodies import placed_stickers
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.layout_search import bright_ellipses, candidate_points, find_layout
-from cmmsim.measuring.observation import Observer, StickerExposure, StickerObservation, faces_camera
+from cmmsim.measuring.observation import Observer, StickerExposure, faces_camera
 from cmmsim.measuring.pose_estimator import (
     FEWEST_NOMINAL,
     NOMINAL_TOLERANCE,
     by_planes,
     frames_by_planes,
 )
+from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.measuring.taught import Taught, setup_of
 from cmmsim.radiometry.stereo_images import StereoImages
 
@@ -227,9 +228,7 @@ class Teacher:
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError if a sticker has moved against the others, as a partly hidden sticker
-        does.
-        """
+        """Raise LostError if a sticker has moved against the others, as if partly hidden."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px

@@ -43,7 +43,9 @@ FEWEST_FOR_A_THREAD = 16  # windows
 class EllipseFits(DetectedCentres):
     """Result of the fits in n windows, with all optional arrays of ``DetectedCentres``.
 
-    ``contrast`` and ``ground`` (n,) are in grey values.
+    ``contrast`` and ``ground`` (n,) are in grey values. ``lights`` (n, 5) tell how far the centres
+    would move if light that rises across each sticker were fitted too: the shift x, y, px, and the
+    entries xx, xy, yy of its covariance, px². They are zero if it was fitted.
     """
 
     shapes: Array = field()  # without a default, unlike in the base class
@@ -51,6 +53,7 @@ class EllipseFits(DetectedCentres):
     misfits: Array = field()
     contrast: Array
     ground: Array
+    lights: Array
 
     def within(self, limits: FitLimits, noise: CameraNoise) -> "EllipseFits":
         """Return the fits, with those that violate the limits marked as not good."""
@@ -79,21 +82,24 @@ def fit_ellipses(
     iterations: int = 8,
     psf_px: float = 0.0,
     smears: Array | None = None,
+    lit: bool = False,
 ) -> EllipseFits:
     """Fit one ellipse in each of n windows (n, h, h) of grey values.
 
     The windows begin at pixels ``corners`` (n, 2) (x, y) of the whole image. The part of
     ``fit_size`` px around the bright spot is fitted. ``psf_px`` is the standard deviation of the
     Gaussian point spread. The spots move by ``smears`` (n, 2) px during the exposure, and the
-    centres are those at its middle. Raises CmmError for a point spread that is too narrow to be
+    centres are those at its middle. If ``lit`` is True, light that rises across each sticker is
+    fitted too. Raises CmmError for a point spread that is too narrow to be
     modelled.
     """
     require_psf(psf_px)
-    from cmmsim.detection.fit_kernels import UNKNOWNS, fit_windows
+    from cmmsim.detection.fit_kernels import LIT_UNKNOWNS, UNKNOWNS, fit_windows
 
     n = len(windows)
     inner = np.empty((n, 2))
-    parameters = np.empty((n, UNKNOWNS))
+    parameters = np.empty((n, LIT_UNKNOWNS if lit else UNKNOWNS))
+    lights = np.empty((n, 5))
     misfits = np.empty(n)
     shapes = np.empty((n, 2, 2))
     covariances = np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
@@ -103,7 +109,9 @@ def fit_ellipses(
     pixels = np.ascontiguousarray(windows, dtype=float)
 
     def fit(part: slice) -> None:
-        filled = (values[part] for values in (inner, parameters, shapes, covariances, misfits))
+        filled = (
+            values[part] for values in (inner, parameters, shapes, covariances, misfits, lights)
+        )
         fit_windows(pixels[part], moved[part], fit_size, settings, *filled)
 
     _in_two_threads(fit, n)
@@ -114,7 +122,9 @@ def fit_ellipses(
         shapes,
         covariances[:, 2:, 2:],
         misfits,
-        *parameters[:, 5:].T,
+        parameters[:, 5],
+        parameters[:, 6],
+        lights,
     )
     return fits.within(limits or FitLimits(), noise)
 
@@ -129,7 +139,7 @@ def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "Fit
     return FitSettings(
         RING_REACH,
         SMALLEST_RADIUS_PX,
-        _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale],
+        _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale, 1.0, 1.0],
         iterations,
         CONVERGED_PX,
         float(psf_px),
@@ -137,6 +147,7 @@ def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "Fit
         noise.variance(greys),
         greys[0],
         1.0 / (greys[1] - greys[0]),
+        noise.black_of_bright,
     )
 
 
@@ -157,8 +168,9 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     other.join()
 
 
-# Largest steps of a fit: centre and shape in px, contrast and ground in grey values of 0 to 255.
-_LARGEST_STEP = frozen([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
+# Largest steps of a fit: centre and shape in px, contrast and ground in grey values of 0 to 255,
+# and the rise of the light per px.
+_LARGEST_STEP = frozen([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0, 0.1, 0.1])
 # Grey values, on a scale of 0 to 255, at which the noise variance is tabulated.
 _GREYS = frozen(np.arange(-64.0, 512.0, 0.25))
 

@@ -11,12 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
+from cmmsim.detection.light_kernels import EVEN_UNKNOWNS as UNKNOWNS
+from cmmsim.detection.light_kernels import (
+    LIT_UNKNOWNS,
+    accumulate_lit,
+    light_across,
+    variance_at,
+)
 from cmmsim.detection.start_kernels import bound_radii, moments, start_ellipse
 from cmmsim.geometry.disc_kernels import blur_window, inverse_shape
 from cmmsim.geometry.matrix_kernels import factorise, invert_factored, solve_factored
 from cmmsim.geometry.rim_kernels import cover_window
-
-UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 
 
 class FitSettings(NamedTuple):
@@ -24,7 +29,7 @@ class FitSettings(NamedTuple):
 
     ring_reach      pixels within this number of radii of the ellipse are fitted
     smallest        smallest radius, px
-    largest_step    (7,), largest step of each parameter
+    largest_step    (9,), largest step of each parameter
     iterations      largest number of steps
     converged       length below which a step ends the fit, px
     psf_px          standard deviation of the point spread, or 0
@@ -33,6 +38,7 @@ class FitSettings(NamedTuple):
     variances       table of noise variances by mean grey value
     first_grey      grey value at which the table begins
     entries_a_grey  number of table entries per grey value
+    black           grey value without light
     """
 
     ring_reach: float
@@ -45,14 +51,7 @@ class FitSettings(NamedTuple):
     variances: Array
     first_grey: float
     entries_a_grey: float
-
-
-@compiled
-def variance_at(mean: float, settings: FitSettings) -> float:
-    """Return the noise variance of a mean grey value, interpolated linearly in the table."""
-    place = (mean - settings.first_grey) * settings.entries_a_grey
-    k = min(max(int(place), 0), len(settings.variances) - 2)
-    return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
+    black: float
 
 
 @compiled
@@ -176,13 +175,13 @@ def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int
 
 @compiled
 def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
-    """Add a step (7,) within its limits to the parameters, and return the largest change, px.
+    """Add a step within its limits to the parameters, and return the largest change, px.
 
     The returned change is that of the centre or shape, before the centre is limited to the window
     and the radii are limited to their range.
     """
     moved = 0.0
-    for k in range(UNKNOWNS):
+    for k in range(len(parameters)):
         change = min(max(step[k], -settings.largest_step[k]), settings.largest_step[k])
         parameters[k] += change
         if k < 5:
@@ -274,40 +273,56 @@ def fit_window(
     parameters: Array,
     shape: Array,
     covariance: Array,
+    light: Array,
 ) -> float:
     """Fit one ellipse by Gauss-Newton steps; return the reduced chi-square.
 
-    ``parameters`` (7,) contain the start values and are replaced by the result. The fit ends when
-    the ellipse moves by less than ``converged`` px. Covariance and chi-square are those from before
-    the last step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m
+    ``parameters`` contain the start values and are replaced by the result. They are seven, or nine
+    if light that rises across the sticker is fitted too. The fit ends when the ellipse moves by
+    less than ``converged`` px. The normal matrix and the misfit are those from before this last
+    step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m
+    parameters. ``light`` (5,) is filled with what ``light_across`` finds, or zero for nine
     parameters.
     """
+    unknowns = len(parameters)
     size = len(window)
     mask = np.empty((size, size), np.bool_)
     shares = np.empty((size, size))
     derivatives = np.empty((size, size, 5))
-    normal = np.empty((UNKNOWNS, UNKNOWNS))
-    right = np.empty(UNKNOWNS)
+    normal = np.empty((unknowns, unknowns))
+    right = np.empty(unknowns)
+    start = parameters[:2].copy()
+    last = parameters.copy()
     set_shape(parameters, shape)
     # the mask of the start is used throughout, so that all steps minimise the same sum
-    freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
+    freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - unknowns, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
         light_of_moving(parameters, shape, smear, settings, shares, derivatives)
-        misfit = accumulate(
-            window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right
-        )
-        for k in range(UNKNOWNS):
+        if unknowns == LIT_UNKNOWNS:
+            misfit = accumulate_lit(
+                window, mask, shares, derivatives, parameters, start, settings, normal, right
+            )
+        else:
+            misfit = accumulate(
+                window, mask, shares, derivatives, parameters[5], parameters[6], settings,
+                normal, right,
+            )  # fmt: skip
+        for k in range(unknowns):
             # keep the factor finite if the window does not determine a parameter
             normal[k, k] += 1e-9
         factorise(normal)
+        solve_factored(normal, right)
+        last[:] = parameters
         if iteration == settings.iterations:
             break
-        solve_factored(normal, right)
         moved = step_within_bounds(parameters, right, settings, size)
         set_shape(parameters, shape)
         if moved < settings.converged:
             break
+    light[:] = 0.0
+    if unknowns == UNKNOWNS:
+        light_across(window, mask, shares, derivatives, last, settings, normal, right, light)
     invert_factored(normal, covariance)
     return misfit / freedom
 
@@ -323,12 +338,14 @@ def fit_windows(
     shapes: Array,
     covariances: Array,
     misfits: Array,
+    lights: Array,
 ) -> None:
     """Fit the part of ``size`` px around the bright spot of each window (n, h, h) of floats.
 
     The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of these
-    parts within their windows, and the misfits (n,). Also fills the parameters (n, 7), the shapes
-    (n, 2, 2) and the covariances (n, m, m) of the first m parameters, relative to these corners.
+    parts within their windows, the misfits (n,) and the ``lights`` (n, 5). Also fills the
+    parameters (n, 7) or (n, 9), the shapes (n, 2, 2) and the covariances (n, m, m) of the first m
+    parameters, relative to these corners.
     """
     for k in range(len(windows)):
         spot = moments(windows[k])
@@ -336,7 +353,10 @@ def fit_windows(
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
         part = windows[k, top : top + size, left : left + size]
+        parameters[k] = 0.0
         start_ellipse(moments(part) if room else spot, size, parameters[k])
-        misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
+        misfits[k] = fit_window(
+            part, smears[k], settings, parameters[k], shapes[k], covariances[k], lights[k]
+        )
         corners[k, 0] = left
         corners[k, 1] = top

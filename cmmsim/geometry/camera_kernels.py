@@ -175,6 +175,16 @@ def point_derivatives(
 
 
 @compiled
+def transformed(move: Array, point: Array) -> tuple:
+    """Return the three coordinates of a point (3,) after a transform (4, 4)."""
+    return (
+        move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3],
+        move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3],
+        move[2, 0] * point[0] + move[2, 1] * point[1] + move[2, 2] * point[2] + move[2, 3],
+    )
+
+
+@compiled
 def add_image(
     camera: Array, move: Array, point: Array, pixel: Array, spread: Array, line_variance: float,
     normal: Array, right: Array,
@@ -185,9 +195,7 @@ def add_image(
     respect to the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I. J' W J is
     added to the six entries ``normal`` (6,), and J' W r to ``right`` (3,).
     """
-    x = move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3]
-    y = move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3]
-    z = move[2, 0] * point[0] + move[2, 1] * point[1] + move[2, 2] * point[2] + move[2, 3]
+    x, y, z = transformed(move, point)
     u, v, a, b, c, d = project(camera, x, y, z)
     r = pixel[0] - u
     s = pixel[1] - v
@@ -273,18 +281,45 @@ def triangulate_point(
 
 
 @compiled
+def signed_distance(cameras: Cameras, pixels: Array, point: Array, gap: float) -> float:
+    """Return the distance of two rays in deviations, from its square ``gap``.
+
+    The distance is positive if the left pixel of ``pixels`` (2, 2) lies on a fixed side of the
+    image of the triangulated ``point`` (3,). This side is perpendicular to the image of the line
+    between the cameras.
+    """
+    move = cameras.extrinsics[0]
+    camera = cameras.intrinsics[0]
+    x, y, z = transformed(move, point)
+    u, v, _, _, _, _ = project(camera, x, y, z)
+    other = cameras.extrinsics[1]
+    along_x = 0.0
+    along_y = 0.0
+    for i in range(3):
+        # The right camera's centre, relative to the left one's, in axes that both share.
+        centre = 0.0
+        for j in range(3):
+            centre += move[j, i] * move[j, 3] - other[j, i] * other[j, 3]
+        along_x += move[0, i] * centre
+        along_y += move[1, i] * centre
+    across = along_x * (pixels[0, 1] - v) - along_y * (pixels[0, 0] - u)
+    return math.copysign(math.sqrt(max(gap, 0.0)), across)
+
+
+@compiled
 def triangulate_all(
     cameras: Cameras, pixels: Array, spreads: Array, line_variance: float, step_tolerance: float,
-    points: Array, covariances: Array, gaps: Array,
+    points: Array, covariances: Array, gaps: Array, rays: Array,
 ) -> None:  # fmt: skip
     """Triangulate n points from pixels (n, 2, 2) with covariances ``spreads`` (n, 2, 2, 2).
 
-    ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3) and gaps
-    (n,). See ``triangulate_point`` for the other parameters.
+    ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3), gaps (n,)
+    and their signed roots ``rays`` (n,). See ``triangulate_point`` for the other parameters.
     """
     scratch = np.empty((3, 6))
     for n in range(len(points)):
         gaps[n] = triangulate_point(
             cameras, pixels[n], spreads[n], line_variance, step_tolerance, points[n], scratch
         )  # fmt: skip
+        rays[n] = signed_distance(cameras, pixels[n], points[n], gaps[n])
         from_entries(scratch[1], covariances[n])

@@ -24,6 +24,47 @@ from cmmsim.geometry.transform_kernels import move_by, transform_point
 
 
 @compiled
+def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
+    """Tell whether the used places (n,3) lie within ``width`` m of one line.
+
+    The middle eigenvalue of their scatter matrix is compared with ``width`` squared. A lower bound
+    of the eigenvalue is compared first, because the bound is faster to compute.
+    """
+    first = np.argmax(used)
+    count = 0
+    x = y = z = xx = xy = xz = yy = yz = zz = 0.0
+    for n in range(len(used)):
+        if used[n]:
+            count += 1
+            a = places[n, 0] - places[first, 0]
+            b = places[n, 1] - places[first, 1]
+            c = places[n, 2] - places[first, 2]
+            x += a
+            y += b
+            z += c
+            xx += a * a
+            xy += a * b
+            xz += a * c
+            yy += b * b
+            yz += b * c
+            zz += c * c
+    # Change from sums of squares about the first place to sums about the middle.
+    xx -= x * x / count
+    xy -= x * y / count
+    xz -= x * z / count
+    yy -= y * y / count
+    yz -= y * z / count
+    zz -= z * z / count
+    # With eigenvalues a >= b >= c, the sum of the principal minors is at most 2 b (a + b + c).
+    minors = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
+    if minors >= 2.0 * (xx + yy + zz) * width * width:
+        return False
+    scatter = np.empty((3, 3))
+    from_entries(np.array([xx, xy, xz, yy, yz, zz]), scatter)
+    return np.linalg.eigvalsh(scatter)[1] < width * width
+
+
+@compiled
 def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array) -> float:
     """Add a point to the normal equations of a pose; return its squared gap in units of its noise.
 

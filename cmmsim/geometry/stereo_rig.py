@@ -224,12 +224,14 @@ class StereoPoints:
     """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
 
     ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, with one
-    degree of freedom.
+    degree of freedom. ``rays`` (n,) are its roots, with a sign that tells on which side of each
+    other the rays pass.
     """
 
     points: Array
     covariances: Array
     ray_gap: Array
+    rays: Array
 
 
 def triangulate(
@@ -260,6 +262,7 @@ def triangulate(
     points = np.array(near, dtype=float, order="C")
     covariances = np.empty((len(points), 3, 3))
     gaps = np.empty(len(points))
+    rays = np.empty(len(points))
     pixels = np.ascontiguousarray(np.stack([left, right], axis=1))
     spreads = np.ascontiguousarray(np.stack([left_covariances, right_covariances], axis=1))
     triangulate_all(
@@ -271,8 +274,9 @@ def triangulate(
         points,
         covariances,
         gaps,
+        rays,
     )
-    return StereoPoints(points, covariances, gaps)
+    return StereoPoints(points, covariances, gaps, rays)
 
 
 def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:

@@ -10,14 +10,17 @@ one first, in two cases:
 - The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
   sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
-Undetected errors of both kinds are then of the size of the noise. At least four stickers must
-remain, because a wrong sticker among three cannot be identified. More stickers must remain than
-were rejected.
+Undetected errors of both kinds are then of the size of the noise. At least five stickers must
+remain, and more than were rejected. If three or more of the rejected stickers agree with each other
+on another pose, a group of stickers has moved. Nothing tells which group it was, so the frame is
+lost.
 
 All residuals can be larger than noise, for example if a camera has drifted since its calibration,
 or several stickers are slightly misplaced. Each place is then compared with the size of the other
 stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
-their noise (squared Birge ratio), up to a limit.
+their noise (squared Birge ratio), up to a limit, and by a factor, because such errors are not
+independent. A warp of the whole pattern enlarges them as well, see ``warp_kernels``, and so does a
+pose from less than half of the stickers that were searched.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -30,17 +33,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.registration import SMALLEST_SPREAD, require_spread
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.measuring.observation import Observer, StickerObservation
+from cmmsim.measuring.observation import DetectionSettings, Observer
+from cmmsim.measuring.sticker_windows import StickerObservation
 
 if TYPE_CHECKING:
-    from cmmsim.measuring.solver_kernels import Outlines, SolverLimits
+    from cmmsim.measuring.outline_kernels import Outlines
+    from cmmsim.measuring.solver_kernels import SolverLimits
 
 # Probability that a good sticker is rejected, for its place and for each of its two ellipses.
 CHANCE = 1e-4
@@ -50,9 +55,23 @@ EXCESS_CHANCE = 1e-4
 LARGEST_EXCESS = 6.0
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Smallest number of stickers that must remain.
-FEWEST = 4
+FEWEST = 5
 # Smallest share of a sticker's noise that must appear in its residual; below, it is not tested.
 SMALLEST_SHARE = 0.01
+# Probability that a good frame counts as warped. It is larger than that of other tests, because
+# a warp that is just not noticed moves the pose by up to ten deviations.
+WARP_CHANCE = 1e-2
+# Largest squared warp that noise explains, in its units.
+LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
+# Errors that are larger than noise are not independent: a pose errs as if each were shared by this
+# number of stickers.
+EXCESS_SHARE = 3.0
+TAIL = 0.999
+# A pose errs in six shapes that are as smooth as those of a warp. Its covariance is multiplied by
+# this number times the mean square of the warp's shapes.
+WARP_SHARE = 8.0
+# Rejected stickers that agree with each other are as likely to be right as the others.
+FEWEST_RIVALS = 3
 # rad: a fit ends after a step with a smaller rotation.
 STEP_TOLERANCE = 1e-8
 
@@ -122,6 +141,7 @@ def solve_frames(
     frames = len(near)
     of, sticker = np.divmod(seen.index, len(places))
     starts = np.searchsorted(of, np.arange(frames + 1)).astype(int)
+    searched = np.diff(starts) if seen.searched is None else seen.searched
     used = np.ones(len(of), dtype=bool)
     covariances = np.array(seen.covariances)
     rows = kernels.ObservedStickers(
@@ -131,15 +151,17 @@ def solve_frames(
         covariances,
         np.empty((len(of), 3)),
         np.empty((len(of), 3)),
+        np.ascontiguousarray(seen.rays),
     )
     camera_from_body = np.array(near, dtype=float)
     spreads = np.zeros((frames, 6, 6))
     verdicts = np.zeros((frames, kernels.COLUMNS))
     outlines = _outlines(seen, observer, body.sticker_normals[sticker])
-    limits = solver_limits(len(places))
+    limits = solver_limits(len(places), observer.settings)
     taught = np.ascontiguousarray(places[sticker])
     kernels.solve_frames(
-        rows, taught, outlines, limits, starts, camera_from_body, spreads, verdicts
+        *(rows, taught, outlines, limits, starts, searched),
+        *(camera_from_body, spreads, verdicts),
     )
     return SolvedFrames(
         camera_from_body,
@@ -167,8 +189,14 @@ def consistent(
     return solved.of(0), solved.camera_from_body[0], solved.covariances[0]
 
 
-def solver_limits(stickers: int, step_tolerance: float = STEP_TOLERANCE) -> SolverLimits:
-    """Return the compiled solver's limits for frames with at most this number of stickers."""
+def solver_limits(
+    stickers: int, settings: DetectionSettings, step_tolerance: float = STEP_TOLERANCE
+) -> SolverLimits:
+    """Return the compiled solver's limits for frames with at most this number of stickers.
+
+    A known error of the rig warps every frame. Its effect on the poses is stated as their common
+    error, so a warp is not tested in that case.
+    """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring.solver_kernels import SolverLimits
 
@@ -180,6 +208,11 @@ def solver_limits(stickers: int, step_tolerance: float = STEP_TOLERANCE) -> Solv
         SMALLEST_SPREAD,
         step_tolerance,
         _largest_totals(3 * stickers),
+        EXCESS_SHARE,
+        _tails(3 * stickers),
+        LARGEST_WARP if settings.line_error_px == 0.0 else np.inf,
+        WARP_SHARE,
+        FEWEST_RIVALS,
     )
 
 
@@ -194,6 +227,11 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
 
     seen = int(verdict[kernels.SEEN])
     count = int(verdict[kernels.LEFT])
+    if verdict[kernels.RIVALS] > 0:
+        return (
+            f"{count} visible stickers agree on one pose and {verdict[kernels.RIVALS]:.0f} on "
+            f"another; the first that contradicts is {first}; a group of stickers has moved"
+        )
     if count >= FEWEST and count > seen - count:
         try:
             require_spread(left)
@@ -219,10 +257,21 @@ def _largest_totals(freedom: int) -> Array:
     return np.asarray(chdtri(np.maximum(np.arange(freedom + 1), 1), EXCESS_CHANCE))
 
 
+@lru_cache(maxsize=16)
+def _tails(freedom: int) -> Array:
+    """Return the factor on a covariance whose scale is known with 0 to ``freedom`` degrees.
+
+    A pose then has Student's distribution. Its squared error has the quantile TAIL of a normal one
+    with the larger covariance.
+    """
+    known = np.maximum(np.arange(freedom + 1), 1)
+    return np.asarray(6.0 * fdtri(6, known, TAIL) / chdtri(6, 1.0 - TAIL))
+
+
 def no_outlines(rig: StereoRig) -> Outlines:
     """Return the compiled solver's input for a detector that states no ellipses."""
     # Imported late, because importing numba takes time.
-    from cmmsim.measuring.solver_kernels import Outlines
+    from cmmsim.measuring.outline_kernels import Outlines
 
     shapes = np.zeros((0, 2, 3))
     return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.kernel_cameras)

@@ -1,12 +1,8 @@
-"""Observation of the stickers of one body near their expected places.
-
-Windows are read, centres are detected in them, and both images' centres are triangulated.
-"""
+"""Observation of the stickers of one body near their expected places, with its settings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -17,27 +13,17 @@ from cmmsim.detection.detector import (
     DetectedCentres,
     Detector,
     FitLimits,
-    SpotWindows,
     find_detector,
 )
-from cmmsim.detection.ellipse_fit import (
-    MAXIMUM_LIKELIHOOD,
-    SMEAR_STEP_PX,
-    EllipseFits,
-    fit_ellipses,
-)
+from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply_each
-from cmmsim.geometry.stereo_rig import StereoRig, triangulate
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.measuring.sticker_windows import StickerObservation, StickerWindows
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import ManyExposures, StereoImages, Windows
 
-# A smear is the movement of a sticker's image during the exposure. The longest smear that can be
-# measured is about the size of a sticker.
-LONGEST_SMEAR_PX = 8.0
-# Shortest smear that changes the result of a fit, in standard deviations of the point spread.
-SHORTEST_SMEAR = 1.5
 # Smallest cosine between a sticker's normal and the line of sight at which it is searched.
 GRAZING = 0.15
 
@@ -73,49 +59,6 @@ class DetectionSettings:
     exposed_share: float = 0.0
     line_error_px: float = 0.0
     dark: bool = False
-
-
-@dataclass(frozen=True)
-class Outlines:
-    """Ellipses of k stickers in both images.
-
-    ``shapes`` are symmetric matrices A (2, k, 2, 2), px. ``covariances`` (2, k, 3, 3), px², are the
-    covariances of the entries A_xx, A_xy, A_yy.
-    """
-
-    shapes: Array
-    covariances: Array
-
-    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
-        """Select some of the stickers."""
-        return Outlines(self.shapes[:, keep], self.covariances[:, keep])
-
-
-@dataclass(frozen=True)
-class StickerObservation:
-    """Stickers seen by both cameras, k of them.
-
-    index                      (k,), indices of the stickers among the body's stickers
-    left_pixels, right_pixels  (k, 2), sticker centres in the distorted images, without eccentricity
-    points, covariances        (k, 3) and (k, 3, 3), in the camera frame, m
-    pixel_variances            (k,), of pixel coordinates, mean over both images and axes, px²
-    outlines                   ellipses of the stickers; None if the detector states no ellipses
-    """
-
-    index: NDArray[np.int_]
-    left_pixels: Array
-    right_pixels: Array
-    points: Array
-    covariances: Array
-    pixel_variances: Array
-    outlines: Outlines | None = None
-
-    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
-        """Return the observation with only some of its stickers."""
-        kept = {name: values[keep] for name, values in vars(self).items() if name != "outlines"}
-        return StickerObservation(
-            **kept, outlines=None if self.outlines is None else self.outlines.selected(keep)
-        )
 
 
 @runtime_checkable
@@ -227,153 +170,6 @@ class Observer:
         return black + (windows - black) / share
 
 
-@dataclass(frozen=True)
-class StickerWindows:
-    """Grey values around the k stickers of a body that both cameras of an observer should see.
-
-    index             (k,), indices of the stickers among the body's stickers
-    exposures         (k,), number of the exposure that shows each sticker, in rising order
-    camera_from_body  (4, 4) or (N, 4, 4), expected place of the body in each exposure
-    places, normals   (k, 3), of the stickers, in body axes, m
-    corners           (2, k, 2), first pixels of the windows
-    windows           (2, k, h, h), grey values without vignetting in which stickers are bright;
-                      empty without images
-    offsets           (2, k, 2), eccentricities of the ellipses, px
-    found             result of the detector for exposures without images, otherwise None
-    """
-
-    observer: Observer
-    index: NDArray[np.int_]
-    exposures: NDArray[np.int_]
-    camera_from_body: Array
-    places: Array
-    normals: Array
-    corners: NDArray[np.int_]
-    windows: Windows
-    offsets: Array
-    found: DetectedCentres | None = None
-
-    def observed(self, exposure_ends: tuple[Array, Array] | None = None) -> StickerObservation:
-        """Return the stickers in these windows; see ``Observer.observe`` for ``exposure_ends``."""
-        if len(self.index) == 0:
-            none = np.zeros((0, 3))
-            return StickerObservation(
-                self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)), none[:, 0]
-            )
-        settings = self.observer.settings
-        fits = self.found or self._detected()
-        if exposure_ends is not None and self.found is None:
-            fits = self._more_likely(fits, exposure_ends)
-        seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
-        systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
-        spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
-        # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
-        # would be too near to the ray of the sharper image.
-        line_variance = settings.line_error_px**2
-        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
-        near = apply_each(moves, self.places[:, None])[:, 0]
-        left, right = seen_at
-        seen = triangulate(
-            self.observer.rig, left, right, spread[0], spread[1], near, line_variance
-        )
-        good = np.all(fits.good.reshape(2, -1), axis=0)
-        # Mean variance over two coordinates in two images.
-        noise = 0.25 * np.einsum("ckii->k", spread)
-        outlines = _outlines(fits, settings.centre_error_px**2)
-        return StickerObservation(
-            self.index, seen_at[0], seen_at[1], seen.points, seen.covariances, noise, outlines
-        ).selected(good & (seen.ray_gap < settings.largest_ray_gap))
-
-    def ellipses(self, smears: Array | None = None) -> EllipseFits:
-        """Fit ellipses to all 2k windows, without a limit on the misfit.
-
-        See ``SpotWindows`` for ``smears`` (2k, 2).
-        """
-        settings = self.observer.settings
-        limits = replace(settings.limits, largest_misfit=np.inf)
-        return fit_ellipses(
-            *self._flat,
-            self.observer.upright,
-            settings.fit_size,
-            limits,
-            psf_px=settings.optics.psf_px,
-            smears=smears,
-        )
-
-    @cached_property
-    def ellipses_at_rest(self) -> EllipseFits:
-        """Ellipses fitted as for a body at rest.
-
-        The search for streaks uses them, and so does the measurement of a body at rest.
-        """
-        return self.ellipses()
-
-    def _detected(self, smears: Array | None = None) -> DetectedCentres:
-        """Return the centres that the detector finds in the windows."""
-        detector = self.observer.detector
-        noise = self.observer.upright
-        settings = self.observer.settings
-        if detector is MAXIMUM_LIKELIHOOD:
-            fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
-            return fits.within(settings.limits, noise)
-        fit_size = settings.fit_size + 2 * detector.margin_px
-        spots = SpotWindows(
-            *self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears
-        )
-        return detector.detect(spots)
-
-    @property
-    def _flat(self) -> tuple[Windows, NDArray[np.int_]]:
-        """Windows (2k, h, h) and corners (2k, 2) of both images together."""
-        return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
-
-    def _more_likely(
-        self, still: DetectedCentres, exposure_ends: tuple[Array, Array]
-    ) -> DetectedCentres:
-        """Choose, for each exposure, between the result for a body at rest and for a moving body.
-
-        The movement between ``exposure_ends`` is only a prediction, and the platform can have
-        stopped. The result that agrees better with the images is therefore chosen. ``still`` is the
-        result for a body at rest.
-        """
-        smears, shown = self._smears(exposure_ends)
-        if still.misfits is None or not shown.any():
-            return still
-        moving = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2))
-        again = np.tile(shown, 2)
-        if moving.misfits is None:
-            return still
-        gains = (still.misfits[again] - moving.misfits).reshape(2, -1)
-        _, starts, counts = np.unique(self.exposures[shown], return_index=True, return_counts=True)
-        better = [np.median(own) > 0.0 for own in np.split(gains, starts[1:], axis=1)]
-        taken = np.tile(np.repeat(better, counts), 2)
-        return still.with_others(np.flatnonzero(again)[taken], moving, taken)
-
-    def _smears(self, exposure_ends: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the stickers' movements (2, k, 2) px during the exposure, and a mask (k,).
-
-        The mask is False for exposures in which the longest movement is too short compared with the
-        point spread, or too long to be measured.
-        """
-        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in exposure_ends)
-        first, last = (
-            self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0]
-            for move in moves
-        )
-        shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
-        longest = np.zeros(self.exposures[-1] + 1)
-        np.maximum.at(longest, self.exposures, np.linalg.norm(last - first, axis=-1).max(axis=0))
-        return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
-
-    def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
-        """Return the windows of only some of the stickers."""
-        each = {
-            name: getattr(self, name)[keep] for name in ("index", "exposures", "places", "normals")
-        }
-        both = {name: getattr(self, name)[:, keep] for name in ("corners", "windows", "offsets")}
-        return replace(self, **each, **both)
-
-
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
     """Tell for each sticker (n,) whether it faces the camera, and not at grazing incidence.
 
@@ -382,14 +178,3 @@ def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
     return np.asarray(
         -np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1)
     )
-
-
-def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
-    """Return the ellipses in both images, or None if the detector states none.
-
-    ``systematic`` px² is the variance of systematic errors of the rim, which is added.
-    """
-    if fits.shapes is None or fits.shape_covariances is None:
-        return None
-    spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
-    return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)

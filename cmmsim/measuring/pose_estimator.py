@@ -24,7 +24,8 @@ from cmmsim.measuring.layout_search import (
     find_layout,
 )
 from cmmsim.measuring.measurement import Measurement, lost_measurement
-from cmmsim.measuring.observation import Observer, StickerObservation
+from cmmsim.measuring.observation import Observer
+from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.measuring.streaks import find_streaks, streak_message
 from cmmsim.measuring.taught import Taught
 from cmmsim.radiometry.stereo_images import FrameImages, StereoFrame, StereoImages

@@ -13,17 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.camera_kernels import Cameras, project
-from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
-from cmmsim.geometry.matrix_kernels import from_entries, square_by
 from cmmsim.geometry.rigid_kernels import (
     add_point,
+    lie_on_a_line,
     residual_covariance,
     residual_misfit,
     solve_step,
     turn_arm,
 )
-from cmmsim.geometry.transform_kernels import make_rigid, move_by, transform_point
+from cmmsim.geometry.transform_kernels import make_rigid, move_by
+from cmmsim.measuring.outline_kernels import Outlines, outline_misfit
+from cmmsim.measuring.warp_kernels import SHAPES, warp
 
 MOST_STEPS = 8
 
@@ -31,6 +31,7 @@ MOST_STEPS = 8
 MEASURED = 0
 TOO_FEW = 1
 ON_A_LINE = 2
+CONTRADICTED = 3
 
 # Columns of a verdict, which is a row of numbers per frame:
 # STATE    state of the frame
@@ -40,8 +41,10 @@ ON_A_LINE = 2
 # PLACE    squared misfit of the place of this sticker
 # OUTLINE  squared misfit of the worse ellipse of this sticker
 # EXCESS   factor on the covariances
-STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS = range(7)
-COLUMNS = 7
+# RIVALS   number of rejected stickers that agree with each other
+# WARP     squared size of the warp in units of its noise
+STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS, RIVALS, WARP = range(9)
+COLUMNS = 9
 
 
 class ObservedStickers(NamedTuple):
@@ -52,6 +55,7 @@ class ObservedStickers(NamedTuple):
     informations  (n, 3, 3), inverse covariances of the points
     covariances   (n, 3, 3), covariances of the points
     arms, gaps    (n, 3), overwritten; ``rigid_kernels`` explains them
+    rays          (n,), signed distances of both rays of a sticker, in units of their noise
     """
 
     used: Array
@@ -60,21 +64,7 @@ class ObservedStickers(NamedTuple):
     covariances: Array
     arms: Array
     gaps: Array
-
-
-class Outlines(NamedTuple):
-    """Ellipses of stickers in both images. All arrays are empty if no ellipses are known.
-
-    ``shapes`` (n, 2, 3) are the entries xx, xy, yy of the ellipses' matrices, px. ``informations``
-    (n, 2, 6) are the entries of the inverse covariances of these entries. ``normals`` (n, 3) are
-    the stickers' normals in body axes, and ``radius`` is the stickers' radius, m.
-    """
-
-    shapes: Array
-    informations: Array
-    normals: Array
-    radius: float
-    cameras: Cameras
+    rays: Array
 
 
 class SolverLimits(NamedTuple):
@@ -88,6 +78,12 @@ class SolverLimits(NamedTuple):
     step_tolerance  rotation below which a step ends a fit, rad
     totals          (d,), largest sums of squared residuals that noise explains, by the number of
                     degrees of freedom
+    excess_share    factor on the mean square of residuals that are larger than noise
+    tails           (d,), factor on the covariance of a pose from few stickers, by the number of
+                    degrees of freedom
+    largest_warp    largest squared warp that noise explains
+    warp_share      factor on the mean square of the warp's shapes, for the covariances
+    fewest_rivals   smallest number of rejected stickers that contradict the others
     """
 
     largest_misfit: float
@@ -97,47 +93,11 @@ class SolverLimits(NamedTuple):
     smallest_width: float
     step_tolerance: float
     totals: Array
-
-
-@compiled
-def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
-    """Tell whether the used places (n,3) lie within ``width`` m of one line.
-
-    The middle eigenvalue of their scatter matrix is compared with ``width`` squared. A lower bound
-    of the eigenvalue is compared first, because the bound is faster to compute.
-    """
-    first = np.argmax(used)
-    count = 0
-    x = y = z = xx = xy = xz = yy = yz = zz = 0.0
-    for n in range(len(used)):
-        if used[n]:
-            count += 1
-            a = places[n, 0] - places[first, 0]
-            b = places[n, 1] - places[first, 1]
-            c = places[n, 2] - places[first, 2]
-            x += a
-            y += b
-            z += c
-            xx += a * a
-            xy += a * b
-            xz += a * c
-            yy += b * b
-            yz += b * c
-            zz += c * c
-    # Change from sums of squares about the first place to sums about the middle.
-    xx -= x * x / count
-    xy -= x * y / count
-    xz -= x * z / count
-    yy -= y * y / count
-    yz -= y * z / count
-    zz -= z * z / count
-    # With eigenvalues a >= b >= c, the sum of the principal minors is at most 2 b (a + b + c).
-    minors = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
-    if minors >= 2.0 * (xx + yy + zz) * width * width:
-        return False
-    scatter = np.empty((3, 3))
-    from_entries(np.array([xx, xy, xz, yy, yz, zz]), scatter)
-    return np.linalg.eigvalsh(scatter)[1] < width * width
+    excess_share: float
+    tails: Array
+    largest_warp: float
+    warp_share: float
+    fewest_rivals: int
 
 
 @compiled
@@ -189,29 +149,6 @@ def excess_of(total: float, freedom: int, totals: Array) -> float:
 
 
 @compiled
-def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: Array) -> float:
-    """Return the squared misfit of the ellipse of sticker ``n`` in image ``side``.
-
-    The misfit is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
-    """
-    camera = outlines.cameras.intrinsics[side]
-    move = outlines.cameras.extrinsics[side]
-    point = np.empty(3)
-    centre = np.empty(3)
-    turned = np.empty(3)
-    normal = np.empty(3)
-    transform_point(place, taught, 1.0, point)
-    transform_point(move, point, 1.0, centre)
-    transform_point(place, outlines.normals[n], 0.0, turned)
-    transform_point(move, turned, 0.0, normal)
-    x, y, xx, xy, yy = disc_ellipse(centre, normal, outlines.radius, camera)
-    _, _, a, b, c, d = project(camera, x, y, 1.0)
-    xx, xy, yy = distorted_root(xx, xy, yy, a, b, c, d)
-    shape = outlines.shapes[n, side]
-    return square_by(outlines.informations[n, side], shape[0] - xx, shape[1] - xy, shape[2] - yy)
-
-
-@compiled
 def worst_sticker(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
     covariance: Array, total: float, freedom: int, misfits: Array,
@@ -250,21 +187,17 @@ def worst_sticker(
 
 
 @compiled
-def solve(
+def agree(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    covariance: Array, verdict: Array,
+    covariance: Array, fewest: int, verdict: Array,
 ) -> None:  # fmt: skip
-    """Solve one frame.
+    """Reject stickers one by one until the others agree; see ``solve`` for the parameters.
 
-    ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
-    ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
-    are the taught places. Stickers that contradict the others are marked as not used. The
-    covariances of the used stickers are enlarged if residuals are larger than noise. Arms and gaps
-    must belong to ``place`` on entry.
+    At least ``fewest`` stickers must be left. Fills all columns of the ``verdict`` but RIVALS and
+    WARP.
     """
     normal = np.empty((6, 6))
     misfits = np.zeros(2)
-    excess = 1.0
     left_out = 0
     verdict[FIRST] = -1
     verdict[SEEN] = np.sum(seen.used)
@@ -273,7 +206,7 @@ def solve(
     while True:
         count = np.sum(seen.used)
         verdict[LEFT] = count
-        if count < limits.fewest or count <= left_out:
+        if count < fewest or count <= left_out:
             verdict[STATE] = TOO_FEW
             return
         if lie_on_a_line(seen.used, places, limits.smallest_width):
@@ -281,7 +214,7 @@ def solve(
             return
         freedom = 3 * count - 6
         total = fit(seen, places, limits.step_tolerance, place, covariance, normal)
-        excess = excess_of(total, freedom, limits.totals)
+        verdict[EXCESS] = excess_of(total, freedom, limits.totals)
         worst = worst_sticker(
             seen, places, outlines, limits, place, covariance, total, freedom, misfits
         )
@@ -289,15 +222,105 @@ def solve(
         if worst < 0:
             verdict[STATE] = TOO_FEW
             return
-        if max(misfits[0], misfits[1]) <= limits.largest_misfit and excess <= limits.largest_excess:
-            break
+        if (
+            max(misfits[0], misfits[1]) <= limits.largest_misfit
+            and verdict[EXCESS] <= limits.largest_excess
+        ):
+            verdict[STATE] = MEASURED
+            return
         if left_out == 0:
             verdict[FIRST] = worst
             verdict[PLACE] = misfits[0]
             verdict[OUTLINE] = misfits[1]
         seen.used[worst] = False
         left_out += 1
-    verdict[STATE] = MEASURED
+
+
+@compiled
+def rivals(
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
+    rejected: Array,
+) -> int:  # fmt: skip
+    """Return the number of rejected stickers (n,) that agree with each other on another pose."""
+    if np.sum(rejected) < limits.fewest_rivals:
+        return 0
+    others = ObservedStickers(
+        rejected.copy(), seen.points, seen.informations, seen.covariances, seen.arms.copy(),
+        seen.gaps.copy(), seen.rays,
+    )  # fmt: skip
+    other = place.copy()
+    verdict = np.zeros(COLUMNS)
+    for n in range(len(rejected)):
+        turn_arm(other, places[n], seen.points[n], others.arms[n], others.gaps[n])
+    agree(others, places, outlines, limits, other, np.empty((6, 6)), limits.fewest_rivals, verdict)
+    return int(verdict[LEFT]) if verdict[STATE] == MEASURED else 0
+
+
+@compiled
+def few_excess(
+    seen: ObservedStickers, rejected: Array, limits: SolverLimits, covariance: Array
+) -> float:
+    """Return the factor on the covariance of a pose from few stickers.
+
+    It is the mean square of the residuals of all stickers that were seen, even of the ``rejected``
+    (n,) ones. A pose from few stickers has a wider distribution than a normal one, which the
+    factor allows for.
+    """
+    half = np.empty((3, 6))
+    left = np.empty(6)
+    inverse = np.empty(6)
+    total = 0.0
+    used = 0
+    gone = 0
+    for n in range(len(seen.used)):
+        if seen.used[n]:
+            used += 1
+            for i in range(3):
+                for j in range(3):
+                    total += seen.gaps[n, i] * seen.informations[n, i, j] * seen.gaps[n, j]
+        elif rejected[n]:
+            gone += 1
+            residual_covariance(seen.arms[n], seen.covariances[n], -covariance, half, left)
+            misfit = residual_misfit(seen.gaps[n], seen.covariances[n], left, 0.0, inverse)
+            total += min(misfit, limits.largest_misfit)
+    mean = max(total / (3 * (used + gone) - 6), 1.0)
+    return mean * limits.tails[3 * used - 6]
+
+
+@compiled
+def solve(
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
+    covariance: Array, searched: int, verdict: Array,
+) -> None:  # fmt: skip
+    """Solve one frame, in which this number of stickers was ``searched``.
+
+    ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
+    ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
+    are the taught places. Stickers that contradict the others are marked as not used. The
+    covariances of the used stickers are enlarged if residuals are larger than noise. Arms and gaps
+    must belong to ``place`` on entry.
+    """
+    rejected = seen.used.copy()
+    verdict[RIVALS] = 0
+    verdict[WARP] = 0.0
+    agree(seen, places, outlines, limits, place, covariance, limits.fewest, verdict)
+    if verdict[STATE] != MEASURED:
+        return
+    for n in range(len(rejected)):
+        rejected[n] = rejected[n] and not seen.used[n]
+    verdict[RIVALS] = rivals(seen, places, outlines, limits, place, rejected)
+    if verdict[RIVALS] > 0:
+        verdict[STATE] = CONTRADICTED
+        return
+    verdict[WARP] = warp(seen.used, seen.arms, seen.gaps, seen.informations, seen.rays, covariance)
+    excess = verdict[EXCESS]
+    warped = verdict[WARP] > excess * limits.largest_warp
+    if excess > 1.0:
+        excess *= limits.excess_share
+    if 2 * verdict[LEFT] <= searched:
+        excess = max(excess, few_excess(seen, rejected, limits, covariance))
+    if warped:
+        excess = max(excess, limits.warp_share * verdict[WARP] / SHAPES)
     verdict[EXCESS] = excess
     for i in range(6):
         for j in range(6):
@@ -311,10 +334,10 @@ def solve(
 @compiled
 def solve_frames(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, starts: Array,
-    camera_from_body: Array, covariances: Array, verdicts: Array,
+    searched: Array, camera_from_body: Array, covariances: Array, verdicts: Array,
 ) -> None:  # fmt: skip
     """Call ``solve`` for several frames. Frame j has the stickers ``starts[j]`` to ``starts[j +
-    1]``.
+    1]``, of ``searched`` (f,) ones.
 
     ``camera_from_body`` (f,4,4) contains first guesses on entry, and the results at the end.
     Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS) are filled.
@@ -329,6 +352,7 @@ def solve_frames(
             seen.covariances[first:last],
             seen.arms[first:last],
             seen.gaps[first:last],
+            seen.rays[first:last],
         )
         shown = Outlines(
             outlines.shapes[first:last],
@@ -342,4 +366,7 @@ def solve_frames(
         make_rigid(camera_from_body[f])
         for n in range(last - first):
             turn_arm(camera_from_body[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
-        solve(own, taught, shown, limits, camera_from_body[f], covariances[f], verdicts[f])
+        solve(
+            own, taught, shown, limits, camera_from_body[f], covariances[f], searched[f],
+            verdicts[f],
+        )  # fmt: skip

@@ -27,7 +27,7 @@ from cmmsim.errors import LostError
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.measuring.observation import LONGEST_SMEAR_PX, StickerWindows
+from cmmsim.measuring.sticker_windows import LONGEST_SMEAR_PX, StickerWindows
 
 # Probability that a movement is found if the stickers are at rest.
 CHANCE = 1e-4

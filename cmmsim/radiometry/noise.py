@@ -141,6 +141,11 @@ class CameraNoise:
         """Return grey values in which stickers are bright, of the same type."""
         return grey.dtype.type(self.white_level) - grey if self.inverted else grey
 
+    @property
+    def black_of_bright(self) -> float:
+        """Grey value without light in images in which stickers are bright; see ``bright``."""
+        return self.white_level - self.black_level if self.inverted else self.black_level
+
     def rounding_excess(self, mean_grey: Array) -> Array:
         """Return the ratio of the largest to the average variance of grey values near a mean.
 

@@ -11,7 +11,8 @@ from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.pose import Array
 from cmmsim.measuring.frame_solver import consistent
 from cmmsim.measuring.measurement import Measurement
-from cmmsim.measuring.observation import Observer, StickerObservation
+from cmmsim.measuring.observation import Observer
+from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 from cmmsim.uncertainty.drift_blocks import RIG, FrameBlock, base_rows, platform_rows, stacked

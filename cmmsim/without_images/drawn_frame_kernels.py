@@ -18,6 +18,7 @@ from cmmsim.geometry.camera_kernels import (
     length_of,
     light_at,
     project,
+    signed_distance,
     triangulate_point,
 )
 from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
@@ -29,11 +30,11 @@ from cmmsim.geometry.transform_kernels import (
     transform_point,
     transform_pose,
 )
+from cmmsim.measuring.outline_kernels import Outlines
 from cmmsim.measuring.solver_kernels import (
     MEASURED,
     STATE,
     ObservedStickers,
-    Outlines,
     SolverLimits,
     solve,
 )
@@ -250,10 +251,11 @@ def observe(
 
 
 @compiled
-def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None:
+def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> int:
     """Triangulate the used stickers, with the platform at camera_from_platform ``place`` (4, 4).
 
     Stickers that the estimator would not search for, or would reject, are marked as not used.
+    Return the number of stickers that the estimator would search for.
     """
     seen = frame.stickers
     expected = np.empty(3)
@@ -263,9 +265,8 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None
     scratch = np.empty((3, 6))
     cameras = scene.assumed_cameras
     limits = scene.limits
+    searched = 0
     for n in range(len(seen.used)):
-        if not seen.used[n]:
-            continue
         transform_point(place, scene.stickers.taught[n], 1.0, expected)
         transform_point(place, scene.stickers.normals[n], 0.0, direction)
         found = True
@@ -273,6 +274,10 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None
             transform_point(cameras.extrinsics[side], expected, 1.0, point)
             transform_point(cameras.extrinsics[side], direction, 0.0, normal)
             found = found and faces(point, normal, limits.grazing)
+        searched += found
+        if not seen.used[n]:
+            continue
+        for side in range(2):
             for i in range(2):
                 pixel = frame.pixels[n, side, i]
                 found = found and -0.5 < pixel < cameras.size[side, i] - 0.5
@@ -284,12 +289,14 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> None
                 seen.points[n], scratch,
             )  # fmt: skip
             found = gap < limits.largest_gap
+            seen.rays[n] = signed_distance(cameras, frame.pixels[n], seen.points[n], gap)
             from_entries(scratch[0], seen.informations[n])
             from_entries(scratch[1], seen.covariances[n])
             for i in range(3):
                 seen.arms[n, i] = expected[i] - place[i, 3]
                 seen.gaps[n, i] = seen.points[n, i] - expected[i]
         seen.used[n] = found
+    return searched
 
 
 @compiled
@@ -307,13 +314,14 @@ def measure_frame(
     covariance = np.empty((6, 6))
     pose_transform(poses[0], platform)
     multiply(scene.camera_from_base, platform, place)
-    triangulate_stickers(scene, place, frame)
+    searched = triangulate_stickers(scene, place, frame)
     stickers = scene.stickers
     none = np.empty((0, 2, 3)), np.empty((0, 2, 6))
     outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, scene.assumed_cameras)
     solve(
-        frame.stickers, stickers.taught, outlines, scene.solver_limits, place, covariance, verdict
-    )
+        frame.stickers, stickers.taught, outlines, scene.solver_limits, place, covariance,
+        searched, verdict,
+    )  # fmt: skip
     if verdict[STATE] == MEASURED:
         multiply(scene.base_from_camera, place, platform)
         transform_pose(platform, pose)

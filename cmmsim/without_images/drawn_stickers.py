@@ -356,6 +356,7 @@ class DrawnStickers:
             np.ones(count),
             found.contrasts,
             found.grounds,
+            np.zeros((count, 5)),
         )
 
 

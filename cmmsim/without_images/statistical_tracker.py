@@ -245,7 +245,7 @@ class StatisticalTracker:
 
     def _frame(self) -> Frame:
         n = len(self._estimator.platform.sticker_ids)
-        rows = (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3)
+        rows = (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (n,)
         stickers = ObservedStickers(np.empty(n, dtype=bool), *(np.empty(shape) for shape in rows))
         pixels = np.empty((n, 2, 2))
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
@@ -290,7 +290,7 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
             estimator.noise, light.optics.psf_px, settings.fit_size, light.sticker, light.ring
         ),
         limits,
-        solver_limits(count, STEP_TOLERANCE),
+        solver_limits(count, settings, STEP_TOLERANCE),
         np.array(taught.base_from_camera, order="C"),
         invert(taught.base_from_camera),
     )

@@ -4,11 +4,13 @@ import cv2
 import numpy as np
 from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from cmmsim.geometry.pose import rigid, skew
 
-FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 4, chi2.isf(1e-4, 3), 6.0
+FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 5, chi2.isf(1e-4, 3), 6.0
+FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-2, 8.0, 3.0, 0.999
+LARGEST_STRAIN, LARGEST_PARTING = 1e-3, 1e3  # a metre
 SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
 
 
@@ -106,10 +108,37 @@ def outline_misfits(shapes, covariances, expected):
     return (change * np.linalg.solve(covariances, change[..., None])[..., 0]).sum(axis=-1)
 
 
-def consistent(seen, rig, radius, places, normals):
-    """Stickers that agree: their index, camera_from_body and its covariance; None when lost."""
-    kept, left_out = np.arange(len(seen.index)), 0
-    while len(kept) >= FEWEST and len(kept) > left_out:
+def warp(transform, places, points, covariances, rays):
+    """Decrease of the squared residuals if strains are fitted, and a part of the rays linear in the
+    place: by least squares of whitened rows.
+    """
+    turned = places @ transform[:3, :3].T
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    pose = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), -skew(turned)], axis=2)
+    sides = np.triu_indices(3)
+    strains = np.array([np.eye(3)[[i]].T @ np.eye(3)[[j]] for i, j in zip(*sides, strict=True)])
+    strains = np.array([part if part.trace() else part + part.T for part in strains])
+    shapes = np.einsum("aij,nj->nia", strains, turned)
+    residuals = np.einsum("nij,nj->ni", whiten, points - turned - transform[:3, 3]).ravel()
+    rows = [(whiten @ part).reshape(3 * len(places), -1) for part in (pose, shapes)]
+    known = np.hstack([np.zeros((6, 6)), np.eye(6) / LARGEST_STRAIN])
+    linear = np.column_stack([np.ones(len(places)), turned])
+    found = [
+        _decrease(np.vstack([np.hstack(rows), known]), np.append(residuals, np.zeros(6))),
+        _decrease(np.vstack([linear, np.eye(4) / LARGEST_PARTING]), np.append(rays, np.zeros(4))),
+    ]
+    return sum(found) - _decrease(rows[0], residuals)
+
+
+def _decrease(rows, right):
+    rest = right - rows @ np.linalg.lstsq(rows, right, rcond=None)[0]
+    return right @ right - rest @ rest
+
+
+def agreeing(kept, fewest, seen, rig, radius, places, normals):
+    """Stickers of ``kept`` that agree, their fit, and the growth of covariances; None when lost."""
+    left_out = 0
+    while len(kept) >= fewest and len(kept) > left_out:
         at, points, covariances = (
             places[seen.index[kept]],
             seen.points[kept],
@@ -125,6 +154,40 @@ def consistent(seen, rig, radius, places, normals):
             misfits = np.maximum(misfits, outline_misfits(*own, expected).max(axis=0))
         growth = excess(total, freedom)
         if misfits.max() <= LARGEST_MISFIT and growth <= LARGEST_EXCESS:
-            return seen.index[kept], transform, growth * covariance
+            return kept, transform, covariance, growth
         kept, left_out = np.delete(kept, misfits.argmax()), left_out + 1
     return None
+
+
+def few_growth(seen, kept, rejected, transform, covariance, places):
+    """Mean square of the residuals of all stickers, with the tail of Student's distribution."""
+    every = np.concatenate([kept, rejected])
+    turned = places[seen.index[every]] @ transform[:3, :3].T
+    gaps = seen.points[every] - turned - transform[:3, 3]
+    slopes = np.concatenate([np.tile(np.eye(3), (len(every), 1, 1)), -skew(turned)], axis=2)
+    spread = seen.covariances[every].copy()
+    spread[len(kept) :] += (slopes @ covariance @ slopes.swapaxes(1, 2))[len(kept) :]
+    squared = np.einsum("ni,nij,nj->n", gaps, np.linalg.inv(spread), gaps)
+    squared[len(kept) :] = np.minimum(squared[len(kept) :], LARGEST_MISFIT)
+    mean = max(squared.sum() / (3 * len(every) - 6), 1.0)
+    return mean * 6.0 * f.ppf(TAIL, 6, 3 * len(kept) - 6) / chi2.ppf(TAIL, 6)
+
+
+def consistent(seen, rig, radius, places, normals):
+    """Stickers that agree: their index, camera_from_body and its covariance; None when lost."""
+    scene = seen, rig, radius, places, normals
+    found = agreeing(np.arange(len(seen.index)), FEWEST, *scene)
+    if found is None:
+        return None
+    kept, transform, covariance, growth = found
+    rejected = np.setdiff1d(np.arange(len(seen.index)), kept)
+    if agreeing(rejected, FEWEST_RIVALS, *scene) is not None:
+        return None
+    own = places[seen.index[kept]], seen.points[kept], seen.covariances[kept], seen.rays[kept]
+    warped = warp(transform, *own)
+    factors = [growth * (EXCESS_SHARE if growth > 1.0 else 1.0)]
+    if 2 * len(kept) <= len(seen.index):
+        factors.append(few_growth(seen, kept, rejected, transform, covariance, places))
+    if warped > growth * chi2.isf(WARP_CHANCE, 10):
+        factors.append(WARP_SHARE * warped / 10.0)
+    return seen.index[kept], transform, max(factors) * covariance

@@ -35,13 +35,9 @@ from cmmsim.measuring.frame_solver import (
     SMALLEST_SHARE,
     consistent,
 )
-from cmmsim.measuring.observation import (
-    DetectionSettings,
-    Observer,
-    Outlines,
-    StickerObservation,
-)
+from cmmsim.measuring.observation import DetectionSettings, Observer
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
+from cmmsim.measuring.sticker_windows import Outlines, StickerObservation
 from cmmsim.visibility import expected_covariance, sight_lines
 from tests.cmmsim import plain
 from tests.cmmsim.sensors import CAMERA, NOISE, require_regions, require_true, squares
@@ -77,7 +73,8 @@ def observed(rng, pixels, spread, stickers):
     )
     seen = triangulate(RIG, left, right, *spread)
     return StickerObservation(
-        stickers, left, right, seen.points, seen.covariances, np.full(len(stickers), np.nan)
+        *(stickers, left, right, seen.points, seen.covariances),
+        *(np.full(len(stickers), np.nan), seen.rays),
     )
 
 
@@ -127,12 +124,16 @@ PIXELS = RIG.project(apply(CAMERA_FROM_BODY, BODY.nominal))[0]
 SHAPES = sticker_outlines(RIG, CAMERA_FROM_BODY, BODY.nominal, BODY.sticker_normals, RADIUS)[1]
 
 
-def seen_from_home(rng, stickers, shift_px=0.0, shrink_px=0.0):
+def seen_from_home(rng, stickers, shift_px=0.0, shrink_px=0.0, slipped=0.0, apart_px=0.0):
     """Stickers with pixel noise; the first one's left centre is shifted along the epipolar line,
-    its shape shrunk.
+    its shape shrunk. The last third has ``slipped`` by some m, and the right image has moved.
     """
     pixels, shapes = PIXELS[:, stickers], SHAPES[:, stickers]
     pixels[0, 0, 0] += shift_px
+    group = BODY.nominal[stickers[-(len(stickers) // 3) :]]
+    here, there = (RIG.project(apply(CAMERA_FROM_BODY, group + off))[0] for off in (0.0, slipped))
+    pixels[:, -len(group) :] += there - here
+    pixels[1] += apart_px
     shapes[0, 0, 0, 0] -= shrink_px
     outlines = Outlines(shapes, np.broadcast_to(0.01**2 * np.eye(3), (2, len(stickers), 3, 3)))
     spread = [pixel_covariances(rng, len(stickers)) for _ in range(2)]
@@ -186,7 +187,9 @@ def test_the_compiled_solver_finds_what_plain_numpy_finds():
     for k in range(150):
         stickers = np.sort(rng.choice(18, rng.integers(4, 19), replace=False))
         seen = seen_from_home(
-            rng, stickers, shift_px=0.4 * (k % 3 == 0), shrink_px=0.1 * (k % 5 == 0)
+            *(rng, stickers, 0.4 * (k % 3 == 0), 0.1 * (k % 5 == 0)),
+            slipped=4e-4 * (k % 8 == 0),
+            apart_px=0.03 * (k % 9 == 0),
         )
         seen = seen if k % 4 else replace(seen, outlines=None)
         seen = seen if k % 7 else replace(seen, covariances=seen.covariances / 4.0)
@@ -242,13 +245,30 @@ def test_displaced_or_misshapen_sticker_is_left_out(seed, wrong):
     np.testing.assert_array_equal(used.index, ALL[1:])
 
 
-def test_three_stickers_are_refused_and_four_of_which_one_is_wrong():
-    with pytest.raises(LostError, match=f"3 visible stickers, at least {FEWEST} are needed"):
-        solved(seen_from_home(np.random.default_rng(5), [0, 7, 12]))
+def test_four_stickers_are_refused_and_five_of_which_one_is_wrong():
+    with pytest.raises(LostError, match=f"4 visible stickers, at least {FEWEST} are needed"):
+        solved(seen_from_home(np.random.default_rng(5), [0, 5, 7, 12]))
     with pytest.raises(
-        LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"
+        LostError, match=r"5 visible stickers contradict each other, 4 are left .* squared misfit"
     ):
-        solved(seen_from_home(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0))
+        solved(seen_from_home(np.random.default_rng(4), [0, 3, 5, 7, 12], shift_px=1.0))
+
+
+def test_a_group_that_has_slipped_refuses_the_frame_even_if_it_is_a_third():
+    seen = seen_from_home(np.random.default_rng(2), ALL, slipped=4e-4)
+    with pytest.raises(LostError, match="12 visible stickers agree on one pose and 6 on another"):
+        solved(seen)
+
+
+def test_images_that_are_apart_widen_the_covariance_though_each_sticker_agrees():
+    """A right image that is 0.04 px off moves each sticker by three deviations of its noise."""
+    rng = np.random.default_rng(3)
+    usual = solved(seen_from_home(rng, ALL))
+    apart = solved(seen_from_home(rng, ALL, apart_px=np.array([0.02, 0.03])))
+    assert len(apart[0].index) == 18
+    error = np.linalg.inv(CAMERA_FROM_BODY) @ apart[1] - np.eye(4)
+    assert np.linalg.norm(error[:3, 3]) > 3.0 * np.sqrt(np.trace(usual[2][:3, :3]))
+    assert np.trace(apart[2]) > 10.0 * np.trace(usual[2])
 
 
 def test_a_sticker_is_left_out_once_its_outline_misfits_by_the_limit():
@@ -266,14 +286,14 @@ def test_a_sticker_is_left_out_once_its_outline_misfits_by_the_limit():
 
 def test_drifted_camera_enlarges_the_covariance():
     """Residuals of twice the stated noise: all stickers are kept, and all covariances are four
-    times as large.
+    times as large, times what errors share that are no noise.
     """
     seen = seen_from_home(np.random.default_rng(9), ALL)
     doubled = replace(seen, covariances=seen.covariances / 4.0)
     usual, scaled = solved(seen), solved(doubled)
     assert len(scaled[0].index) == 18
     squared = plain.fitted(BODY.nominal, seen.points, seen.covariances)[2]
-    factor = squared.sum() / (3 * 18 - 6)
+    factor = plain.EXCESS_SHARE * squared.sum() / (3 * 18 - 6)
     np.testing.assert_allclose(scaled[2], factor * usual[2], rtol=1e-6)
     np.testing.assert_allclose(scaled[0].covariances, factor * usual[0].covariances, rtol=1e-6)
 

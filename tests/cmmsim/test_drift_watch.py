@@ -18,7 +18,8 @@ from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import PLACE_NAMES, triangulate
 from cmmsim.measuring.measurement import Measurement, lost_measurement
-from cmmsim.measuring.observation import StickerObservation, faces_camera
+from cmmsim.measuring.observation import faces_camera
+from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 from cmmsim.uncertainty.drift_evidence import Filter
 from cmmsim.uncertainty.drift_watch import DriftWatch
@@ -83,18 +84,21 @@ class Projected:
         pixels = rig.project(points)[0] + NOISE_PX * self.rng.standard_normal((2, len(points), 2))
         spread = np.tile(NOISE_PX**2 * np.eye(2), (2, len(points), 1, 1))
         found = triangulate(self.known.rig, *pixels, *spread)
-        return pixels, found.points, found.covariances
+        return pixels, found
 
     def base_seen(self, rig):
-        pixels, points, spread = self._seen(rig, apply(self.camera_from_base, self.base))
+        pixels, seen = self._seen(rig, apply(self.camera_from_base, self.base))
+        count = len(self.base)
         return StickerObservation(
-            np.arange(len(points)), *pixels, points, spread, np.full(len(points), NOISE_PX**2)
+            *(np.arange(count), *pixels, seen.points, seen.covariances),
+            *(np.full(count, NOISE_PX**2), seen.rays),
         )
 
     def measured(self, rig, pose):
-        pixels, points, spread = self._seen(
+        pixels, seen = self._seen(
             rig, apply(self.camera_from_base @ pose_to_transform(pose), self.places)
         )
+        points, spread = seen.points, seen.covariances
         found = register(self.known.taught.platform_places[self.index], points, spread).transform
         names, variances = (
             self.known.platform.sticker_ids[self.index],

@@ -19,7 +19,7 @@ from cmmsim.detection.start_kernels import (
     two_of_rank,
 )
 from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
-from tests.cmmsim.sensors import NOISE, random_ellipses
+from tests.cmmsim.sensors import NOISE, random_ellipses, require_true, squares
 
 SIZE, FIT = 16, 14
 LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
@@ -216,3 +216,48 @@ def test_information_of_a_rounded_number_is_that_of_its_probabilities():
             assert grey_value_information(np.array([mean]), noise)[0] == pytest.approx(
                 expected, rel=1e-4
             )
+
+
+def rising(seed, count, rise, fine=12):
+    """Noisy windows of ellipses on which the light rises by up to ``rise`` a px, and their centres.
+
+    Drawn by fine samples, each inside or outside.
+    """
+    rng = np.random.default_rng(seed)
+    centres, shapes = random_ellipses(rng, count, SIZE, (3.8, 2.8))
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    slopes = rise * np.stack([np.cos(angle), np.sin(angle)], -1)
+    ticks = (np.arange(SIZE * fine) + 0.5) / fine - 0.5
+    away = np.stack(np.meshgrid(ticks, ticks), -1) - centres[:, None, None]
+    inside = np.linalg.norm(away @ np.linalg.inv(shapes)[:, None], axis=-1) < 1.0
+    lit = 1.0 + np.einsum("nijk,nk->nij", away, slopes)
+    radiance = lit * (8.0 + 200.0 * inside) / 255.0
+    radiance = radiance.reshape(count, SIZE, fine, SIZE, fine).mean(axis=(2, 4))
+    return NOISE.expose(radiance.astype(np.float32), rng), centres
+
+
+def test_light_that_rises_across_a_sticker_is_fitted_with_it():
+    """By 6 % a px, half of it across a radius. The error is that which the covariance states; even
+    light would put the centres six deviations off.
+    """
+    windows, centres = rising(2, 400, 0.06)
+    corners = np.zeros((400, 2), dtype=int)
+    even, lit = (fit_ellipses(windows, corners, NOISE, FIT, lit=lit) for lit in (False, True))
+    assert lit.good.all()
+    require_true(squares(lit.centres - centres, lit.covariances), 2)
+    assert np.median(squares(even.centres - centres, even.covariances)) > 36.0
+    assert np.mean(lit.misfits) == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_fit_tells_how_light_would_move_its_centre():
+    """The shift is that of the fit with light, for little of it; without light it is as large as
+    its own covariance says.
+    """
+    windows, _ = rising(3, 400, 0.01)
+    corners = np.zeros((400, 2), dtype=int)
+    even, lit = (fit_ellipses(windows, corners, NOISE, FIT, lit=lit) for lit in (False, True))
+    shifts = lit.centres - even.centres
+    assert np.std(even.lights[:, :2] - shifts) < 0.1 * np.std(shifts)
+    windows, _ = rising(4, 400, 0.0)
+    lights = fit_ellipses(windows, corners, NOISE, FIT).lights
+    require_true(squares(lights[:, :2], lights[:, [[2, 3], [3, 4]]]), 2)

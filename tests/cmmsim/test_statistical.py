@@ -15,8 +15,8 @@ import cmmsim
 from cmmsim.detection.ellipse_fit import fit_settings, lies_inside
 from cmmsim.geometry.disc_image import SHAPE_BASIS
 from cmmsim.geometry.pose import invert, pose_to_transform
-from cmmsim.measuring.observation import StickerObservation
 from cmmsim.measuring.solver_kernels import COLUMNS, LEFT, SEEN, STATE
+from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.without_images.drawn_fit_kernels import fit_covariances, tabulated
 from cmmsim.without_images.drawn_frame_kernels import (
@@ -156,7 +156,8 @@ def test_the_estimator_says_the_same_of_the_same_stickers(lens, known):
             estimator.rig, pixels, spreads, frame.stickers.points[index], settings.line_error_px**2
         )
         observed = StickerObservation(
-            index, *pixels, points, covariances, 0.25 * np.einsum("ckii->k", spreads)
+            *(index, *pixels, points, covariances, 0.25 * np.einsum("ckii->k", spreads)),
+            frame.stickers.rays[index],
         )
         expected = estimator.measured(observed, near)[0]
         used = frame.stickers.used

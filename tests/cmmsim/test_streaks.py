@@ -10,7 +10,7 @@ from scipy.stats import chi2, kstest
 import cmmsim
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply
-from cmmsim.measuring.observation import LONGEST_SMEAR_PX
+from cmmsim.measuring.sticker_windows import LONGEST_SMEAR_PX
 from cmmsim.measuring.streaks import find_streaks
 from tests.cmmsim.sensors import TWELVE_BIT, camera_from, exact, poses_about_home, squared_error
 

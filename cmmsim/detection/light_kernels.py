@@ -1,0 +1,158 @@
+"""Compiled kernels for stickers that are brighter on one side than on the other.
+
+Light that rises across a sticker multiplies all that the sticker sends to the camera by
+1 + g_x x + g_y y, where x and y are counted from a fixed place in the window, px. Where a blurred
+rim crosses a pixel, the mean place of the light that reaches the pixel is not the middle of the
+pixel. By Stein's identity, the share s of a pixel times that mean place is s x - v ds/dx, where v
+is the variance of the point spread and of the pixel together.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+from cmmsim.geometry.matrix_kernels import solve_factored
+
+if TYPE_CHECKING:
+    from cmmsim.detection.fit_kernels import FitSettings
+
+EVEN_UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
+LIT_UNKNOWNS = 9  # the same, then g_x and g_y
+PIXEL_VARIANCE = 1.0 / 12.0
+
+
+@compiled
+def variance_at(mean: float, settings: FitSettings) -> float:
+    """Return the noise variance of a mean grey value, interpolated linearly in the table."""
+    place = (mean - settings.first_grey) * settings.entries_a_grey
+    k = min(max(int(place), 0), len(settings.variances) - 2)
+    return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
+
+
+@compiled
+def accumulate_lit(
+    window: Array, mask: Array, shares: Array, derivatives: Array, parameters: Array, start: Array,
+    settings: FitSettings, normal: Array, right: Array,
+) -> float:  # fmt: skip
+    """Fill the normal matrix (9, 9) and the right-hand side (9,) for light that rises.
+
+    ``start`` (2,) is the place from which x and y are counted. Return the weighted sum of squared
+    residuals.
+    """
+    variance = settings.psf_px * settings.psf_px + PIXEL_VARIANCE
+    contrast = parameters[5]
+    ground = parameters[6] - settings.black
+    g_x = parameters[7]
+    g_y = parameters[8]
+    row = np.empty(LIT_UNKNOWNS)
+    normal[:] = 0.0
+    right[:] = 0.0
+    misfit = 0.0
+    for i in range(window.shape[0]):
+        for j in range(window.shape[1]):
+            if not mask[i, j]:
+                continue
+            x = j - start[0]
+            y = i - start[1]
+            share = shares[i, j]
+            change = derivatives[i, j]
+            factor = 1.0 + g_x * x + g_y * y
+            for k in range(5):
+                row[k] = contrast * factor * change[k]
+            row[5] = factor * share - variance * (g_x * change[0] + g_y * change[1])
+            row[6] = factor
+            row[7] = ground * x + contrast * (share * x - variance * change[0])
+            row[8] = ground * y + contrast * (share * y - variance * change[1])
+            mean = settings.black + ground * factor + contrast * row[5]
+            weight = 1.0 / variance_at(mean, settings)
+            residual = window[i, j] - mean
+            misfit += weight * residual * residual
+            for a in range(LIT_UNKNOWNS):
+                weighted = weight * row[a]
+                right[a] += weighted * residual
+                for b in range(a + 1):
+                    normal[a, b] += weighted * row[b]
+    return misfit
+
+
+@compiled
+def light_across(
+    window: Array, mask: Array, shares: Array, derivatives: Array, parameters: Array,
+    settings: FitSettings, lower: Array, step: Array, light: Array,
+) -> None:  # fmt: skip
+    """Fill the shift (2,) of the centre if rising light were fitted too, and its covariance.
+
+    ``light`` (5,) are the shift x, y and the entries xx, xy, yy of its covariance, px and px². They
+    are exact to first order in the slope of the light. ``parameters`` (7,) are those of the last
+    normal matrix, whose factor is ``lower``, and ``step`` (7,) is the step that follows from it.
+    """
+    variance = settings.psf_px * settings.psf_px + PIXEL_VARIANCE
+    contrast = parameters[5]
+    ground = parameters[6] - settings.black
+    mixed = np.zeros((2, EVEN_UNKNOWNS))
+    slope = np.empty(2)
+    own_xx = own_xy = own_yy = 0.0
+    right_x = right_y = 0.0
+    dark = 1.0 / variance_at(parameters[6], settings)
+    bright = 1.0 / variance_at(parameters[6] + contrast, settings)
+    for i in range(window.shape[0]):
+        y = i - parameters[1]
+        for j in range(window.shape[1]):
+            if not mask[i, j]:
+                continue
+            x = j - parameters[0]
+            share = shares[i, j]
+            mean = parameters[6] + contrast * share
+            inner = ground + contrast * share
+            slope[0] = inner * x
+            slope[1] = inner * y
+            weight = dark if share == 0.0 else bright
+            if 0.0 < share < 1.0:
+                weight = 1.0 / variance_at(mean, settings)
+                change = derivatives[i, j]
+                slope[0] -= contrast * variance * change[0]
+                slope[1] -= contrast * variance * change[1]
+                for k in range(2):
+                    weighted = weight * slope[k] * contrast
+                    for a in range(5):
+                        mixed[k, a] += weighted * change[a]
+            residual = weight * (window[i, j] - mean)
+            right_x += slope[0] * residual
+            right_y += slope[1] * residual
+            own_xx += weight * slope[0] * slope[0]
+            own_xy += weight * slope[0] * slope[1]
+            own_yy += weight * slope[1] * slope[1]
+            for k in range(2):
+                mixed[k, 5] += weight * slope[k] * share
+                mixed[k, 6] += weight * slope[k]
+    taken = mixed.copy()
+    for k in range(2):
+        solve_factored(lower, taken[k])
+    for a in range(EVEN_UNKNOWNS):
+        right_x -= mixed[0, a] * step[a]
+        right_y -= mixed[1, a] * step[a]
+        own_xx -= mixed[0, a] * taken[0, a]
+        own_xy -= mixed[0, a] * taken[1, a]
+        own_yy -= mixed[1, a] * taken[1, a]
+    determinant = own_xx * own_yy - own_xy * own_xy
+    light[:] = 0.0
+    if not (own_xx > 0.0 and determinant > 0.0):
+        return
+    spread_xx = own_yy / determinant
+    spread_xy = -own_xy / determinant
+    spread_yy = own_xx / determinant
+    g_x = spread_xx * right_x + spread_xy * right_y
+    g_y = spread_xy * right_x + spread_yy * right_y
+    light[0] = -taken[0, 0] * g_x - taken[1, 0] * g_y
+    light[1] = -taken[0, 1] * g_x - taken[1, 1] * g_y
+    # The covariance of the shift is T' S T, with the taken parts T of the centre.
+    for k in range(3):
+        a = 0 if k < 2 else 1
+        b = 0 if k < 1 else 1
+        light[2 + k] = (
+            taken[0, a] * (spread_xx * taken[0, b] + spread_xy * taken[1, b])
+            + taken[1, a] * (spread_xy * taken[0, b] + spread_yy * taken[1, b])
+        )  # fmt: skip

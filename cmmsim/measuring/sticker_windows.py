@@ -1,0 +1,291 @@
+"""Windows around the stickers of a body, and the stickers that are found in them.
+
+Centres are detected in the windows, and both images' centres are triangulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from cmmsim.detection.detector import DetectedCentres, SpotWindows
+from cmmsim.detection.ellipse_fit import (
+    MAXIMUM_LIKELIHOOD,
+    SMEAR_STEP_PX,
+    EllipseFits,
+    fit_ellipses,
+)
+from cmmsim.geometry.pose import Array, apply_each
+from cmmsim.geometry.stereo_rig import triangulate
+from cmmsim.radiometry.stereo_images import Windows
+
+if TYPE_CHECKING:
+    from cmmsim.measuring.observation import Observer
+
+# A smear is the movement of a sticker's image during the exposure. The longest smear that can be
+# measured is about the size of a sticker.
+LONGEST_SMEAR_PX = 8.0
+# Shortest smear that changes the result of a fit, in standard deviations of the point spread.
+SHORTEST_SMEAR = 1.5
+# Probability that light across the stickers is fitted in an evenly lit frame, and the squared
+# movement of its pose, in units of noise, that this allows.
+LIGHT_CHANCE = 1e-4
+LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Ellipses of k stickers in both images.
+
+    ``shapes`` are symmetric matrices A (2, k, 2, 2), px. ``covariances`` (2, k, 3, 3), px², are the
+    covariances of the entries A_xx, A_xy, A_yy.
+    """
+
+    shapes: Array
+    covariances: Array
+
+    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
+        """Select some of the stickers."""
+        return Outlines(self.shapes[:, keep], self.covariances[:, keep])
+
+
+@dataclass(frozen=True)
+class StickerObservation:
+    """Stickers seen by both cameras, k of them.
+
+    index                      (k,), indices of the stickers among the body's stickers
+    left_pixels, right_pixels  (k, 2), sticker centres in the distorted images, without eccentricity
+    points, covariances        (k, 3) and (k, 3, 3), in the camera frame, m
+    pixel_variances            (k,), of pixel coordinates, mean over both images and axes, px²
+    rays                       (k,), signed distances of both rays of a sticker, in deviations
+    outlines                   ellipses of the stickers; None if the detector states no ellipses
+    searched                   (f,), number of stickers that were searched in each of f exposures;
+                               None if all were found
+    """
+
+    index: NDArray[np.int_]
+    left_pixels: Array
+    right_pixels: Array
+    points: Array
+    covariances: Array
+    pixel_variances: Array
+    rays: Array
+    outlines: Outlines | None = None
+    searched: NDArray[np.int_] | None = None
+
+    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
+        """Return the observation with only some of its stickers."""
+        whole = ("outlines", "searched")
+        kept = {name: values[keep] for name, values in vars(self).items() if name not in whole}
+        outlines = None if self.outlines is None else self.outlines.selected(keep)
+        return StickerObservation(**kept, outlines=outlines, searched=self.searched)
+
+
+@dataclass(frozen=True)
+class StickerWindows:
+    """Grey values around the k stickers of a body that both cameras of an observer should see.
+
+    index             (k,), indices of the stickers among the body's stickers
+    exposures         (k,), number of the exposure that shows each sticker, in rising order
+    camera_from_body  (4, 4) or (N, 4, 4), expected place of the body in each exposure
+    places, normals   (k, 3), of the stickers, in body axes, m
+    corners           (2, k, 2), first pixels of the windows
+    windows           (2, k, h, h), grey values without vignetting in which stickers are bright;
+                      empty without images
+    offsets           (2, k, 2), eccentricities of the ellipses, px
+    found             result of the detector for exposures without images, otherwise None
+    """
+
+    observer: Observer
+    index: NDArray[np.int_]
+    exposures: NDArray[np.int_]
+    camera_from_body: Array
+    places: Array
+    normals: Array
+    corners: NDArray[np.int_]
+    windows: Windows
+    offsets: Array
+    found: DetectedCentres | None = None
+
+    def observed(self, exposure_ends: tuple[Array, Array] | None = None) -> StickerObservation:
+        """Return the stickers in these windows; see ``Observer.observe`` for ``exposure_ends``."""
+        if len(self.index) == 0:
+            none = np.zeros((0, 3))
+            pixels = none[:, :2]
+            each = none[:, 0]
+            return StickerObservation(
+                self.index, pixels, pixels, none, np.zeros((0, 3, 3)), each, each
+            )
+        settings = self.observer.settings
+        fits = self.found or self._detected()
+        smears = np.zeros((2, len(self.index), 2))
+        if exposure_ends is not None and self.found is None:
+            fits = self._more_likely(fits, exposure_ends, smears)
+        if self.found is None and isinstance(fits, EllipseFits):
+            fits = self._lit(fits, smears)
+        seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
+        systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
+        spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
+        # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
+        # would be too near to the ray of the sharper image.
+        line_variance = settings.line_error_px**2
+        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
+        near = apply_each(moves, self.places[:, None])[:, 0]
+        left, right = seen_at
+        seen = triangulate(
+            self.observer.rig, left, right, spread[0], spread[1], near, line_variance
+        )
+        good = np.all(fits.good.reshape(2, -1), axis=0)
+        # Mean variance over two coordinates in two images.
+        noise = 0.25 * np.einsum("ckii->k", spread)
+        outlines = _outlines(fits, settings.centre_error_px**2)
+        found = StickerObservation(
+            self.index, left, right, seen.points, seen.covariances, noise, seen.rays, outlines
+        )
+        exposures = len(self.camera_from_body.reshape(-1, 4, 4))
+        searched = np.bincount(self.exposures, minlength=exposures)
+        good &= seen.ray_gap < settings.largest_ray_gap
+        return replace(found, searched=searched).selected(good)
+
+    def ellipses(self, smears: Array | None = None, lit: bool = False) -> EllipseFits:
+        """Fit ellipses to all 2k windows, without a limit on the misfit.
+
+        See ``fit_ellipses`` for ``smears`` (2k, 2) and ``lit``.
+        """
+        settings = self.observer.settings
+        limits = replace(settings.limits, largest_misfit=np.inf)
+        return fit_ellipses(
+            *self._flat,
+            self.observer.upright,
+            settings.fit_size,
+            limits,
+            psf_px=settings.optics.psf_px,
+            smears=smears,
+            lit=lit,
+        )
+
+    @cached_property
+    def ellipses_at_rest(self) -> EllipseFits:
+        """Ellipses fitted as for a body at rest.
+
+        The search for streaks uses them, and so does the measurement of a body at rest.
+        """
+        return self.ellipses()
+
+    def _detected(self, smears: Array | None = None) -> DetectedCentres:
+        """Return the centres that the detector finds in the windows."""
+        detector = self.observer.detector
+        noise = self.observer.upright
+        settings = self.observer.settings
+        if detector is MAXIMUM_LIKELIHOOD:
+            fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
+            return fits.within(settings.limits, noise)
+        fit_size = settings.fit_size + 2 * detector.margin_px
+        spots = SpotWindows(
+            *self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears
+        )
+        return detector.detect(spots)
+
+    @property
+    def _flat(self) -> tuple[Windows, NDArray[np.int_]]:
+        """Windows (2k, h, h) and corners (2k, 2) of both images together."""
+        return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
+
+    def _lit(self, even: EllipseFits, smears: Array) -> DetectedCentres:
+        """Fit rising light with each sticker in the exposures in which it moves the pose.
+
+        Without such light, a fit of it would only widen the covariance. ``even`` are the fits
+        without, for stickers that move by ``smears`` (2, k, 2) px during the exposure.
+        """
+        # Imported late, because importing numba takes time.
+        from cmmsim.measuring.warp_kernels import light_sizes
+
+        good = np.flatnonzero(np.all(even.good.reshape(2, -1), axis=0))
+        exposures = np.arange(self.exposures[-1] + 2)
+        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures[good]]
+        near = apply_each(moves, self.places[good, None])[:, 0]
+        sizes = np.empty(len(exposures) - 1)
+        light_sizes(
+            self.observer.rig.kernel_cameras,
+            near,
+            near - moves[:, :3, 3],
+            even.covariances.reshape(2, -1, 2, 2)[:, good],
+            even.lights.reshape(2, -1, 5)[:, good],
+            np.searchsorted(self.exposures[good], exposures),
+            sizes,
+        )
+        shown = (sizes > LARGEST_LIGHT)[self.exposures]
+        if not shown.any():
+            return even
+        part = self._selected(shown)
+        lit = part.ellipses(smears[:, shown].reshape(-1, 2), lit=True)
+        lit = lit.within(self.observer.settings.limits, self.observer.upright)
+        return even.with_others(
+            np.flatnonzero(np.tile(shown, 2)), lit, np.ones(2 * len(part.index), dtype=bool)
+        )
+
+    def _more_likely(
+        self, still: DetectedCentres, exposure_ends: tuple[Array, Array], taken: Array
+    ) -> DetectedCentres:
+        """Choose, for each exposure, between the result for a body at rest and for a moving body.
+
+        The movement between ``exposure_ends`` is only a prediction, and the platform can have
+        stopped. The result that agrees better with the images is therefore chosen. ``still`` is the
+        result for a body at rest. ``taken`` (2, k, 2) is filled with the movements of the stickers
+        in the chosen results, px.
+        """
+        smears, shown = self._smears(exposure_ends)
+        if still.misfits is None or not shown.any():
+            return still
+        moving = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2))
+        again = np.tile(shown, 2)
+        if moving.misfits is None:
+            return still
+        gains = (still.misfits[again] - moving.misfits).reshape(2, -1)
+        _, starts, counts = np.unique(self.exposures[shown], return_index=True, return_counts=True)
+        better = [np.median(own) > 0.0 for own in np.split(gains, starts[1:], axis=1)]
+        chosen = np.repeat(better, counts)
+        at = np.flatnonzero(shown)[chosen]
+        taken[:, at] = smears[:, at]
+        both = np.tile(chosen, 2)
+        return still.with_others(np.flatnonzero(again)[both], moving, both)
+
+    def _smears(self, exposure_ends: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the stickers' movements (2, k, 2) px during the exposure, and a mask (k,).
+
+        The mask is False for exposures in which the longest movement is too short compared with the
+        point spread, or too long to be measured.
+        """
+        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in exposure_ends)
+        first, last = (
+            self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0]
+            for move in moves
+        )
+        shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
+        longest = np.zeros(self.exposures[-1] + 1)
+        np.maximum.at(longest, self.exposures, np.linalg.norm(last - first, axis=-1).max(axis=0))
+        return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
+
+    def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
+        """Return the windows of only some of the stickers."""
+        each = {
+            name: getattr(self, name)[keep] for name in ("index", "exposures", "places", "normals")
+        }
+        both = {name: getattr(self, name)[:, keep] for name in ("corners", "windows", "offsets")}
+        return replace(self, **each, **both)
+
+
+def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
+    """Return the ellipses in both images, or None if the detector states none.
+
+    ``systematic`` px² is the variance of systematic errors of the rim, which is added.
+    """
+    if fits.shapes is None or fits.shape_covariances is None:
+        return None
+    spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
+    return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)
