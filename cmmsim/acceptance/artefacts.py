@@ -37,7 +37,7 @@ LENGTH = 0.300
 HALF_LENGTH = 0.5 * LENGTH + 0.065
 HALF_WIDTH = HALF_RIDGE + SIDE_WIDTH
 # True transform from the frame of the second end to the frame of the first end.
-END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
+FIRST_FROM_SECOND = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
 StickerRow = tuple[ArrayLike, ArrayLike]
 """Places of the stickers of one side: along (n,) and across (n,) the artefact, m.

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.acceptance.artefacts import (
-    END_FROM_END,
+    FIRST_FROM_SECOND,
     HALF_LENGTH,
     HALF_WIDTH,
     SensorUnderTest,
@@ -55,12 +55,13 @@ TOWARDS_DEPTH = np.deg2rad(35.0)
 # s: step of the difference quotient of a path.
 STEP = 1e-4
 SPEED_SAMPLES = 100
+# Number of the stream of noise of the first run.
 STREAM = 101
 # Number of exposures of the bar at rest at the start of each run.
-STANDING = 15
+STANDING_FRAMES = 15
 # Number of consecutive lost frames that ends a run. After each lost frame, the whole images are
 # searched, which takes time, and further frames would probably be lost as well.
-GIVEN_UP = 5
+MOST_LOST_FRAMES = 5
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
     "along x": np.array([1.0, 0.0, 0.0]),
@@ -146,7 +147,8 @@ class BarRun:
     lost             number of frames in which an end was not measured
     given_up         reason if the run has ended early, otherwise empty
 
-    If GIVEN_UP consecutive frames are lost, the run ends, and its remaining frames count as lost.
+    If MOST_LOST_FRAMES consecutive frames are lost, the run ends, and its remaining frames count as
+    lost.
     """
 
     name: str
@@ -206,7 +208,7 @@ def bar_test(
     under_test: SensorUnderTest,
     volume: MeasuringVolume,
     seconds: float = SECONDS,
-    standing: int = STANDING,
+    standing: int = STANDING_FRAMES,
     advance: Callable[[], None] = lambda: None,
 ) -> BarTest:
     """Move the bar along the six paths of a volume, and measure its relative pose errors.
@@ -252,7 +254,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
         else:
             lost_in_a_row = lost_in_a_row + 1
             reason = first.reason or second.reason
-            if lost_in_a_row == GIVEN_UP:
+            if lost_in_a_row == MOST_LOST_FRAMES:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(
@@ -260,7 +262,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
             f"{reason}"
         )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
-    given_up = reason if lost_in_a_row == GIVEN_UP else ""
+    given_up = reason if lost_in_a_row == MOST_LOST_FRAMES else ""
     return BarRun(
         path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen), given_up
     )
@@ -274,9 +276,9 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
     covariance, divided by 6.
     """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
-    turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
-    error = np.concatenate([measured[:3, 3] - END_FROM_END[:3, 3], turn])
-    distance = float(np.linalg.norm(measured[:3, 3]) - np.linalg.norm(END_FROM_END[:3, 3]))
+    turn = rotation_log(measured[:3, :3] @ FIRST_FROM_SECOND[:3, :3].T)
+    error = np.concatenate([measured[:3, 3] - FIRST_FROM_SECOND[:3, 3], turn])
+    distance = float(np.linalg.norm(measured[:3, 3]) - np.linalg.norm(FIRST_FROM_SECOND[:3, 3]))
     covariance = relative_covariance(first, second)
     return error, distance, float(error @ np.linalg.solve(covariance, error)) / 6.0
 

@@ -54,7 +54,7 @@ FEWEST_FITTED = 0.5
 # Samples along each side of the square around a dot in which its area is measured.
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
-EXTREMES = (2.0, 98.0)
+EXTREME_PERCENTILES = (2.0, 98.0)
 # The noise of a photograph is unknown, and edges are blurred. All grey values therefore have equal
 # weight, and the limit rejects only shapes that are no ellipse (residuals of 25 grey values rms).
 PLAIN_NOISE = CameraNoise(
@@ -116,18 +116,18 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
-    flat, _ = cv2.findHomography(plane, view.pixels)
-    if flat is None:
+    homography, _ = cv2.findHomography(plane, view.pixels)
+    if homography is None:
         return "its points lie on one line"
-    if np.linalg.det(flat) * (np.append(plane.mean(axis=0), 1.0) @ flat[2]) < 0.0:
+    if np.linalg.det(homography) * (np.append(plane.mean(axis=0), 1.0) @ homography[2]) < 0.0:
         if board.kind == "asymmetric_dots":
             return "the dots were found in mirrored order"
         view = view.read_as(grid[:, ::-1].ravel())
         plane = board.points[view.index, :2]
-        flat, _ = cv2.findHomography(plane, view.pixels)
-    expected = cv2.perspectiveTransform(plane[None], flat)[0]
+        homography, _ = cv2.findHomography(plane, view.pixels)
+    expected = cv2.perspectiveTransform(plane[None], homography)[0]
     step = np.linalg.norm(
-        np.diff(cv2.perspectiveTransform(board.points[None, :2, :2], flat)[0], axis=0)
+        np.diff(cv2.perspectiveTransform(board.points[None, :2, :2], homography)[0], axis=0)
     )
     gap = np.linalg.norm(expected - view.pixels, axis=1).max()
     if gap > LARGEST_POINT_GAP * step:
@@ -205,9 +205,11 @@ def _refine(
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
         windows = cut_windows(bright, corners, int(size))
-        alone = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
-        spread = _point_spread(alone[:PROBED], corners[:PROBED]) if spread is None else spread
-        fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread)
+        isolated = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
+        spread = _point_spread(isolated[:PROBED], corners[:PROBED]) if spread is None else spread
+        fits = fit_ellipses(
+            isolated, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread
+        )
         moved = np.linalg.norm(fits.centres - rough[chosen], axis=1)
         clean = fits.good & (moved < np.maximum(LARGEST_MOVE * largest[chosen], 0.5))
         fine[chosen[clean]] = fits.centres[clean]
@@ -242,12 +244,12 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
     The matrices follow from the homography of the board.
     """
     plane = board.points[:, :2]
-    flat, _ = cv2.findHomography(plane, rough)
+    homography, _ = cv2.findHomography(plane, rough)
     moved = [
-        cv2.perspectiveTransform((plane + step)[None], flat)[0]
+        cv2.perspectiveTransform((plane + step)[None], homography)[0]
         for step in board.dot_radius * np.eye(2)
     ]
-    middle = cv2.perspectiveTransform(plane[None], flat)[0]
+    middle = cv2.perspectiveTransform(plane[None], homography)[0]
     return np.stack([m - middle for m in moved], axis=2)
 
 
@@ -258,9 +260,9 @@ def _without_neighbours(
     # Imported late, because importing numba takes time.
     from cmmsim.detection.start_kernels import isolate_dots
 
-    alone = np.array(windows, dtype=float)
-    isolate_dots(alone, np.ascontiguousarray(centres), np.linalg.inv(shapes), GROUND_FROM, reach)
-    return alone
+    isolated = np.array(windows, dtype=float)
+    isolate_dots(isolated, np.ascontiguousarray(centres), np.linalg.inv(shapes), GROUND_FROM, reach)
+    return isolated
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
@@ -276,7 +278,7 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
     cell = np.stack(np.meshgrid(ticks, ticks), axis=-1)[within]
     places = (centres[:, None] + cell @ steps.swapaxes(1, 2)).astype(np.float32)
     values = cv2.remap(bright, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
-    middle = np.percentile(values, EXTREMES, axis=1).mean(axis=0)[:, None]
+    middle = np.percentile(values, EXTREME_PERCENTILES, axis=1).mean(axis=0)[:, None]
     ground = np.nanmedian(np.where(values <= middle, values, np.nan), axis=1)
     dot = np.nanmedian(np.where(values >= middle, values, np.nan), axis=1)
     area = (values.mean(axis=1) - ground) / np.maximum(dot - ground, 1.0)
@@ -307,8 +309,10 @@ def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
     last = np.array([board.columns - 1, board.rows - 1], dtype=np.float32)
     grid = last * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
     for turn in range(4):
-        flat = cv2.getPerspectiveTransform(np.roll(corners, turn, axis=0).astype(np.float32), grid)
-        places = cv2.perspectiveTransform(points[None], flat)[0]
+        homography = cv2.getPerspectiveTransform(
+            np.roll(corners, turn, axis=0).astype(np.float32), grid
+        )
+        places = cv2.perspectiveTransform(points[None], homography)[0]
         cells = np.rint(places)
         inside = np.all((cells >= 0) & (cells <= last))
         index = (cells[:, 1] * board.columns + cells[:, 0]).astype(int)

@@ -39,15 +39,15 @@ EDGE_PX = 2
 SMALLEST_CONDITION = 1e-9
 
 
-def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
+def detect_by_dual_conic(spot_windows: SpotWindows) -> DetectedCentres:
     """Return centres by the dual conic operator.
 
     The point spread only increases the required distance from the window's edge. Smears are
     ignored.
     """
-    if len(given.windows) == 0:
+    if len(spot_windows.windows) == 0:
         return no_centres()
-    spots = bright_spots(given)
+    spots = bright_spots(spot_windows)
     lines = _edge_lines(spots)
     basis = np.stack(
         [lines.a**2, lines.a * lines.b, lines.b**2, lines.a * lines.c, lines.b * lines.c]
@@ -59,15 +59,17 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
     jacobian = _centre_by_pixels(lines, basis, normal, dual)
-    variance = given.noise.variance(spots.windows)
+    variance = spot_windows.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
     squared = _squared_shape(dual) * lines.unit_px[:, None, None] ** 2
     good = (
-        (spots.contrast >= given.limits.smallest_contrast)
+        (spots.contrast >= spot_windows.limits.smallest_contrast)
         & determined
         & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
     )
-    good &= whole_inside(centres, 0.25 * squared, given.fit_size, EDGE_PX + given.psf_px)
+    good &= whole_inside(
+        centres, 0.25 * squared, spot_windows.fit_size, EDGE_PX + spot_windows.psf_px
+    )
     return DetectedCentres(centres + spots.corners, covariances, good)
 
 
@@ -116,9 +118,9 @@ def _filtered(
 
     Values outside the window are zero.
     """
-    turn = -1 if adjoint else 1
-    across = ndimage.correlate1d(values, along_x[::turn], axis=2, mode="constant")
-    return ndimage.correlate1d(across, along_y[::turn], axis=1, mode="constant")
+    direction = -1 if adjoint else 1
+    across = ndimage.correlate1d(values, along_x[::direction], axis=2, mode="constant")
+    return ndimage.correlate1d(across, along_y[::direction], axis=1, mode="constant")
 
 
 def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:

@@ -49,7 +49,7 @@ DEFAULT_FREQUENCY = 2 * np.pi * 3
 """Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID."""
 
 DEFAULT_DAMPING = 0.7
-"""Damping ratio of this joint."""
+"""Damping ratio of the joint with the least inertia, if a file states no joint PID."""
 
 DEFAULT_TRAVEL = 0.5
 """Travel beyond the home coordinates if a file states no joint ranges, rad."""
@@ -71,7 +71,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     if not np.array_equal(axes, platform.axes):
         notes.append(f"the platform has principal axes instead of the axes of {platform.name}")
     mechanism_legs = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
-    legs = [_leg(one, k) for k, one in enumerate(mechanism_legs, 1)]
+    legs = [_leg(mechanism_leg, k) for k, mechanism_leg in enumerate(mechanism_legs, 1)]
     if not legs:
         raise RobotFileError(
             f"it has no legs: no body is between the base and {platform.name}, which has the most "
@@ -95,7 +95,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     geometry = replace(geometry, full_bodies=tuple(full))
     layout = geometry.layout
     notes += _spinning(geometry, mechanism_legs)
-    friction = np.transpose([one.actuated.friction for one in mechanism_legs])
+    friction = np.transpose([mechanism_leg.actuated.friction for mechanism_leg in mechanism_legs])
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     gains = plain.gains
     gain_counts = len(JOINT_PID), len(JOINT_PID) * layout.joints
@@ -111,12 +111,12 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     return robot, notes
 
 
-def _leg(one: MechanismLeg, number: int) -> Leg:
+def _leg(mechanism_leg: MechanismLeg, number: int) -> Leg:
     """Leg of a known kind for a leg of the mechanism."""
     try:
-        return leg_of(one.chain)
+        return leg_of(mechanism_leg.chain)
     except RobotFileError as error:
-        names = ", ".join(solid.name for bars in one.bodies for solid in bars)
+        names = ", ".join(solid.name for bars in mechanism_leg.bodies for solid in bars)
         raise RobotFileError(f"leg {number} ({names}): {error}") from None
 
 
@@ -130,10 +130,12 @@ def _bodies(
     layout = geometry.layout
     bodies = np.empty((len(layout.bodies), len(platform)))
     bodies[0] = platform
-    for k, (one, leg) in enumerate(zip(mechanism_legs, geometry.legs, strict=True)):
-        places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
+    for k, (mechanism_leg, leg) in enumerate(zip(mechanism_legs, geometry.legs, strict=True)):
+        places = [
+            _numbers(place) for place in leg.placements(ca.SX(mechanism_leg.chain.points[-1]))
+        ]
         for body, place, bars, row in zip(
-            leg.bodies, places, one.bodies, layout.of_leg[k], strict=True
+            leg.bodies, places, mechanism_leg.bodies, layout.of_leg[k], strict=True
         ):
             try:
                 bodies[row] = _inertia(body, place, bars, geometry.chart.basis[:3])
@@ -147,8 +149,8 @@ def _spinning(geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]) -> li
     layout = geometry.layout
     names = [
         layout.bodies[rows[-1]]
-        for one, rows in zip(mechanism_legs, layout.of_leg, strict=True)
-        if layout.full[rows[-1]] and one.chain.joints[-2:] == ("ball", "ball")
+        for mechanism_leg, rows in zip(mechanism_legs, layout.of_leg, strict=True)
+        if layout.full[rows[-1]] and mechanism_leg.chain.joints[-2:] == ("ball", "ball")
     ]
     if not names:
         return []
@@ -211,10 +213,10 @@ def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     cosines = wanted.T @ axes
     order = linear_sum_assignment(-np.abs(cosines))[1]
     aligned = np.diagonal(cosines[:, order])
-    turned = axes[:, order] * np.where(aligned < 0, -1.0, 1.0)
-    if np.linalg.det(turned) < 0:
-        turned[:, int(np.argmin(np.abs(aligned)))] *= -1
-    return turned
+    result = axes[:, order] * np.where(aligned < 0, -1.0, 1.0)
+    if np.linalg.det(result) < 0:
+        result[:, int(np.argmin(np.abs(aligned)))] *= -1
+    return result
 
 
 def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Chart:
@@ -242,24 +244,27 @@ def _travel(
 ) -> float:
     """Travel limit from the ranges in the file, or a default about home."""
     limits = []
-    for one in mechanism_legs:
-        at_home = one.actuated.coordinate
-        span = plain.ranges.get(one.actuated.name)
+    for mechanism_leg in mechanism_legs:
+        at_home = mechanism_leg.actuated.coordinate
+        span = plain.ranges.get(mechanism_leg.actuated.name)
         if span is not None:
             limits.append(min(-span[0], span[1]))
             if limits[-1] <= abs(at_home):
                 raise RobotFileError(
-                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}; zero and "
-                    f"home ({at_home:g}) must be well inside"
+                    f"{mechanism_leg.actuated.name} has the range {span[0]:g} to {span[1]:g}; zero "
+                    f"and home ({at_home:g}) must be well inside"
                 )
     if limits:
         return float(min(limits))
     lengths = [
-        float(np.linalg.norm(one.chain.points[-1] - one.chain.points[0])) for one in mechanism_legs
+        float(np.linalg.norm(mechanism_leg.chain.points[-1] - mechanism_leg.chain.points[0]))
+        for mechanism_leg in mechanism_legs
     ]
     notes.append("the file has no ranges of the actuated joints: travel_limit is chosen")
     beyond = DEFAULT_TRAVEL_RATIO * min(lengths) if legs[0].prismatic else DEFAULT_TRAVEL
-    return float(max(abs(one.actuated.coordinate) for one in mechanism_legs) + beyond)
+    return float(
+        max(abs(mechanism_leg.actuated.coordinate) for mechanism_leg in mechanism_legs) + beyond
+    )
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:

@@ -123,9 +123,9 @@ def _closures(path: str | Path) -> dict[str, list[Any]]:
             raise RobotFileError(f"{path}: {key} is unknown or no list; valid: {', '.join(KEYS)}")
     settings = {key: list(content.get(key, [])) for key in KEYS}
     for key in ("type", "name_mot", "joint_name", "joint_type"):
-        for one in settings[key]:
-            if not isinstance(one, str):
-                raise RobotFileError(f"{path}: {key} has {shown(one)}, must be a list of names")
+        for name in settings[key]:
+            if not isinstance(name, str):
+                raise RobotFileError(f"{path}: {key} has {shown(name)}, must be a list of names")
     for key in ("name_mot", "joint_name"):
         _require_once(settings[key], f"{path}: {key}")
     settings["type"] = settings["type"] or ["6d"] * len(settings["closed_loop"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cmmsim.acceptance.moving_bar import GIVEN_UP
+from cmmsim.acceptance.moving_bar import MOST_LOST_FRAMES
 from identify.reporting.tables import Table, number
 
 URAD_IN_DEG = float(np.rad2deg(1e-6))
@@ -100,7 +100,7 @@ def bar_table(test: dict[str, Any]) -> Table:
     given_up = [f"{run['name']} ({run['given_up']})" for run in test["runs"] if run["given_up"]]
     if given_up:
         note += (
-            f" Given up after {GIVEN_UP} lost frames in a row, the rest counted as lost: "
+            f" Given up after {MOST_LOST_FRAMES} lost frames in a row, the rest counted as lost: "
             f"{'; '.join(given_up)}."
         )
     return Table(
