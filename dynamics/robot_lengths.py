@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dynamics import workspace
-from dynamics.checks import check_choice, real
+from dynamics.checks import Length, check_choice, real, within
 from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.gains import DesignedDrives, design_drives
 from dynamics.errors import RobotFileError
@@ -47,8 +47,8 @@ joints from the middle of the platform.
 MOMENT_ABOUT_LENGTH = {"crank": "Ixx", "link": "Izz", "cylinder": "Izz", "rod": "Izz"}
 """Moment of inertia of each body of a leg about the axis along its length."""
 
-DECIMALS = 9
-"""Decimals of coordinates of joints, m."""
+DIGITS = 9
+"""Digits of the coordinates of joints, of which the first is that of the radius of their circle."""
 
 SAMPLES = 2000
 """Number of random positions of the joints within the travel limit."""
@@ -88,6 +88,10 @@ def robot_of_lengths(
     for length, value in lengths.items():
         check_choice(f"length of {like.name}", length, tuple(old), RobotFileError)
         real(length, value, RobotFileError, above=0, unit=" m")
+        try:
+            within(Length).check(value)
+        except ValueError as error:
+            raise RobotFileError(f"{length}: {error}") from None
     new = old | dict(lengths)
     ratios = {length: new[length] / old[length] for length in old}
     geometry = _at_rest_at_home(like.geometry, new)
@@ -116,7 +120,8 @@ def _at_rest_at_home(geometry: RobotGeometry, new: Mapping[str, float]) -> Robot
     legs = [_placed(leg, new, geometry.chart.name) for leg in geometry.legs]
     home = geometry.home_pose
     if geometry.chart.name != "planar":
-        home[2] = round(float(np.mean([_height(leg, new) for leg in legs])), DECIMALS)
+        heights = [_height(leg, new) for leg in legs]
+        home[2] = float(_shortened(np.mean(heights), new["base_radius"]))
     chart = Chart(geometry.chart.name, tuple(home.tolist()))
     # without a branch, a leg takes the one whose coordinate is zero at home
     without_branch = tuple(leg.model_copy(update={"branch": None}) for leg in legs)
@@ -151,7 +156,12 @@ def _placed(leg: Leg, new: Mapping[str, float], chart: str) -> Leg:
 def _on_circle(joint: np.ndarray, radius: float) -> np.ndarray:
     """Joint moved along its direction from the z axis to a circle of another radius, m."""
     plan = joint[:2] * (radius / np.hypot(*joint[:2]))
-    return np.round(np.append(plan, joint[2]), DECIMALS)
+    return _shortened(np.append(plan, joint[2]), radius)
+
+
+def _shortened(values: np.ndarray, size: float) -> np.ndarray:
+    """Values with `DIGITS` digits, of which the first is that of a size."""
+    return np.round(values, DIGITS - 1 - int(np.floor(np.log10(size))))
 
 
 def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
@@ -190,7 +200,7 @@ def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> 
     turn = np.sign(np.sin(base_angle - platform_angle)) * np.arccos(cosine)
     angle = np.arctan2(platform[1], platform[0]) + turn
     place = base_radius * np.array([np.cos(angle), np.sin(angle)])
-    return np.round(np.append(place, leg.base_joint[2]), DECIMALS)
+    return _shortened(np.append(place, leg.base_joint[2]), base_radius)
 
 
 def _height(leg: Leg, new: Mapping[str, float]) -> float:
@@ -215,8 +225,10 @@ def _travel(geometry: RobotGeometry, old: RobotGeometry, ratios: Mapping[str, fl
     if not geometry.prismatic:
         return old.travel_limit
     if "leg" not in ratios:
-        return round(old.travel_limit * ratios["link"], DECIMALS)
-    return round(old.travel_limit * _home_to_end(geometry) / _home_to_end(old), DECIMALS)
+        ratio = ratios["link"]
+    else:
+        ratio = _home_to_end(geometry) / _home_to_end(old)
+    return float(f"{ratio * old.travel_limit:.9g}")
 
 
 def _home_to_end(geometry: RobotGeometry) -> float:

@@ -1,5 +1,6 @@
 """Robots from a few lengths: the built-in ones from their own, and others by their triangles."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -57,12 +58,27 @@ def test_legs_of_other_lengths_close_at_home_with_all_coordinates_zero(name):
             assert (end - begin)[:2] @ leg.crank_zero_direction[:2] == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.parametrize("factor", [1e-4, 1e2])
+def test_a_robot_on_a_chip_and_a_crane_close_as_well(factor):
+    """Coordinates have as many digits, whatever their size."""
+    own = lengths_of(read_robot_file("rss6").geometry)
+    made = geometry_of("rss6", **{name: factor * value for name, value in own.items()})
+    assert made.home_pose[2] == pytest.approx(0.2 * factor, rel=1e-7)
+    for leg, end in zip(made.legs, made.joints_at(made.home_pose), strict=True):
+        assert float(leg.coordinate(ca.SX(end))) == pytest.approx(0, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("name", "lengths", "said"),
     [
         ("rss6", {"leg": 0.3}, "unknown length of rss6 `leg`; valid: base_radius, platform_radius"),
         ("ups6", {"crank": 0.1}, "valid: base_radius, platform_radius, leg, cylinder, rod"),
         ("rss6", {"link": -1.0}, "link is -1.0 m, must be finite and > 0"),
+        (
+            "pus6",
+            {"base_radius": 1e9},
+            "base_radius: 1e+09 is outside the range of machines, 1e-06",
+        ),
         ("delta3", {"link": float("nan")}, "link is nan m, must be finite and > 0"),
         ("rss6", {"crank": 0.3}, "crank is 0.3 m, must be shorter than the 0.2332 m in plan"),
         (

@@ -216,7 +216,9 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
     run = problem_of([record], scenario, robot).runs[0]
     residuals, slopes = run.residuals_in_noise(truth)
     forbidden = list(FORBIDDEN.get(robot.name, ()))
-    unmoved = run.whiten(run.simulate(truth).pose * 0 + robot.home_pose - run.measured)[:, forbidden]
+    unmoved = run.whiten(run.simulate(truth).pose * 0 + robot.home_pose - run.measured)[
+        :, forbidden
+    ]
     np.testing.assert_allclose(residuals[:, forbidden], unmoved, atol=1e-9)
     assert not slopes[:, forbidden].any()
     result, layout = identify(record, robot, scenario), robot.layout
