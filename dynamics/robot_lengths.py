@@ -121,7 +121,7 @@ def _at_rest_at_home(geometry: RobotGeometry, new: Mapping[str, float]) -> Robot
     home = geometry.home_pose
     if geometry.chart.name != "planar":
         heights = [_height(leg, new) for leg in legs]
-        home[2] = float(_shortened(np.mean(heights), new["base_radius"]))
+        home[2] = float(_shortened(np.array(heights), new["base_radius"]).mean())
     chart = Chart(geometry.chart.name, tuple(home.tolist()))
     # without a branch, a leg takes the one whose coordinate is zero at home
     without_branch = tuple(leg.model_copy(update={"branch": None}) for leg in legs)

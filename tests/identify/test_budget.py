@@ -121,6 +121,17 @@ def test_what_the_anchor_adds_is_what_its_error_does_to_the_estimate():
     )
 
 
+@pytest.mark.thorough
+def test_the_parts_sum_up_where_two_records_share_some_errors_and_not_others():
+    scenario = quick(**DOUBTS)
+    records = [run_plant(scenario, k, duration_s=3.0, trajectory_seed=k)[0] for k in (3, 4)]
+    result = identify(records, scenario=scenario)
+    whole = result.whole_covariance
+    std = np.sqrt(np.diag(whole))
+    off = np.sum(list(result.sources.values()), axis=0) - whole
+    assert np.abs(off / np.outer(std, std)).max() < 1e-9
+
+
 def test_cameras_and_teaching_add_to_the_measured_pose_what_the_record_states():
     """Also where they are correlated, and where the identification takes them as exact."""
     record = short_run()[0].copy()
