@@ -56,8 +56,7 @@ def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.
 def pose_response(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> Callable[[float], np.ndarray]:
-    """Response of the coordinates to small oscillations of the desired coordinates about a pose
-    (6,).
+    """Response of the coordinates to small oscillations of the desired ones about a pose (6,).
 
     Returns a function of the angular frequency, rad/s. It gives the matrix (m, m) from the desired
     to the true coordinates at the frames. Raises the same errors as `closed_loop.equilibrium`.

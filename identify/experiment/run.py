@@ -158,10 +158,11 @@ def run_plant(
         store_law(record, law, in_loop.drives)
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
-    stated = isinstance(sensor, cmmsim.Sensor) and (
-        not runs.rig.exact or sensor.method == "registration"
-    )
-    if stated and done.measured_ok.any():
+    if (
+        isinstance(sensor, cmmsim.Sensor)
+        and (not runs.rig.exact or sensor.method == "registration")
+        and done.measured_ok.any()
+    ):
         # A late exposure shifts a pose in proportion to its rate, so rates are needed.
         poses = without_gaps(done.measured, done.measured_ok)
         rates = spline_derivatives(poses, runs.timing.frame_rate_hz)[0]
