@@ -12,6 +12,7 @@ from scipy.stats import binom
 from dynamics import DynamicsError
 from dynamics.closed_loop import simulate_commands
 from dynamics.pseudo_inertia import body_fault
+from identify.diagnosis.diagnose import diagnose
 from identify.diagnosis.diagnosis import CandidateRow, Diagnosis, Finding
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.explanation import Misfit
@@ -31,6 +32,7 @@ from identify.studies.rows.gauntlet.case import (
     run_case,
 )
 from identify.studies.rows.gauntlet.catalogue import INSIDE, OUTSIDE, TROUBLES, drawn_troubles
+from identify.studies.rows.gauntlet.late import late_plant
 from identify.studies.rows.gauntlet.play import PlantWithPlay
 from identify.studies.rows.gauntlet.trouble import Trouble
 from identify.studies.rows.gauntlet.typed import typed
@@ -354,3 +356,22 @@ def test_the_command_writes_a_dozen_cases_that_it_continues_and_counts(tmp_path,
         troubles = drawn(load_scenario("quick"), seed, "drawn", 0).troubles
         kinds = [one.kind for one in troubles]
         assert [table[f"trouble_{place}"][row] for place in (1, 2)] == [*kinds, "", ""][:2]
+
+
+@pytest.mark.slow
+def test_two_causes_are_not_taken_for_one_that_is_there_or_not():
+    """A latency with a clock that falls behind looks like drives of another law at first."""
+    late = replace(LATE, plant=lambda plant: late_plant(plant, 7.9e-3, 1.55e-3))
+    made = recorded(scenario(), (late,), 71, 0)
+    found = diagnose(made.record)
+    assert {one.group for one in found.findings} == {
+        "latency of the commands",
+        "drift of the commands' clock",
+    }
+    sizes = {one.group: one.sizes[0] for one in found.findings}
+    for group, true in (
+        ("latency of the commands", 7.9e-3),
+        ("drift of the commands' clock", 1.55e-3),
+    ):
+        assert abs(sizes[group].value - true) < 4 * sizes[group].std
+    assert not found.left.significant
