@@ -76,6 +76,10 @@ class LostError(CmmError):
     """
 
 
+class DividedError(LostError):
+    """Error that two groups of stickers in one frame agree on different poses."""
+
+
 class TeachingError(CmmError):
     """The stickers could not be taught; the message names the step."""
 

@@ -5,7 +5,7 @@ Stickers are searched at a pose predicted from the last measurements, never at t
 
 from __future__ import annotations
 
-from cmmsim.errors import LostError
+from cmmsim.errors import DividedError, LostError
 from cmmsim.geometry.pose import Array, invert, rigid, rotation_exp, rotation_log
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator, require_fitting
@@ -80,7 +80,8 @@ class Tracker:
             try:
                 found = self._found(images)
             except LostError as error:
-                if best is None:
+                # Windows that show only one of two groups of stickers must not decide for it.
+                if best is None or isinstance(error, DividedError):
                     self.forget()
                     return lost_measurement(str(error))
             else:

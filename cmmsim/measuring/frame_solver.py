@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-from cmmsim.errors import LostError
+from cmmsim.errors import DividedError, LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.registration import SMALLEST_SPREAD, require_spread
@@ -65,7 +65,7 @@ WARP_CHANCE = 1e-2
 LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # Errors that are larger than noise are not independent: a pose errs as if each were shared by this
 # number of stickers.
-EXCESS_SHARE = 3.0
+EXCESS_SHARE = 4.0
 TAIL = 0.999
 # A pose errs in six shapes that are as smooth as those of a warp. Its covariance is multiplied by
 # this number times the mean square of the warp's shapes.
@@ -113,6 +113,14 @@ class SolvedFrames:
         own[self.starts[frame] : self.starts[frame + 1]] = True
         seen = self.stickers.selected(own & self.used)
         return replace(seen, index=seen.index % len(self.places))
+
+    def error(self, frame: int) -> LostError:
+        """Return the error that tells why a frame is lost."""
+        # Imported late, because importing numba takes time.
+        from cmmsim.measuring.solver_kernels import RIVALS
+
+        kind = DividedError if self.verdicts[frame, RIVALS] > 0 else LostError
+        return kind(self.reason(frame))
 
     def reason(self, frame: int) -> str:
         """Return the reason why a frame is lost."""
@@ -185,7 +193,7 @@ def consistent(
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
-        raise LostError(solved.reason(0))
+        raise solved.error(0)
     return solved.of(0), solved.camera_from_body[0], solved.covariances[0]
 
 
