@@ -67,8 +67,8 @@ LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # number of stickers.
 EXCESS_SHARE = 4.0
 TAIL = 0.999
-# A pose errs in six shapes that are as smooth as those of a warp. Its covariance is multiplied by
-# this number times the mean square of the warp's shapes.
+# A pose errs in six shapes that are as smooth as those of a warp. What of the mean square of the
+# warp's shapes exceeds its limit, times this number, is added to the factor on the covariance.
 WARP_SHARE = 8.0
 # Rejected stickers that agree with each other are as likely to be right as the others.
 FEWEST_RIVALS = 3

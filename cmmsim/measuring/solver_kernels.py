@@ -314,13 +314,14 @@ def solve(
         return
     verdict[WARP] = warp(seen.used, seen.arms, seen.gaps, seen.informations, seen.rays, covariance)
     excess = verdict[EXCESS]
-    warped = verdict[WARP] > excess * limits.largest_warp
+    # A warp counts from its limit on, so that good frames that just exceed it lose little.
+    beyond = verdict[WARP] - excess * limits.largest_warp
+    warped = excess + limits.warp_share * max(beyond, 0.0) / SHAPES
     if excess > 1.0:
         excess *= limits.excess_share
     if 2 * verdict[LEFT] <= searched:
         excess = max(excess, few_excess(seen, rejected, limits, covariance))
-    if warped:
-        excess = max(excess, limits.warp_share * verdict[WARP] / SHAPES)
+    excess = max(excess, warped)
     verdict[EXCESS] = excess
     for i in range(6):
         for j in range(6):

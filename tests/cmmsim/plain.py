@@ -188,6 +188,6 @@ def consistent(seen, rig, radius, places, normals):
     factors = [growth * (EXCESS_SHARE if growth > 1.0 else 1.0)]
     if 2 * len(kept) <= len(seen.index):
         factors.append(few_growth(seen, kept, rejected, transform, covariance, places))
-    if warped > growth * chi2.isf(WARP_CHANCE, 10):
-        factors.append(WARP_SHARE * warped / 10.0)
+    beyond = max(warped - growth * chi2.isf(WARP_CHANCE, 10), 0.0)
+    factors.append(growth + WARP_SHARE * beyond / 10.0)
     return seen.index[kept], transform, max(factors) * covariance
