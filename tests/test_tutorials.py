@@ -43,8 +43,10 @@ def steps_of(page):
     """The steps of a page in their order. Files of which only a part is shown are not saved."""
     found = [Step("sh", AFTER[page])] if page in AFTER else []
     text = (TUTORIALS / f"{page}.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"^```(\S+)(?: (\S+))?\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    for language, file, body in blocks:
+    blocks = r"(?:as `([\w.]+)`:\n\n)?^```(\S+)(?: (\S+))?\n(.*?)^```$"
+    for saved_as, language, file, body in re.findall(blocks, text, re.MULTILINE | re.DOTALL):
+        if language == "toml" and saved_as:
+            found.append(Step("sh", f"cat >{saved_as} <<'END'\n{body}END"))
         if language == "{literalinclude}" and ":start-at:" not in body:
             found.append(Step("file", file))
         elif language == "sh":
