@@ -60,7 +60,7 @@ FEWEST = 5
 SMALLEST_SHARE = 0.01
 # Probability that a good frame counts as warped. It is larger than that of other tests, because
 # a warp that is just not noticed moves the pose by up to ten deviations.
-WARP_CHANCE = 1e-2
+WARP_CHANCE = 1e-3
 # Largest squared warp that noise explains, in its units.
 LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # Errors that are larger than noise are not independent: a pose errs as if each were shared by this

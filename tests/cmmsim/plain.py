@@ -9,7 +9,7 @@ from scipy.stats import chi2, f
 from cmmsim.geometry.pose import rigid, skew
 
 FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 5, chi2.isf(1e-4, 3), 6.0
-FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-2, 8.0, 4.0, 0.999
+FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-3, 8.0, 4.0, 0.999
 LARGEST_STRAIN, LARGEST_PARTING = 1e-3, 1e3  # a metre
 SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
 
