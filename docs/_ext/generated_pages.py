@@ -63,6 +63,13 @@ COVERED = {
 }
 """Figures of stated uncertainty against the truth."""
 
+UNIFORM = {
+    "intervals": "identified quantities",
+    "covered_percent": "their 95 % intervals that contain the truth, %",
+    "inner_covered_percent": "their 68.3 % intervals that contain the truth, %",
+}
+"""Figures of simulation-based calibration."""
+
 ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "friction_timing": (
         {
@@ -122,6 +129,10 @@ FIGURES: dict[str, Callable[[Path], str]] = {
     "robots.md": kept_figures.robots,
     "laws.md": kept_figures.laws,
     "answer_estimators.md": kept_figures.leaderboard,
+    "answer_calibration.md": kept_figures.answer("calibration", {}, UNIFORM),
+    "answer_calibration_robots.md": kept_figures.answer(
+        "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
+    ),
     **{f"answer_{name}.md": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws.md": kept_figures.answers(
         at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED
