@@ -60,7 +60,14 @@ ANSWERS = {
     "friction_timing",
     "inexact",
 }
-ANSWERS |= {"calibration", "interval_coverage", "parameter_groups", "control_robots", "model_off", "observer"}
+ANSWERS |= {
+    "calibration",
+    "interval_coverage",
+    "parameter_groups",
+    "control_robots",
+    "model_off",
+    "observer",
+}
 """Studies that ask what no law says; what came out is in the documentation."""
 
 

@@ -10,7 +10,7 @@ from scipy.stats import kstest, truncnorm
 from dynamics import load_robot
 from identify.estimation.bounds import bounded_estimate, parameter_bounds
 from identify.estimation.prior import starting_guess
-from identify.studies.rows.calibrated import drawn_truth
+from identify.studies.rows.calibrated import drawn_truth, moving_frames
 from identify.studies.rows.kind import PROBABILITY
 from identify.studies.uniformity import (
     BAND,
@@ -53,6 +53,13 @@ def test_stated_probabilities_are_those_of_the_normal_distribution_cut_at_the_bo
     expected = truncnorm((least - guess.values) / std, np.inf, guess.values, std).cdf(truth)
     below = found.probabilities(np.eye(size), truth)
     assert below[free] == pytest.approx(expected[free], abs=1e-12)
+
+
+def test_poses_are_compared_where_the_platform_has_left_its_start():
+    poses = np.zeros((6, 6))
+    poses[2:, 4] = 1e-12, 1e-6, 2e-6, 0.0
+    assert moving_frames(poses).tolist() == [3, 4]
+    assert moving_frames(np.ones((6, 6))).tolist() == [5]
 
 
 def probabilities(**figures):
