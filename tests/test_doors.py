@@ -99,7 +99,7 @@ def test_nothing_heavy_is_imported_before_it_is_wanted(start, heavy, tmp_path):
     assert python("-c", text, cwd=tmp_path, path=[ROOT]).stdout.endswith("[]\n")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_type_checker_follows_the_installed_packages(tmp_path):
     """In the environment of this test, from a folder that knows nothing of the checkout."""
     (tmp_path / "mine.py").write_text(SCRIPT)

@@ -97,7 +97,7 @@ def test_lines_of_ours_that_need_what_is_hidden_fail_and_those_of_others_do_not(
     assert shown == ["cmmsim.new"] * 4
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_module_is_loaded_and_a_study_runs_and_goes_on_where_what_only_some_systems_have_is_hidden(
     tmp_path,
 ):

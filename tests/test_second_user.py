@@ -175,7 +175,7 @@ class Planted:
         return os.mkdir, (str(self.mark),)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_kernels_that_another_user_planted_in_numbas_cache_are_not_loaded(commons):
     """In the cache of a user whose umask keeps nobody out, where the package cannot be written, and
     in a shared one that the environment names."""

@@ -49,7 +49,7 @@ def test_default_detector_is_of_all_the_closest_to_the_bound_at_the_working_poin
     assert default.lost == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_interval_holds_the_ratio_in_95_of_100_repetitions():
     """Against the ratio of many draws; 60 repetitions of 100 draws make 95 % uncertain by 3 %."""
     best = [find_detector("dual_conic")]

@@ -45,6 +45,7 @@ def test_noise_free_lengths_are_right_to_two_microns(volume):
     assert np.abs(found.errors).max() < 2e-6
 
 
+@pytest.mark.thorough
 def test_lengths_do_not_depend_on_the_number_of_threads(volume, monkeypatch):
     found = []
     for threads in (1, 3):
@@ -169,7 +170,7 @@ def test_motion_blur_reaches_the_moving_bar_only(volume):
     assert np.abs(blurred.distance_errors).max() < 30e-6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_that_loses_the_bar_is_given_up(volume):
     """The bar is taken out of sight after four frames."""
     path = bar_paths(volume)[0]

@@ -108,7 +108,7 @@ def test_no_wrong_pose_in_eighty_faults_and_what_spoils_little_is_measured(rende
 @pytest.mark.parametrize(
     ("method", "renderer", "kinds", "frames", "seed", "untracked"),
     [
-        pytest.param("planes", "analytic", SPOILING, 80, 200, 0.02, marks=pytest.mark.slow),
+        pytest.param("planes", "analytic", SPOILING, 80, 200, 0.02, marks=pytest.mark.thorough),
         *(
             pytest.param(*row, marks=pytest.mark.thorough)
             for row in (

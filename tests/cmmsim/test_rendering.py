@@ -82,7 +82,7 @@ def test_both_renderers_agree_in_every_sticker_centre(lens, supersampling, count
 
 @pytest.mark.rendering
 @pytest.mark.parametrize(
-    ("lens", "count"), [("perfect", 1), pytest.param("all", 3, marks=pytest.mark.slow)]
+    ("lens", "count"), [("perfect", 1), pytest.param("all", 3, marks=pytest.mark.thorough)]
 )
 def test_the_scene_of_pyrender_itself_shows_every_sticker_at_the_same_place(lens, count):
     """It takes pyrender's camera, light and materials for the window's matrices and levels."""

@@ -161,7 +161,7 @@ def test_a_frame_from_elsewhere_is_measured_by_its_streaks():
 @pytest.mark.parametrize(
     ("exposure", "lens", "frames"),
     [
-        pytest.param(0.002, "perfect", 16, marks=pytest.mark.slow),
+        pytest.param(0.002, "perfect", 16, marks=pytest.mark.thorough),
         *(
             pytest.param(*row, 48, marks=pytest.mark.thorough)
             for row in ((0.002, "perfect"), (0.004, "perfect"), (0.001, "perfect"), (0.002, "all"))

@@ -76,11 +76,12 @@ class States:
     twist_dot: np.ndarray
 
 
+OFTEN = {"ups6": (), "delta3": (), "rss6_coplanar": (pytest.mark.thorough,)}
 SLOW_ROBOTS = [
-    name if name in ("ups6", "delta3") else pytest.param(name, marks=pytest.mark.slow)
+    pytest.param(name, marks=OFTEN.get(name, (pytest.mark.slow,)))
     for name in dynamics.built_in_robots()
 ]
-"""Every built-in robot, two of them also among the quick tests."""
+"""Every built-in robot, two of them among the quick tests, and the second RSS among the thorough."""
 
 
 def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:

@@ -16,7 +16,7 @@ from tests.identify.commands import command
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(0.5, marks=pytest.mark.slow),
+        pytest.param(0.5, marks=pytest.mark.thorough),
         pytest.param(SECONDS, marks=pytest.mark.thorough),
     ],
 )

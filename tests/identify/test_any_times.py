@@ -74,7 +74,7 @@ def test_commands_that_change_while_no_pose_is_logged_drive_the_model():
 @pytest.mark.parametrize(
     "form",
     [
-        "begun in motion",
+        pytest.param("begun in motion", marks=pytest.mark.thorough),
         pytest.param("two clocks", marks=pytest.mark.thorough),
         pytest.param("gaps of the log", marks=pytest.mark.thorough),
     ],

@@ -96,7 +96,7 @@ def replace_frames(reference, frames):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_sensitivities_of_the_servo_follow_the_scale(compiled):
     """Against differences of runs, compiled and plain."""
     robot = rss6()

@@ -50,6 +50,7 @@ def test_a_changed_figure_of_a_result_is_refused_and_so_is_a_scenario_with_its_f
     assert "result.json is damaged" in refusal(RecordError, load_result, run_folder.result)
 
 
+@pytest.mark.thorough
 def test_what_hangs_kills_or_fills_the_reader_of_a_strangers_file_is_one_line(
     tmp_path, monkeypatch
 ):

@@ -431,7 +431,7 @@ def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
         JointInstruments(encoder_noise=np.nan)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_bias_of_least_squares_over_repeated_experiments():
     """Mean of eight records at 40 um: what the inertia and ld lose by least squares is many
     standard errors of the mean, and several times what the instrumental variables lose, whose

@@ -256,7 +256,7 @@ def test_limits_hold_between_the_instants_of_the_search(one_start, method):
         assert worst["velocity"].share > 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
     random, evolved, climbed = (
         designed(method) for method in ("random", "evolutionary", "gradient")
@@ -267,7 +267,7 @@ def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
     np.testing.assert_array_equal(climbed.validation[0].sine, random.validation[0].sine)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.thorough)]
 )

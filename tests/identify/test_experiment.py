@@ -227,7 +227,7 @@ def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_r
     np.testing.assert_array_equal(ours.command, nominal.command)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_truth_holds_true_poses_motors_joint_errors_and_switches_and_the_encoders_read_the_motors():
     """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque
     over stiffness.

@@ -259,7 +259,7 @@ CASES = {
     "new study": Case("new study {place}/new/mine.toml"),
     "new record": Case("new record {place}/new/mine.csv rss6"),
 }
-OFTEN = ("run", "identify", "study", "calibrate", "import mjcf", "measure", "export")
+OFTEN = ("identify", "study", "calibrate", "import mjcf", "measure", "export")
 ONE_EACH = [name for name, case in CASES.items() if name == case.words and name in OFTEN]
 """One case for each way of writing: all commands are for the long proof."""
 

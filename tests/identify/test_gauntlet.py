@@ -318,7 +318,7 @@ def test_bad_input_of_the_command_is_refused_in_one_line(tmp_path, monkeypatch, 
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_trouble_of_known_seeds_is_named_and_its_remedy_lets_the_intervals_hold():
     done = run_case(drawn(scenario(), np.random.SeedSequence(0), "none", 0))
     assert judge(done) == "right intervals"

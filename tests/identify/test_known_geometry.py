@@ -88,7 +88,7 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     assert problem_of([record], silent, robot).runs[0].common.geometry is None
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_parameters_are_found_in_spite_of_a_poor_calibration_and_the_geometry_with_them():
     """Without being told how well the geometry is known, the model seems wrong."""
     known, true = calibrated(2)

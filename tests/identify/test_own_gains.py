@@ -84,7 +84,7 @@ def test_gains_of_each_joint_are_identified_with_intervals(name):
     assert rms[3:].max() < 25e-6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_intervals_of_gains_of_each_joint_hold():
     """Share of the 95 % intervals of gains and friction with the truth, over some records."""
     robot, scenario = with_unequal_gains("delta3"), each()

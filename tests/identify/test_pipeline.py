@@ -67,6 +67,7 @@ def test_a_quick_run_meets_every_goal_and_the_model_is_twenty_times_closer_than_
             assert all(before > 20 * after for before, after in pairs)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("unseen", "position_um", "orientation_urad", "sensor_um", "sensor_urad"),
     [
@@ -167,6 +168,7 @@ def test_planes_and_commands_identify_too(tmp_path, capfd):
     assert result["identification"]["noise_ratio"] == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.thorough
 def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     wrong = {
         "plant.friction": "stribeck",
@@ -185,6 +187,7 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     assert result["identification"]["noise_ratio"] > 1.05
 
 
+@pytest.mark.thorough
 def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_line_each(tmp_path):
     broken, out = tmp_path / "without" / "OpenGL", tmp_path / "out"
     broken.mkdir(parents=True)

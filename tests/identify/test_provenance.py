@@ -138,7 +138,7 @@ def entries(**changes):
     }
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(
     recorded_folder, capsys
 ):

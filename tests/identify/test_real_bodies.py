@@ -73,7 +73,10 @@ def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("height", [0.001, 0.005, 0.030])
+@pytest.mark.parametrize(
+    "height",
+    [*(pytest.param(one, marks=pytest.mark.thorough) for one in (0.001, 0.005)), 0.030],
+)
 def test_a_centre_of_mass_off_the_joint_plane_is_named_with_its_height(height):
     _, record = recorded(uneven((0.0, 0.0, height)))
     found = identify.diagnose(record)
@@ -131,7 +134,7 @@ LOAD = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_load_on_the_top_plane_fixes_the_scale():
     """8 kg, 0.13 m above the joint plane: the gains, which poses know up to the scale, to 0.5 %."""
     scenario = identify.load_scenario(

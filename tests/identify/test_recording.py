@@ -131,6 +131,7 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
             check_record(record.assign(measured_ok=("time", flags)), "mine")
 
 
+@pytest.mark.thorough
 def test_what_a_file_lacks_or_damages_is_named(tmp_path, record):
     with pytest.raises(RecordError, match="there is no file"):
         read(tmp_path / "nothing.nc")

@@ -110,6 +110,7 @@ def test_the_slider_shows_the_poses_of_the_files(robot, replayed, browser):
     assert (folder.path / "replay.html").stat().st_size < 6e6
 
 
+@pytest.mark.thorough
 def test_legs_rays_and_enlarged_differences_stand_where_they_should(replayed, browser):
     page = opened(browser(), replayed())
     truth, measured = (
@@ -245,6 +246,7 @@ def test_a_record_without_truth_and_models_is_shown_with_what_it_has(replayed, b
     assert page.console() == []
 
 
+@pytest.mark.thorough
 def test_a_scene_without_a_run_opens_too(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = browser()

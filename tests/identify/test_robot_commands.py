@@ -96,7 +96,7 @@ def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_
     assert "MuJoCo: 421 of 421" in said.err
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_wrong_parameter_in_one_engine_is_seen(robot):
     pytest.importorskip("mujoco")
     initial = robot.parameter_sets["guess"].vector

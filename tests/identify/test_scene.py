@@ -231,7 +231,7 @@ def test_a_failed_replay_leaves_the_page_before(run_folder, monkeypatch, capsys)
     assert sorted(path.name for path in run_folder.path.glob("*replay*")) == ["replay.html"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_robot_of_ones_own_is_shown_with_its_sensor_and_as_a_picture(
     tmp_path, monkeypatch, capsys
 ):

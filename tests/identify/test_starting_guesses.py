@@ -267,7 +267,7 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     assert relative(moved, expected[size:], scale) < 3e-3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     """No friction and gains far off make an unstable loop: no search can start there, and no warm
     start is at hand. Segment by segment the model runs, and it ends where the search from the truth

@@ -146,7 +146,7 @@ def serial(tmp_path_factory):
     ).frame
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_one_warning(
     tmp_path, serial
 ):
@@ -234,7 +234,7 @@ def certificate(tmp_path):
     return make
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_scheduler_with_certificates_takes_a_study_with_the_same_one_and_no_other(
     tmp_path, certificate, monkeypatch, serial
 ):

@@ -49,7 +49,7 @@ def children():
     return [one for one in here if "spawn_main" in " ".join(one.cmdline())]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_rows_that_end_their_process_or_take_its_memory_are_errors_and_no_other_row_is(
     tmp_path, serial, monkeypatch
 ):
@@ -101,6 +101,7 @@ def test_processes_that_die_before_they_are_ready_or_cannot_be_started_end_the_s
     assert not (tmp_path / "b").exists()
 
 
+@pytest.mark.thorough
 def test_a_study_in_processes_has_no_port_and_no_file_but_those_of_its_folder(
     tmp_path, monkeypatch
 ):
@@ -208,7 +209,7 @@ def test_interrupted_command_ends_with_one_line_and_goes_on(command, serial):
     same_numbers(outcome.frame, serial)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_command_interrupted_while_its_workers_start_ends_with_one_line(command):
     """Also the processes that start get the signal, as from a terminal; none of them says anything,
     or stays.

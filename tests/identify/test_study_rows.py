@@ -235,7 +235,7 @@ def test_each_kind_says_unit_and_meaning_of_its_columns_and_which_are_drawn(kind
         assert name.endswith(suffixes.get(column.unit, ""))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_closed_loop_follows_its_reference_with_the_images_in_the_loop():
     settings = scenario(**{"validation.duration_s": 1.0})
     one, again = (row("closed_loop", 0, settings, teaching="exact") for _ in range(2))
@@ -327,7 +327,7 @@ def test_intervals_that_know_of_inexact_cameras_hold_where_those_that_do_not_do_
         assert one["unaware_poses_covered_percent"] < 80.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_law_follows_the_closer_the_better_its_model_and_pid_knows_none():
     settings = scenario(
         **{"renderer": "statistical", "validation.count": 1, "validation.duration_s": 2.0}

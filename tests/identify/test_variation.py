@@ -61,7 +61,7 @@ def test_variation_is_the_standard_deviation_over_the_mean_and_its_table_stands_
         _ = variation(nothing).worst
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_identifies_each_unseen_run(tmp_path, capsys):
     """Estimates vary as their intervals say: the mean square of variation over expectation is near
     one.
