@@ -13,6 +13,7 @@ loop is unstable. The row counts these draws.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from dynamics.closed_loop import LoopFailure
@@ -235,13 +236,13 @@ def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
     }
 
 
-def moving_frames(poses: Array) -> Array:
+def moving_frames(poses: Array) -> NDArray[np.int_]:
     """Return the frames in which the poses (N, 6) have left the first one, or the last frame.
 
     While joints stick at the start, the platform rests there, and every prediction is exact.
     """
     left = np.flatnonzero(np.abs(poses - poses[0]).max(axis=1) > AT_REST)
-    return left if len(left) else np.array([len(poses) - 1])
+    return left if len(left) else np.array([len(poses) - 1], dtype=np.int_)
 
 
 def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> Row:
