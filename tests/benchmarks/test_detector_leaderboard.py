@@ -73,7 +73,7 @@ def test_same_seed_same_scores_and_one_draw_is_refused():
         compete(SCENE, [point], 1, np.random.default_rng(0))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_default_detector_stays_at_the_bound_over_all_conditions():
     """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees; some blurred."""
     sizes, tilts, noises = (2.5, 5.0, 10.0), np.radians([0.0, 30.0, 60.0]), (0.002, 0.01, 0.05)

@@ -154,7 +154,7 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
     assert np.sqrt(np.mean(found.errors[:, :3] ** 2)) < 60e-6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_motion_blur_reaches_the_moving_bar_only(volume):
     """With 1 ms of exposure a standing bar gives the frames it gives with 1 ns, and others once it
     moves fast.

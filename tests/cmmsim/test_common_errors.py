@@ -167,7 +167,7 @@ def test_a_measurement_states_what_is_known_of_its_common_part(geometry):
     assert np.isnan(lost_measurement("dark").common_covariance).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_poses_measured_with_the_cameras_of_photographs_are_off_as_predicted_down_to_the_noise():
     """Taught and measured from images, in motion, with a right camera that exposes later: of errors
     of 200 um, what a rig that is off in all its numbers explains to first order leaves noise and

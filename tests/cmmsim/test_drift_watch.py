@@ -271,7 +271,7 @@ def alarms(geometry, covariance, told, runs, frames, chance, rng):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("share", [0.0, 1e-2])
 def test_false_alarms_are_as_rare_as_stated(geometry, share):
     """Watches that allow one in ten, on 50 runs: more than 9 have a chance of 2 %. Rigs that are

@@ -157,7 +157,8 @@ def test_poses_from_noise_free_images(lens, renderer, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)]
+    "renderer",
+    ["analytic", pytest.param("pyrender", marks=[pytest.mark.thorough, pytest.mark.rendering])],
 )
 def test_noise_free_teaching_and_measuring_through_all_effects(renderer):
     """At most 2 um and 10 urad at every pose; 0.8 um and 4 urad were the largest."""

@@ -121,7 +121,7 @@ def test_a_partly_hidden_platform_is_measured_with_what_is_left(renderer):
     assert len(sensor.measure(sensor.home).target_ids) == 18
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_process_measures_the_same(sensor, taught, moving_path, tmp_path):
     path = moving_path(5)
     (tmp_path / "given.pickle").write_bytes(pickle.dumps((taught, path)))

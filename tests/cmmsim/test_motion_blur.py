@@ -86,6 +86,7 @@ def test_fit_of_noise_free_smeared_windows_is_exact(smear, psf_px):
     assert np.abs(fits.shapes - shapes).max() < 4e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "speed",
     [pytest.param(0.3, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.thorough)],

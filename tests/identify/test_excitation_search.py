@@ -282,7 +282,7 @@ def test_seed_decides_what_is_found(method):
         design_trajectories(design_of(small(method="evolutionary", candidates=3)), 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
     one_start, tmp_path, capsys, monkeypatch
 ):

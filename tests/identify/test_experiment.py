@@ -291,7 +291,7 @@ def test_the_residuals_say_that_the_model_is_wrong(switch):
     assert any("are correlated from frame to frame" in said for said in result.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_residuals_of_elastic_joints_that_the_closed_loop_hides_are_those_of_the_logged_commands():
     """The closed loop explains the record, with wrong parameters; the model driven by the commands
     does not.

@@ -148,7 +148,7 @@ def test_a_second_table_may_be_of_the_robot_under_a_known_load(mine, record):
     assert free.attrs["scale_anchor"] == "payload"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_csv_and_netcdf_of_a_run_give_the_same_estimates_in_folders_without_its_truth(
     mine, record, tmp_path, capfd
 ):

@@ -83,10 +83,8 @@ def sought(page, frame):
     return page.run("return window.replay.shown()")
 
 
-@pytest.mark.parametrize(
-    "robot",
-    ["rss6", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("ups6", "delta3"))],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize("robot", ["rss6", "ups6", "delta3"])
 def test_the_slider_shows_the_poses_of_the_files(robot, replayed, browser):
     folder = replayed(robot)
     page = opened(browser(), folder)

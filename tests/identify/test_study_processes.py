@@ -65,7 +65,7 @@ def test_rows_that_end_their_process_or_take_its_memory_are_errors_and_no_other_
     same_numbers(frame.drop(index=[3, 5, 7]), serial.drop(index=[3, 5, 7]))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_killed_processes_are_replaced_cost_their_batch_alone_and_change_no_number(
     tmp_path, serial
 ):
