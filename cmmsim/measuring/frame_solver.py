@@ -66,6 +66,7 @@ LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # Errors that are larger than noise are not independent: a pose errs as if each were shared by this
 # number of stickers.
 EXCESS_SHARE = 4.0
+# Probability at which a pose from few stickers has the quantile of a normal one, see ``_tails``.
 TAIL = 0.999
 # A pose errs in six shapes that are as smooth as those of a warp. What of the mean square of the
 # warp's shapes exceeds its limit, times this number, is added to the factor on the covariance.

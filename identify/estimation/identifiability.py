@@ -147,17 +147,22 @@ class GroupEstimates:
     prior_share: Array
 
     @property
+    def several(self) -> NDArray[np.bool_]:
+        """True for each group (rank,) of several parameters."""
+        return np.asarray(np.count_nonzero(self.combinations, axis=1) > 1)
+
+    @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
         """True for each group (rank,) that is identified only with the guess of parameters."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
 
-def group_rows(base: BaseParameters, layout: ParameterLayout) -> Array:
+def group_rows(combinations: Array, layout: ParameterLayout) -> Array:
     """Return the groups as combinations (rank, p) of all parameters.
 
     The gains of the joint PID belong to no group.
     """
-    return np.pad(base.combinations, ((0, 0), (0, len(layout.joint_pid_names))))
+    return np.pad(combinations, ((0, 0), (0, len(layout.joint_pid_names))))
 
 
 def group_estimates(
@@ -168,7 +173,7 @@ def group_estimates(
     uncertainty: Uncertainty,
 ) -> GroupEstimates:
     """Return the estimates of the groups from parameters (p,) and their uncertainty."""
-    rows = group_rows(base, guess.layout)
+    rows = group_rows(base.combinations, guess.layout)
     return GroupEstimates(
         names=base.group_names(),
         expressions=base.expressions(),
@@ -298,7 +303,7 @@ def judge(
     ]
     groups = group_estimates(base, guess, criterion, estimate, uncertainty)
     identifiable = criterion.judge(each, uncertainty.covariance)
-    in_groups = group_rows(base, robot.layout)[groups.identifiable] != 0
+    in_groups = group_rows(base.combinations, robot.layout)[groups.identifiable] != 0
     shown = identifiable | np.any(in_groups, axis=0)
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
@@ -310,7 +315,7 @@ def judge(
         },
         intervals=bounded.intervals(each),
         groups=groups,
-        group_intervals=bounded.intervals(group_rows(base, robot.layout)),
+        group_intervals=bounded.intervals(group_rows(base.combinations, robot.layout)),
         bounded=bounded,
         conditioning=conditioned,
         base_rank=rank_by_threshold(np.concatenate(excited), qr_threshold),

@@ -133,7 +133,7 @@ def _figures(
 ) -> Iterator[tuple[str, Figure]]:
     """Yield all plots of a study with the names of their files."""
     if tests:
-        yield "uniformity", uniformity_figure(done, list(study.factors), tests)
+        yield "uniformity", uniformity_figure(tests)
     for path in study.factors:
         yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]

@@ -92,7 +92,7 @@ def write(
             name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))
         },
         "theory": [verdict.entry for verdict in verdicts],
-        "uniformity": [asdict(one) | {"fails": one.fails} for one in tests],
+        "uniformity": [one.entry for one in tests],
         "points": [
             {"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
             for factors, figures in points

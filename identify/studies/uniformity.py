@@ -43,17 +43,26 @@ SIMULATED = 4000
 class Uniformity:
     """Test of one figure.
 
-    name: figure without `PROBABILITY`. point: values of the factors. rows: number of rows of the
-    point that have the figure. mean: its mean, 0.5 if the estimates are right on average. p_value:
-    Kolmogorov and Smirnov's. corrected: p value multiplied by the number of tests (Bonferroni).
+    name: figure without `PROBABILITY`. point: values of the factors. values (n,): the figure in the
+    rows of the point that have it, in ascending order. p_value: Kolmogorov and Smirnov's.
+    corrected: p value multiplied by the number of tests (Bonferroni).
     """
 
     name: str
     point: tuple[str, ...]
-    rows: int
-    mean: float
+    values: Array
     p_value: float
     corrected: float
+
+    @property
+    def rows(self) -> int:
+        """Number of rows with the figure."""
+        return len(self.values)
+
+    @property
+    def mean(self) -> float:
+        """Mean of the figure, 0.5 if the estimates are right on average."""
+        return float(self.values.mean())
 
     @property
     def fails(self) -> bool:
@@ -64,6 +73,12 @@ class Uniformity:
     def label(self) -> str:
         """Name of the figure, after the values of the factors."""
         return " ".join((*self.point, self.name))
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Test for JSON, without the values."""
+        names = ("name", "point", "rows", "mean", "p_value", "corrected", "fails")
+        return {name: getattr(self, name) for name in names}
 
 
 def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniformity]:
@@ -76,7 +91,7 @@ def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniform
     for (point, name), values in figures.items():
         p_value = float(kstest(values, "uniform").pvalue)
         corrected = min(1.0, p_value * len(figures))
-        found.append(Uniformity(name, point, len(values), float(values.mean()), p_value, corrected))
+        found.append(Uniformity(name, point, np.sort(values), p_value, corrected))
     return sorted(found, key=lambda one: one.p_value)
 
 
@@ -116,9 +131,7 @@ def simultaneous_band(rows: int) -> tuple[Array, Array, Array]:
     return points, low / rows - points, high / rows - points
 
 
-def uniformity_figure(
-    done: pd.DataFrame, factors: Sequence[str], found: list[Uniformity]
-) -> Figure:
+def uniformity_figure(found: list[Uniformity]) -> Figure:
     """Plot the curve of each tested figure, times the root of its number of rows, and the band.
 
     Figures that fail have a name and a colour.
@@ -128,13 +141,11 @@ def uniformity_figure(
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     axes = figure.subplots()
     root = np.sqrt(rows)
-    figures = probabilities_at_points(done, factors)
     axes.fill_between(
         points, root * low, root * high, color="0.85", label=f"band of right ones, {BAND:.0%}"
     )
     for one in reversed(found):
-        values = np.sort(figures[one.point, one.name])
-        curve = np.searchsorted(values, points, side="right") / one.rows - points
+        curve = np.searchsorted(one.values, points, side="right") / one.rows - points
         style: dict[str, Any] = (
             {"label": one.label, "lw": 1.2} if one.fails else {"color": "0.4", "lw": 0.5}
         )

@@ -180,7 +180,7 @@ class LoggedRun:
             known = self.settings.anchor_std or default_std(anchor, robot.layout)
             information[place, place] += (guess.std[place] / known) ** 2
         covariance = np.linalg.inv(information) * np.outer(guess.std, guess.std)
-        rows_of_groups = group_rows(structure(robot), robot.layout)
+        rows_of_groups = group_rows(structure(robot).combinations, robot.layout)
         return identifiability(guess, robot).judge(rows_of_groups, covariance)
 
 

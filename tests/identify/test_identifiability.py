@@ -191,7 +191,7 @@ def test_the_estimate_does_not_decide(base, factor):
     uncertainty = Uncertainty(covariance, {"guess": covariance}, covariance, truth(), None)
     groups = group_estimates(base, guess, criterion, factor * truth(), uncertainty)
     assert groups.identifiable.all()
-    assert not criterion.judge(group_rows(base, LAYOUT), 9 * covariance).any()
+    assert not criterion.judge(group_rows(base.combinations, LAYOUT), 9 * covariance).any()
 
 
 @pytest.fixture(scope="module")

@@ -75,7 +75,7 @@ def test_right_distributions_pass_and_wrong_ones_are_named():
     found = judge_uniformity(done, [])
     assert {one.name for one in found if one.fails} == {"narrow", "high"}
     assert len(found) == 42
-    labels = uniformity_figure(done, [], found).axes[0].get_legend().get_texts()
+    labels = uniformity_figure(found).axes[0].get_legend().get_texts()
     assert {text.get_text() for text in labels[1:]} == {"narrow", "high"}
     assert judge_uniformity(done.head(10), []) == [], "too few rows for a test"
 

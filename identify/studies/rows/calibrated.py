@@ -20,6 +20,7 @@ from dynamics.closed_loop import LoopFailure
 from identify.arrays import Array
 from identify.errors import StudyError
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
+from identify.estimation.identifiability import group_rows
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.result import IdentificationResult
@@ -29,7 +30,6 @@ from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import PoseSensor
 from identify.experiment.truth import true_poses
 from identify.files.dataset import POSE
-from identify.model.model_side import model_side
 from identify.progress import SilentProgress
 from identify.random_streams import child, stream_seed
 from identify.scenario import Scenario
@@ -178,7 +178,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: SensorOpt
     setup = row_setup(scenario, stream_seed(seed, EXPERIMENT))
     settings = scenario.identification
     plant = setup.plant
-    side = model_side(setup.robot, scenario)
+    side = setup.side
     if plant.robot.layout.names != side.robot.layout.names:
         raise StudyError(
             "the truth is drawn from the prior of the model, so plant and model need the same "
@@ -215,15 +215,12 @@ def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
     """Return the probabilities below the truth of the identified quantities, and their coverage."""
     truth = plant.parameters_of(result.layout)
     groups = result.groups
-    gains = len(result.names) - groups.combinations.shape[1]
-    combined = np.pad(groups.combinations, ((0, 0), (0, gains)))
-    several = np.count_nonzero(groups.combinations, axis=1) > 1
-    rows = np.concatenate(
-        [np.eye(len(truth))[result.identifiable], combined[groups.identifiable & several]]
-    )
+    counted = groups.identifiable & groups.several
+    combined = group_rows(groups.combinations, result.layout)
+    rows = np.concatenate([np.eye(len(truth))[result.identifiable], combined[counted]])
     names = [
         *np.array(result.names)[result.identifiable],
-        *np.array(groups.expressions)[groups.identifiable & several],
+        *np.array(groups.expressions)[counted],
     ]
     if not names:
         return {"intervals": 0}

@@ -77,14 +77,12 @@ def quantities(
     `truth` holds the true parameters (p,).
     """
     groups = result.groups
-    # A group of one parameter would count this parameter twice.
-    several = np.count_nonzero(groups.combinations, axis=1) > 1
     parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
     combined = (
         groups.expressions,
         groups.combinations @ truth[result.layout.dynamic],
         result.group_intervals,
-        several,
+        groups.several,  # a group of one parameter would count this parameter twice
     )
     for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
         for k in np.flatnonzero(counted):
