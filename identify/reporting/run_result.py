@@ -13,7 +13,7 @@ from identify.experiment.truth import true_poses, true_values
 from identify.files.run_folder import rms_figures
 from identify.loop_parameters import parameter_column, parameter_entries, settled_drive
 from identify.record import recording
-from identify.validation.prediction import PosePrediction
+from identify.validation.pose_prediction import PosePrediction
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:

@@ -22,7 +22,7 @@ from identify.record.stored_common_errors import CHANGES, kind_of, read_common_e
 from identify.reporting.run_result import parameter_vector
 from identify.scenario import load_scenario
 from identify.trajectory import load_trajectories
-from identify.validation.prediction import predicted_variances
+from identify.validation.pose_prediction import predicted_variances
 
 UNITS = 3 * ("m",) + 3 * ("rad",)
 

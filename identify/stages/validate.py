@@ -31,7 +31,7 @@ from identify.reporting.run_result import (
     validation_entry,
 )
 from identify.stages.plan import check_planned, open_run
-from identify.validation.prediction import predicted_runs
+from identify.validation.pose_prediction import predicted_runs
 from identify.validation.unseen import model_on_record, run_unseen
 
 

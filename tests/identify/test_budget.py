@@ -18,7 +18,7 @@ from identify.record.recording import write_runs
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting.run_result import parameter_vector
 from identify.stages.run_budget import error_budget, pose_budget
-from identify.validation.prediction import predicted_runs
+from identify.validation.pose_prediction import predicted_runs
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import (
     SHORT,

@@ -29,7 +29,7 @@ from identify.record.stored_common_errors import (
     store_common_errors,
 )
 from identify.reporting.tables import common_error_table
-from identify.validation.prediction import predicted_runs
+from identify.validation.pose_prediction import predicted_runs
 from identify.validation.unseen import model_run
 from tests.identify.synthetic import (
     SIGMA,

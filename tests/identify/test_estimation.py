@@ -28,7 +28,7 @@ from identify.progress import SilentProgress
 from identify.record.load import store_payload
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
-from identify.validation.prediction import PosePrediction, predict_poses, predicted_runs
+from identify.validation.pose_prediction import PosePrediction, predict_poses, predicted_runs
 from tests.identify.synthetic import (
     LAYOUT,
     NAMES,

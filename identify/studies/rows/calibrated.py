@@ -43,7 +43,7 @@ from identify.studies.rows.identified import (
 )
 from identify.studies.rows.kind import PROBABILITY, Column, KeysRead, Kind, Row
 from identify.studies.rows.row_sensor import SensorOptions, row_pose_sensor
-from identify.validation.prediction import PosePrediction, predicted_runs
+from identify.validation.pose_prediction import PosePrediction, predicted_runs
 
 TRUTH = 1
 TRAJECTORIES = 2

@@ -12,7 +12,7 @@ from identify.experiment.run import Experiment
 from identify.experiment.truth import true_poses
 from identify.studies.rows.kind import Row
 from identify.studies.rows.row_sensor import rms_um
-from identify.validation.prediction import PosePrediction
+from identify.validation.pose_prediction import PosePrediction
 
 
 def intervals_hold(result: IdentificationResult, plant: Plant) -> tuple[bool, ...]:

@@ -46,7 +46,7 @@ from identify.studies.rows.kind import (
 )
 from identify.studies.rows.row_sensor import SensorOptions, rms_um, row_pose_sensor, stated_um
 from identify.trajectory import TrajectorySet
-from identify.validation.prediction import PosePrediction, predicted_runs
+from identify.validation.pose_prediction import PosePrediction, predicted_runs
 from identify.validation.unseen import model_on_record
 
 EXPERIMENT = 0
