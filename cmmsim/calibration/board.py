@@ -3,6 +3,10 @@
 The board frame has its origin at the first point. Its x axis points from column to column, its y
 axis from row to row, and its z axis away from an observer who looks at the front. All points lie in
 z = 0. They are ordered row by row, and along x within a row, as in OpenCV.
+
+The points of a chessboard and of a ChArUco board are the inner corners of their squares. A ChArUco
+board has a marker in each bright square, which tells its corners apart even where a part of the
+board is outside of the picture.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
@@ -20,36 +25,69 @@ from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Count = Annotated[int, Field(ge=3, le=200)]
+# OpenCV's constants of its dictionaries of markers, by their names without the prefix.
+DICTIONARIES: dict[str, int] = {
+    name.removeprefix("DICT_").upper(): getattr(cv2.aruco, name)
+    for name in dir(cv2.aruco)
+    if name.startswith("DICT_")
+}
 
 
 class Board(Section):
     """Flat board.
 
-    kind     "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every
-             other row shifted)
-    columns  points along x: inner corners of a chessboard, or dots in one row
-    rows     points along y
-    spacing  distance between neighbouring points, m; for asymmetric_dots the distance between
-             rows, while dots of the same row are twice as far apart
-    radius   radius of the dots, m; not allowed for a chessboard
-    dark     True if dots are darker than the board
+    kind        "chessboard", "charuco", "dots" (rows and columns at right angles) or
+                "asymmetric_dots" (every other row shifted)
+    columns     points along x: inner corners, one less than squares, or dots in one row
+    rows        points along y
+    spacing     distance between neighbouring points, m; for asymmetric_dots the distance between
+                rows, while dots of the same row are twice as far apart
+    radius      radius of the dots, m; of dots only
+    dark        True if dots are darker than the board
+    marker      side of the markers with their dark border, m; of charuco only
+    dictionary  OpenCV's name of the markers' dictionary, such as "5X5_100" or "APRILTAG_36h11"; of
+                charuco only
     """
 
     model_config = ConfigDict(strict=True)
 
-    kind: Literal["chessboard", "dots", "asymmetric_dots"]
+    kind: Literal["chessboard", "charuco", "dots", "asymmetric_dots"]
     columns: Count
     rows: Count
     spacing: Length
     radius: Length | None = None
     dark: bool = True
+    marker: Length | None = None
+    dictionary: str | None = None
+
+    @model_validator(mode="after")
+    def _markers_fit(self) -> Board:
+        """Raise ValueError for markers that are missing, extra, too large or too many."""
+        given = (self.marker, self.dictionary)
+        if self.kind != "charuco":
+            if given != (None, None):
+                raise ValueError(f"{self.kind} have no markers, remove marker and dictionary")
+            return self
+        if self.marker is None or self.dictionary is None:
+            raise ValueError("marker (side, m) or dictionary is missing, charuco needs both")
+        if self.marker >= self.spacing:
+            raise ValueError(
+                f"markers of {self.marker:g} m do not fit into squares of {self.spacing:g} m"
+            )
+        count = (self.rows + 1) * (self.columns + 1) // 2
+        if count > (most := len(self.markers.bytesList)):
+            raise ValueError(
+                f"{self.columns + 1} x {self.rows + 1} squares have {count} markers, but the "
+                f"dictionary {self.dictionary} has {most}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _dots_fit(self) -> Board:
         """Raise ValueError for dots that nearly touch, or for a radius that is missing or extra."""
-        if self.kind == "chessboard":
+        if self.has_squares:
             if self.radius is not None:
-                raise ValueError("a chessboard has no dots, remove radius")
+                raise ValueError(f"a {self.kind} has no dots, remove radius")
         elif self.radius is None:
             raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
         elif self.radius > 0.4 * self.nearest:
@@ -60,8 +98,34 @@ class Board(Section):
         return self
 
     @property
+    def has_squares(self) -> bool:
+        """True for boards of squares, False for boards of dots."""
+        return self.kind in ("chessboard", "charuco")
+
+    @property
+    def markers(self) -> cv2.aruco.Dictionary:
+        """Dictionary of the markers of a ChArUco board. Raises ValueError for an unknown name."""
+        name = str(self.dictionary).upper().removeprefix("DICT_")
+        if name not in DICTIONARIES:
+            raise ValueError(
+                f"unknown dictionary {self.dictionary!r}, valid are {', '.join(DICTIONARIES)}"
+            )
+        return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
+
+    def charuco(self, legacy: bool = False) -> cv2.aruco.CharucoBoard:
+        """Return OpenCV's description of a ChArUco board.
+
+        OpenCV before version 4.6 placed markers in the other squares if the rows of squares are
+        even in number. ``legacy`` describes such a board.
+        """
+        squares = (self.columns + 1, self.rows + 1)
+        found = cv2.aruco.CharucoBoard(squares, self.spacing, self.marker or 0.0, self.markers)
+        found.setLegacyPattern(legacy)
+        return found
+
+    @property
     def dot_radius(self) -> float:
-        """Radius of the dots, m; 0 for a chessboard."""
+        """Radius of the dots, m; 0 for squares."""
         return self.radius or 0.0
 
     @property
@@ -82,9 +146,11 @@ class Board(Section):
 
         The first is the order of ``points``. The others follow from half a turn of the board, and
         from quarter turns if it has as many rows as columns. An asymmetric grid with an odd number
-        of rows has no others.
+        of rows has no others, and neither has a ChArUco board.
         """
         order = np.arange(self.rows * self.columns)
+        if self.kind == "charuco":
+            return [order]
         if self.kind == "asymmetric_dots":
             return [order] if self.rows % 2 else [order, order[::-1]]
         if self.rows != self.columns:
@@ -100,6 +166,8 @@ class Board(Section):
             f"rows = {self.rows}",
             f"spacing = {self.spacing!r}  # m",
         ]
+        if self.dictionary is not None:
+            lines += [f"marker = {self.marker!r}  # m", f'dictionary = "{self.dictionary}"']
         if self.radius is not None:
             lines += [f"radius = {self.radius!r}  # m", f"dark = {str(self.dark).lower()}"]
         return "\n".join(lines) + "\n"

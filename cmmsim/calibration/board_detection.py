@@ -1,6 +1,7 @@
 """Detection of a board in a picture: the visible points and their pixels.
 
-OpenCV finds the corners of a chessboard. Dots are found directly if one threshold separates all
+OpenCV finds the corners of squares, see square_detection. Dots are found directly if one threshold
+separates all
 dots from the background, and the dots lie on the perspective image of a grid. The four sharpest
 corners of the dots' convex hull are then the corners of the board, and a homography identifies the
 other dots. OpenCV finds the dots in any other picture. It tries two dozen thresholds and supports
@@ -22,21 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
+from cmmsim.calibration.square_detection import find_charuco, find_chessboard
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-# Fraction of the board's points that must be measured.
+# Fraction of the board's points that must be measured, and number of a ChArUco board, which may be
+# partly outside of the picture.
 FEWEST_MEASURED = 0.7
+FEWEST_CHARUCO = 6
 # Largest distance of a point from its place in the plane's perspective image, over the distance
 # between neighbouring points.
 LARGEST_POINT_GAP = 0.25
 # Largest relative difference between the measured and the given radius of the dots. A larger one
 # would make the correction of the dots' centres wrong by more than 20 %.
 LARGEST_RADIUS_GAP = 0.1
-# Half the width of cornerSubPix's window, over the distance between neighbouring corners.
-FINE_WINDOW_RATIO = 0.3
 
 FIT_ITERATIONS = 5
 # Radius of the fitted surroundings of a dot, and radius from which on pixels belong to the ground,
@@ -95,12 +97,15 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     radius: float | None = None
     if board.kind == "chessboard":
         found = find_chessboard(grey, board.columns, board.rows)
+    elif board.kind == "charuco":
+        found = find_charuco(grey, board)
     else:
         found, radius = find_dots(grey, board) or (None, None)
     if found is None:
         return f"no {board.kind} of {board.columns} x {board.rows} found"
     measured = np.isfinite(found).all(axis=1)
-    if measured.sum() < FEWEST_MEASURED * len(found):
+    fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(found)
+    if measured.sum() < fewest:
         other = radius_differs(radius, board.radius)
         why = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" if other else ""
         return f"only {measured.sum()} of {len(found)} points are sharp and whole{why}"
@@ -116,6 +121,8 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
+    if len(np.unique(plane[:, 0])) < 2 or len(np.unique(plane[:, 1])) < 2:
+        return "its points lie on one line"
     homography, _ = cv2.findHomography(plane, view.pixels)
     if homography is None:
         return "its points lie on one line"
@@ -145,28 +152,6 @@ def radius_differs(measured: float | None, given: float | None) -> bool:
         and given is not None
         and bool(abs(measured - given) > LARGEST_RADIUS_GAP * given)
     )
-
-
-def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
-    """Return the corners (rows * columns, 2) px, or None.
-
-    The sector-based search is tried first, then the older search with refined corners.
-    """
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=flags)
-    if found:
-        return np.asarray(corners, dtype=float).reshape(-1, 2)
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    found, corners = cv2.findChessboardCorners(grey, (columns, rows), flags=flags)
-    if not found:
-        return None
-    corners = np.asarray(corners, dtype=np.float32).reshape(-1, 1, 2)
-    grid = corners.reshape(rows, columns, 2)
-    nearest = min(np.linalg.norm(np.diff(grid, axis=k), axis=2).min() for k in (0, 1))
-    half = max(2, int(FINE_WINDOW_RATIO * nearest))
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    fine = cv2.cornerSubPix(grey, corners, (half, half), (-1, -1), stop)
-    return np.asarray(fine, dtype=float).reshape(-1, 2)
 
 
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:

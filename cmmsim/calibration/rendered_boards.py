@@ -12,18 +12,21 @@ from scipy.spatial.transform import Rotation
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert
+from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.prints import Print, print_renderer
 from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
-# Constants of the drawn board. Width of the plate beyond its outermost points, in spacings. A
-# chessboard's outer squares fill this margin, and a bright rim of width RIM surrounds the squares.
+# Constants of the drawn board. Width of the plate beyond its outermost points, in spacings. The
+# outer squares of a board fill this margin, and a bright rim of width RIM surrounds the squares.
 MARGIN = 1.0
 RIM = 0.35
+# Picture elements along the side of a square. OpenCV rounds the sides of markers to them.
+SQUARE = 80
 THICKNESS = 0.008  # m
 # Reflectances.
 BRIGHT = 0.86
@@ -45,28 +48,27 @@ AT_ONCE = 200
 # Constants of its images.
 TILE_PX = 64
 SUPERSAMPLING = 12
+# Each sample of a print is as expensive as the others, and its edges are long.
+PRINT_SUPERSAMPLING = 6
 # Points along each side of the plate, from which the extent of its distorted image is found.
 OUTLINE_POINTS = 15
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
-    """Return plate and marks of a board as one body in the board frame.
+    """Return plate and dots of a board as one body in the board frame.
 
     ``distance`` is the distance from the cameras to the board, m.
     """
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
     dots = [DiscStack((Disc(point, FRONT, board.dot_radius, mark),)) for point in board.points]
-    patches: list[Patch] = [
-        *(_squares(board, mark) if board.kind == "chessboard" else dots),
-        _plate(board, ground),
-    ]
+    patches: list[Patch] = [*dots, _plate(board, ground)]
     return Drawable(patches, [0] * len(patches), distance)
 
 
 def plate_corners(board: Board) -> Array:
     """Return the corners (4, 3) of the plate's front, m."""
     points = board.points
-    rim = board.spacing * (MARGIN + (RIM if board.kind == "chessboard" else 0.0))
+    rim = board.spacing * (MARGIN + (RIM if board.has_squares else 0.0))
     x0, y0 = points[:, :2].min(axis=0) - rim
     x1, y1 = points[:, :2].max(axis=0) + rim
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
@@ -81,21 +83,20 @@ def _plate(board: Board, level: float) -> Mesh:
     return solid_mesh(mesh, level)
 
 
-def _squares(board: Board, level: float) -> list[Mesh]:
-    """Return a chessboard's squares of one colour, also those outside its outermost corners."""
-    corners = board.spacing * np.array(
-        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
-    )
-    places = [
-        np.array([column, row, 0.0]) * board.spacing
-        for row in range(-1, board.rows)
-        for column in range(-1, board.columns)
-        if (row + column) % 2 == 0
-    ]
-    return [
-        Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level))
-        for place in places
-    ]
+def _squares(board: Board) -> Print:
+    """Return the print of a board of squares, with its bright rim."""
+    columns = board.columns + 1
+    rows = board.rows + 1
+    rim = round(RIM * SQUARE)
+    if board.kind == "chessboard":
+        place = np.add.outer(np.arange(rows), np.arange(columns))
+        bright = np.kron(place % 2, np.ones((SQUARE, SQUARE), dtype=int))
+    else:
+        bright = board.charuco().generateImage((columns * SQUARE, rows * SQUARE)) // 255
+    levels = np.where(np.pad(bright, rim, constant_values=1), BRIGHT, DARK).astype(np.float32)
+    # The frame of a print begins at its corner, and that of a board at its first point.
+    place = rigid(np.eye(3), plate_corners(board)[0])
+    return Print(levels, board.spacing / SQUARE, place)
 
 
 def default_board(rig: StereoRig) -> Board:
@@ -240,14 +241,9 @@ def render_pairs(
 ) -> Iterator[StereoFrame]:
     """Yield noisy images of both cameras for each pose left_from_board (4, 4).
 
-    Raises CalibrationError for a chessboard with the analytic renderer, which draws only discs and
-    convex solids.
+    The renderer draws dots. Squares are drawn as a print, without it.
     """
-    if board.kind == "chessboard" and renderer.name == "analytic":
-        raise CalibrationError(
-            "the analytic renderer cannot draw a chessboard: use the renderer pyrender, or a board "
-            "of dots"
-        )
+    renderer = print_renderer([_squares(board)]) if board.has_squares else renderer
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
     formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
     for pose in poses:
@@ -271,7 +267,9 @@ def _radiance(
     )
     corners = _reached_tiles(camera, camera_from_board, board, formation.optics.margin_px)
     tiles = formation.windows(
-        [Side(camera, camera_from_board[None], corners)], TILE_PX, SUPERSAMPLING
+        [Side(camera, camera_from_board[None], corners)],
+        TILE_PX,
+        PRINT_SUPERSAMPLING if board.has_squares else SUPERSAMPLING,
     )[0]
     for (x, y), tile in zip(corners, tiles, strict=True):
         image[y : y + TILE_PX, x : x + TILE_PX] = tile

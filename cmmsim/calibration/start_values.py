@@ -19,6 +19,8 @@ from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert, rigid
 
 FEWEST_VIEWS = 3
+# Fewest common points of two pictures from which OpenCV finds the place of a board.
+FEWEST_COMMON = 6
 # Two pictures show the board in the same place if their points differ by less than this, px rms.
 ALIKE_PX = 2.0
 # Poses of the right camera count as the same if they differ by less than this angle, rad, and by
@@ -223,6 +225,8 @@ def _stereo(
         a = left_views[k]
         b = right_views[k]
         index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+        if len(index) < FEWEST_COMMON:
+            continue
         points.append(board.points[index].astype(np.float32))
         left.append(a.pixels[in_a].astype(np.float32))
         right.append(b.pixels[in_b].astype(np.float32))

@@ -103,14 +103,16 @@ def calibrate(
     Reads both folders and the description of the board:
 
     \b
-      kind = "dots"         # or chessboard, or asymmetric_dots, whose every other
-                            # row is shifted
-      columns = 13          # dots in a row; of a chessboard: inner corners, one
-                            # less than squares
+      kind = "dots"         # or chessboard, charuco, or asymmetric_dots, whose
+                            # every other row is shifted
+      columns = 13          # dots in a row; of squares: inner corners, one less
+                            # than squares
       rows = 9
       spacing = 0.038       # m between neighbours; asymmetric_dots: between rows
       radius = 0.0095       # m, of dots only
       dark = true           # dots darker than the board, of dots only
+      marker = 0.028        # m, side of the markers, of charuco only
+      dictionary = "5X5_100"  # OpenCV's name, of charuco only
 
     Writes into the folder calibration.json, which is also the JSON: estimates with standard
     deviations, covariance, residuals, and the images used and rejected. If the points of a picture

@@ -13,12 +13,12 @@ from cmmsim.calibration import (
     read_grey,
     view_pairs,
 )
-from tests.cmmsim.test_calibration_images import ASYMMETRIC, CHESSBOARD, DOTS
+from tests.cmmsim.test_calibration_images import ASYMMETRIC, CHARUCO, CHESSBOARD, DOTS
 
 # --- board files
 
 
-@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD])
+@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD, CHARUCO])
 def test_board_file_is_read_back(tmp_path, board):
     (tmp_path / "board.toml").write_text(board.as_toml())
     assert read_board(tmp_path / "board.toml") == board
@@ -29,16 +29,18 @@ def test_board_file_is_read_back(tmp_path, board):
     [
         (
             "colums = 9",
-            "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing",
+            "unknown key 'colums', valid are columns, dark, dictionary, kind, marker, "
+            "radius, rows, spacing",
         ),
         ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
         ("columns = 2", "columns: .*greater than or equal to 3"),
-        ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
+        ('kind = "aruco"', "kind: .*'chessboard', 'charuco', 'dots' or 'asymmetric_dots'"),
         ("spacing = nan", "spacing: .*finite"),
         ("spacing = 0", "spacing: .*greater than 0"),
         ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
         ("rows", "is not TOML"),
         ('kind = "chessboard"', "a chessboard has no dots"),
+        ("marker = 0.02", "dots have no markers, remove marker and dictionary"),
     ],
 )
 def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
@@ -46,6 +48,22 @@ def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
     name, _, value = text.partition(" = ")
     values[name] = value
     (tmp_path / "board.toml").write_text("\n".join(f"{k} = {v}" for k, v in values.items()))
+    with pytest.raises(CalibrationError, match=evidence):
+        read_board(tmp_path / "board.toml")
+
+
+@pytest.mark.parametrize(
+    ("changed", "evidence"),
+    [
+        (("marker = 0.037  # m\n", ""), "charuco needs both"),
+        (("0.037", "0.05"), "markers of 0.05 m do not fit into squares of 0.05 m"),
+        (("5X5_100", "5x5_30"), "unknown dictionary '5x5_30', valid are 4X4_100, .*APRILTAG_36H11"),
+        (("columns = 8", "columns = 30"), "31 x 7 squares have 108 markers, .*5X5_100 has 100"),
+        (("spacing", "radius = 0.01\nspacing"), "a charuco has no dots"),
+    ],
+)
+def test_bad_charuco_board_is_refused_with_evidence(tmp_path, changed, evidence):
+    (tmp_path / "board.toml").write_text(CHARUCO.as_toml().replace(*changed))
     with pytest.raises(CalibrationError, match=evidence):
         read_board(tmp_path / "board.toml")
 

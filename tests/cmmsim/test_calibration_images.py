@@ -31,12 +31,12 @@ from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
 from cmmsim.imaging.analytic import ANALYTIC
-from cmmsim.imaging.pyrender_renderer import PYRENDER
 from tests.cmmsim.sensors import NOISE
 
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
 ASYMMETRIC = Board(kind="asymmetric_dots", columns=4, rows=9, spacing=0.04, radius=0.014)
 CHESSBOARD = Board(kind="chessboard", columns=8, rows=6, spacing=0.05)
+CHARUCO = Board(kind="charuco", columns=8, rows=6, spacing=0.05, marker=0.037, dictionary="5X5_100")
 PERFECT = toed_in_rig(
     PinholeCamera(1000.0, 399.5, 299.5, 800, 600), 0.5, np.array([0.0, -1.6, 0.0]), np.zeros(3)
 )[0]
@@ -135,15 +135,35 @@ def test_dots_are_found_to_hundredths_of_a_pixel(rig, board, count, seed, psf_px
     assert np.abs(errors.mean(axis=0)).max() < 0.004
 
 
-@pytest.mark.rendering
 def test_chessboard_corners_are_found_to_a_tenth_of_a_pixel_by_the_older_search_too(monkeypatch):
     """Which is taken where the newer one fails."""
-    drawn = rendered(PERFECT, CHESSBOARD, 2, renderer=PYRENDER)
+    drawn = rendered(PERFECT, CHESSBOARD, 2)
     errors = pixel_errors(PERFECT, CHESSBOARD, *drawn)
-    assert np.sqrt(np.mean(errors**2)) < 0.1
-    assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert np.sqrt(np.mean(errors**2)) < 0.06
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
     monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: (False, None))
     assert np.sqrt(np.mean(pixel_errors(PERFECT, CHESSBOARD, *drawn) ** 2)) < 0.1
+
+
+def test_corners_between_markers_are_found_as_well_as_those_of_a_chessboard():
+    """OpenCV's own corners of these pictures are off by 0.07 px rms, and by up to 0.7 px."""
+    errors = pixel_errors(PERFECT, CHARUCO, *rendered(PERFECT, CHARUCO, 2))
+    assert np.sqrt(np.mean(errors**2)) < 0.05
+    assert np.abs(errors).max() < 0.25
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_markers_may_be_in_either_squares_of_a_board_of_an_even_number_of_rows(legacy):
+    """OpenCV draws the picture. Its corners lie between pixels."""
+    board = CHARUCO.model_copy(update={"rows": 5})
+    picture = board.charuco(legacy).generateImage((9 * 40, 6 * 40))
+    view = find_board(
+        cv2.copyMakeBorder(picture, 20, 20, 20, 20, cv2.BORDER_CONSTANT, 0, 255), board
+    )
+    np.testing.assert_array_equal(view.index, np.arange(40))
+    expected = 800.0 * board.points[:, :2] + 40 + 20 - 0.5
+    np.testing.assert_allclose(view.pixels, expected, atol=0.02)
 
 
 @pytest.mark.slow
@@ -238,8 +258,6 @@ def test_a_dot_alone_has_the_median_of_its_ground_for_neighbours():
 
 
 def test_boards_that_cannot_be_drawn_are_refused():
-    with pytest.raises(CalibrationError, match="use the renderer pyrender, or a board of dots"):
-        rendered(PERFECT, CHESSBOARD, 1)
     with pytest.raises(CalibrationError, match=r"shows the whole board of 2\.5 x 2 m"):
         board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
 
@@ -271,7 +289,7 @@ def test_far_too_small_a_radius_is_the_reason_given():
     [
         (PERFECT, DOTS, 8, 3, ANALYTIC, 0.0, 0.02),
         pytest.param(BENT, DOTS, 10, 3, ANALYTIC, 0.4, 0.02, marks=pytest.mark.slow),
-        pytest.param(BENT, CHESSBOARD, 12, 8, PYRENDER, 0.4, 0.1, marks=pytest.mark.thorough),
+        pytest.param(BENT, CHESSBOARD, 12, 8, ANALYTIC, 0.4, 0.1, marks=pytest.mark.thorough),
     ],
 )
 def test_rendered_boards_give_the_true_cameras(rig, board, count, seed, renderer, psf_px, sigma_px):
@@ -280,6 +298,30 @@ def test_rendered_boards_give_the_true_cameras(rig, board, count, seed, renderer
     assert len(found.used) == count
     assert np.abs(normalised_errors(found, rig)).max() < 4.0
     assert found.adjustment.sigma_px < sigma_px
+
+
+@pytest.mark.parametrize(
+    ("rig", "count", "psf_px"),
+    [
+        pytest.param(PERFECT, 8, 0.0, marks=pytest.mark.slow),
+        pytest.param(BENT, 12, 0.4, marks=pytest.mark.thorough),
+    ],
+)
+def test_charuco_boards_that_reach_out_of_the_pictures_give_the_true_cameras(rig, count, psf_px):
+    """The middle of the board is where that of a smaller one would be wholly in both pictures."""
+    board = CHARUCO.model_copy(update={"columns": 11, "rows": 8, "spacing": 0.07, "marker": 0.05})
+    rng = np.random.default_rng(0)
+    poses = board_poses(rig, DOTS, count, rng)
+    for pose in poses:
+        pose[:3, 3] += pose[:3, :3] @ (DOTS.points.mean(axis=0) - board.points.mean(axis=0))
+    frames = render_pairs(rig, board, poses, ANALYTIC, Optics(psf_px=psf_px), NOISE, rng)
+    views = views_of(frames, board)
+    seen = [len(side.index) for pair in views for side in pair.sides]
+    assert np.mean(np.array(seen) < len(board.points)) > 0.6
+    found = calibrate(board, views, (800, 600))
+    assert len(found.used) == count
+    assert np.abs(normalised_errors(found, rig)).max() < 4.0
+    assert found.adjustment.sigma_px < 0.05
 
 
 def test_calibrated_sensor_file_is_one(tmp_path):
@@ -366,10 +408,10 @@ def as_photograph(image, rng):
     ("board", "renderer", "count"),
     [
         pytest.param(ASYMMETRIC, ANALYTIC, 8, marks=pytest.mark.slow),
-        pytest.param(CHESSBOARD, PYRENDER, 5, marks=pytest.mark.thorough),
+        pytest.param(CHESSBOARD, ANALYTIC, 5, marks=pytest.mark.thorough),
         pytest.param(DOTS, ANALYTIC, 16, marks=pytest.mark.thorough),
         pytest.param(ASYMMETRIC, ANALYTIC, 16, marks=pytest.mark.thorough),
-        pytest.param(CHESSBOARD, PYRENDER, 16, marks=pytest.mark.thorough),
+        pytest.param(CHESSBOARD, ANALYTIC, 16, marks=pytest.mark.thorough),
     ],
 )
 def test_photograph_like_images_give_the_true_cameras(board, renderer, count):

@@ -1,0 +1,92 @@
+"""Drawing of flat prints, such as chessboards and tags, from pictures of their levels.
+
+A perfect lens images a plane by a homography. Each sample of a pixel therefore has its exact place
+on the print. The renderer of prints draws nothing else, so `ImageFormation` adds distortion, point
+spread and pixels as it does for stickers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import Array
+from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, Views
+
+
+@dataclass(frozen=True)
+class Print:
+    """Flat print on a body.
+
+    Its frame has the origin at the outer corner of the first picture element. The x axis points
+    along the rows, the y axis down the columns, and the z axis away from an observer who looks at
+    the front.
+
+    levels           (rows, columns), radiance 0 to 1 of the picture elements
+    side             side of a picture element, m
+    body_from_print  (4, 4)
+    body             index of the body
+    """
+
+    levels: NDArray[np.float32]
+    side: float
+    body_from_print: Array
+    body: int = 0
+
+    @property
+    def corners(self) -> Array:
+        """Corners (4, 2) in picture elements: first, along x, opposite, and along y."""
+        height, width = self.levels.shape
+        return np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+
+
+def print_renderer(prints: Sequence[Print]) -> Renderer:
+    """Return a renderer that draws prints in their order, whatever drawable it is given."""
+    return Renderer("prints", partial(_draw_windows, prints))
+
+
+def _draw_windows(
+    prints: Sequence[Print],
+    drawable: Drawable,
+    views: Sequence[View],
+    supersampling: int,
+    background: float = 0.0,
+) -> NDArray[np.float32]:
+    """Draw the radiance (n, h, w) of n windows. Each pixel has ``supersampling``² samples."""
+    # Imported late, because importing numba takes time.
+    from cmmsim.imaging.print_kernels import draw_print
+
+    views = Views.of(views)
+    width, height = views.size
+    images = np.full((len(views), height, width), background, dtype=np.float32)
+    for shown in views.exposures:
+        for each in prints:
+            camera_from_print = shown.camera_from_bodies[each.body] @ each.body_from_print
+            corners = camera_from_print[:3, :2] @ (each.side * each.corners.T)
+            depths = corners[2] + camera_from_print[2, 3]
+            # The front is hidden from a camera behind the print.
+            if depths.min() < NEAR or camera_from_print[:3, 2] @ camera_from_print[:3, 3] <= 0.0:
+                continue
+            plane = camera_from_print[:3, [0, 1, 3]] * [each.side, each.side, 1.0]
+            pixels_from_texels = shown.camera.matrix @ plane
+            outline = pixels_from_texels @ [*each.corners.T, np.ones(4)]
+            pixels = outline[:2] / outline[2]
+            for k in shown.windows:
+                shift = np.eye(3)
+                shift[:2, 2] = -views.corners[k]
+                low = np.floor(pixels.min(axis=1) - views.corners[k])
+                high = np.ceil(pixels.max(axis=1) - views.corners[k])
+                if (high < 0.0).any() or (low >= views.size).any():
+                    continue
+                draw_print(
+                    images[k],
+                    np.linalg.inv(shift @ pixels_from_texels),
+                    each.levels,
+                    np.concatenate([low, high]).astype(int),
+                    supersampling,
+                )
+    return images
