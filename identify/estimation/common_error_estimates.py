@@ -8,7 +8,7 @@ At its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -51,7 +51,7 @@ def errors_of_run(run: LoopModel, parameters: Array) -> Array:
     The run is one returned by `with_common_errors`. The errors are in prior standard deviations.
     """
     assert run.marginal is not None
-    missed = replace(run, marginal=None).misses(parameters).ravel() - run.marginal.had
+    missed = run.missed_in_noise(parameters).ravel()
     return errors_from_residuals(run.marginal.modes, missed)
 
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynamics import DynamicsError
-from dynamics.closed_loop import LoopFailure
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, minimise
 from identify.estimation.bounds import ParameterBounds
 from identify.estimation.common_error_estimates import errors_in_models
+from identify.estimation.joint_search import with_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import linear_warm_start
@@ -32,25 +32,14 @@ FULL_STEPS = 2
 SETTLED = 0.02
 """Change of the most likely common errors, in standard deviations, at which the loop ends."""
 
-STEPS = 1
-"""Steps of the parameters between two linearisations in common errors with a wide prior."""
-
-MOST = 15
-"""Largest number of linearisations in common errors with a wide prior."""
-
-HALVINGS = 10
-"""Largest number of halvings of a step of the common errors."""
-
 MISSED = 1.2
 """Mean squared residual above which the search is repeated from another start."""
-
-WORSE = 1.01
-"""Largest ratio of the costs after and before a step of the common errors."""
 
 NEAR = 1.0
 """Change of common errors with a wide prior at which they count as near their optimum.
 
-It is in the standard deviations of `LoopModel.in_deciding_stds`.
+It is in the standard deviations of `LoopModel.in_deciding_stds`, for which the parameters are
+known. Parameters and errors move together by a small part of their own standard deviations there.
 """
 
 CLOSE_ENOUGH = 1e-2
@@ -118,16 +107,20 @@ def search_with_common_errors(
     problem, start = _with_common_errors(problem, starts)
     in_motion = any(run.begins_in_motion for run in problem.runs)
     if in_motion:
-        problem, start = _near_common_errors(problem, start)
+        problem, start = with_likely_errors(problem, start)
     solution = search(problem, start, advance)
     if in_motion and solution.costs[-1] > MISSED * 6 * sum(run.ok.sum() for run in problem.runs):
         # Far from the right errors, the parameters can have gone to a wrong minimum.
         warm = problem.bounds.nearest(linear_warm_start(problem))
-        again = search(problem, warm, lambda n=1: None)
-        solution = min(solution, again, key=lambda one: one.costs[-1])
+        other, start = with_likely_errors(problem, warm)
+        again = search(other, start, lambda n=1: None)
+        if again.costs[-1] < solution.costs[-1]:
+            problem = other
+            solution = again
+    settled = NEAR if in_motion else SETTLED
     for turn in range(LINEARISATIONS if problem.bends else 0):
         errors = errors_in_models(problem, solution.parameters)
-        if problem.has(errors, SETTLED):
+        if problem.has(errors, settled):
             break
         if turn >= FULL_STEPS:
             before = [run.errors_had for run in problem.runs]
@@ -138,49 +131,6 @@ def search_with_common_errors(
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
     return Search(problem, solution)
-
-
-def _near_common_errors(
-    problem: OutputErrorProblem, start: Array
-) -> tuple[OutputErrorProblem, Array]:
-    """Return a problem about nearly its most likely common errors, and parameters (p,) near it.
-
-    Errors with a wide prior, such as a start in motion, move the optimum of the parameters far.
-    Only a few steps are therefore made between two linearisations.
-    """
-    few = replace(problem.stop, max_iterations=STEPS)
-    for _ in range(MOST):
-        found = search(replace(problem, stop=few), start, lambda n=1: None)
-        start = found.parameters
-        errors = errors_in_models(problem, start)
-        if problem.has(errors, NEAR):
-            break
-        problem = _moved_towards(problem, errors, start)
-    return problem, start
-
-
-def _moved_towards(
-    problem: OutputErrorProblem, errors: list[Array], parameters: Array
-) -> OutputErrorProblem:
-    """Return the problem about these common errors, or as near to them as lowers its cost.
-
-    Far from the linearisation from which they follow, the model can be unstable or worse. Raises
-    LoopFailure if it is unstable a thousandth of the way from there.
-    """
-    had = [run.errors_had for run in problem.runs]
-    before = problem.cost(parameters)
-    for halving in range(HALVINGS):
-        share = 0.5**halving
-        part = [own + share * (new - own) for own, new in zip(had, errors, strict=True)]
-        try:
-            moved = problem.having(part).with_common_errors(parameters)
-        except LoopFailure:
-            if halving == HALVINGS - 1:
-                raise
-            continue
-        if moved.cost(parameters) <= WORSE * before:
-            break
-    return moved
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def error_modes(
     unnoticed = range(run.common.noticed, len(run.common.names))
     moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
     ends = [
-        np.maximum(drawn + sign * np.diag(run.difference_steps)[k], run.lowest_drawn)
+        np.maximum(drawn + sign * np.eye(len(drawn))[k], run.lowest_drawn)
         for k in moving
         for sign in (1.0, -1.0)
     ]

@@ -115,12 +115,9 @@ class LoopModel:
         run = replace(self, bodies=body_errors(self, parameters))
         seen = run.modes(parameters)[self.ok]
         modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
-        # Errors of measured poses have no effect on a model without a servo.
-        inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
-        had = modes[:, inside] @ self.errors_had[inside]
+        had = modes[:, self.contained] @ self.errors_had[self.contained]
         whitened = replace(run, marginal=Marginal.of(modes, had))
-        # Whitening changes no run.
-        whitened.known_runs.update(run.known_runs)
+        whitened.known_runs.update(run.known_runs)  # whitening changes no run
         return whitened
 
     def modes(self, parameters: Array) -> Array:
@@ -188,9 +185,9 @@ class LoopModel:
         return np.zeros(count) if self.drawn is None else self.drawn
 
     @property
-    def difference_steps(self) -> Array:
-        """Steps (k,) of the common errors by which runs differ in `error_modes`."""
-        return np.ones(len(self.errors_had))
+    def contained(self) -> slice:
+        """Places of the common errors that move the model: without a servo, not those of poses."""
+        return slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
 
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in the standard deviations that decide."""
@@ -314,7 +311,11 @@ class LoopModel:
         With `ahead`, the run also computes the sensitivities that `shown_residuals` will need.
         Raises LoopFailure if the model is unstable.
         """
-        return self.without_common(self.missed(self._latest_run(parameters, sensitivities=ahead)))
+        return self.without_common(self.missed_in_noise(parameters, ahead))
+
+    def missed_in_noise(self, parameters: Array, ahead: bool = False) -> Array:
+        """Return the residuals (n, 6) as `misses`, but whitened by the noise alone."""
+        return self.missed(self._latest_run(parameters, sensitivities=ahead))
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
@@ -382,7 +383,7 @@ class LoopModel:
         """Whiten rows (n, 6, ...) for the common errors. They are whitened by the noise already."""
         if self.marginal is None:
             return rows
-        stacked = rows.reshape(self.marginal.directions.shape[0], -1)
+        stacked = rows.reshape(len(self.marginal.modes), -1)
         return self.marginal.whiten(stacked).reshape(rows.shape)
 
     def without_gaps(self) -> Array:

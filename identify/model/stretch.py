@@ -46,7 +46,7 @@ class Stretch:
     coordinates, rates : ndarray, shape (m,)
         Coordinates of the platform at the start, and their rates.
     integral : ndarray, shape (n,)
-        Integrals of the drives beside those of the state of rest, rad s or m s.
+        Integrals of the drives beside those of rest at the coordinates, rad s or m s.
     std : ndarray, shape (2 m + n,)
         Standard deviations of coordinates, rates and integrals.
     """
@@ -103,7 +103,9 @@ class Stretch:
         count = len(self.coordinates)
         place, rate, integral = np.split(off, [count, 2 * count])
         pose = chart.pose(self.coordinates + place)
-        rest = equilibrium(robot, parameters, pose, settings.servo, drives=settings.drives)
+        # The integrals have errors of their own, which do not depend on that of the pose.
+        held = chart.pose(self.coordinates)
+        rest = equilibrium(robot, parameters, held, settings.servo, drives=settings.drives)
         # A run takes commands from before its start as issued one period apart.
         period = 1.0 / settings.timing.frame_rate_hz
         issued = np.arange(-len(commands), 0) * period

@@ -36,9 +36,13 @@ from identify.model.joint_torques import equivalent_commands
 from identify.model.loop_model import LoopModel
 from identify.model.stretch import Stretch
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE
+from identify.runtime import in_threads
 
-CLOCK_STEPS = {CLOCK_OFFSET: 5e-4, CLOCK_DRIFT: 2e-5}
-"""Largest differences of the clock, s and s/s, by which the effect of its errors is computed."""
+CLOCK_STEPS = {CLOCK_OFFSET: 1e-4, CLOCK_DRIFT: 5e-6}
+"""Differences of the clock, s and s/s, by which the effect of its errors is computed.
+
+With them, the poses change by 2e-4 of a derivative more or less than linearly.
+"""
 
 ROUNDING = 9
 """Decimals of the times of events, s, so that a command and a pose of one time are one event."""
@@ -110,18 +114,10 @@ class TimedModel(LoopModel):
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
         """Return shifts (N, 6) that need no run of each error, by the places of the errors.
 
-        They are those by the start and by errors of bodies.
+        They are those by the start, by the clock and by errors of bodies.
         """
-        return super().derived_modes(parameters) | self._shown_starts(parameters)
-
-    @property
-    def difference_steps(self) -> Array:
-        """Steps (k,) of the common errors, small ones for a clock of which little is known."""
-        steps = super().difference_steps
-        for place, (name, std) in enumerate(self.common.loop_std.items(), len(self.common.names)):
-            if name in CLOCK_STEPS:
-                steps[place] = min(1.0, CLOCK_STEPS[name] / std)
-        return steps
+        of_bodies = super().derived_modes(parameters)
+        return of_bodies | self._shown_starts(parameters) | self._shown_clock(parameters)
 
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in their posterior standard deviations.
@@ -238,6 +234,25 @@ class TimedModel(LoopModel):
                         stds[name] * run.start_sensitivity[:, :, column]
                     )
         return found
+
+    def _shown_clock(self, parameters: Array) -> dict[int, Array]:
+        """Return the changes (N, 6) of the poses by each error of the clock, by its place.
+
+        The run at the parameters (p,) without a difference is known already.
+        """
+        before = self._latest_run(parameters, sensitivities=True).pose
+        stds = self.common.loop_std
+        places = [len(self.common.names) + k for k, name in enumerate(stds) if name in CLOCK_STEPS]
+        steps = [CLOCK_STEPS[name] / stds[name] for name in stds if name in CLOCK_STEPS]
+
+        def moved(change: tuple[int, float]) -> Array:
+            place, step = change
+            drawn = self.errors_had.copy()
+            drawn[place] += step
+            return (self.having(drawn).simulate(parameters).pose - before) / step
+
+        changes = [*zip(places, steps, strict=True)]
+        return dict(zip(places, in_threads(moved, changes), strict=True))
 
 
 PER_FRAME = (

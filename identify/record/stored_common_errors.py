@@ -175,26 +175,28 @@ class Marginal:
         Modes of the m residuals.
     had : ndarray, shape (m,)
         Part of the residuals that is due to the common errors that the model contains.
-    directions, seen : ndarray, shapes (m, k) and (k,)
-        Directions U of the modes, and the standard deviations S along them.
     """
 
     modes: Array
     had: Array
-    directions: Array
-    seen: Array
 
     @classmethod
     def of(cls, modes: Array, had: Array | float = 0.0) -> "Marginal":
         """Return the whitener for modes (m, k) and `had` (m,)."""
-        directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
-        return cls(modes, np.broadcast_to(had, len(modes)), directions, seen)
+        return cls(modes, np.broadcast_to(had, len(modes)))
+
+    @cached_property
+    def _directions(self) -> tuple[Array, Array]:
+        """Directions U (m, k) of the modes, and the standard deviations S (k,) along them."""
+        directions, seen, _ = np.linalg.svd(self.modes, full_matrices=False)
+        return directions, seen
 
     def whiten(self, rows: Array) -> Array:
         """Whiten residuals (m,) or their derivatives (m, p)."""
         # The whitener is applied along its few directions. As a matrix it would be (m, m).
-        along = (1.0 - 1.0 / np.sqrt(1.0 + self.seen**2)) * (self.directions.T @ rows).T
-        return np.asarray(rows - self.directions @ along.T)
+        directions, seen = self._directions
+        along = (1.0 - 1.0 / np.sqrt(1.0 + seen**2)) * (directions.T @ rows).T
+        return np.asarray(rows - directions @ along.T)
 
 
 def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
