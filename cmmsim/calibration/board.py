@@ -20,17 +20,12 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from cmmsim.checks import Section, checked, parsed, read_text
+from cmmsim.detection.tags import tag_dictionary
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Count = Annotated[int, Field(ge=3, le=200)]
-# OpenCV's constants of its dictionaries of markers, by their names without the prefix.
-DICTIONARIES: dict[str, int] = {
-    name.removeprefix("DICT_").upper(): getattr(cv2.aruco, name)
-    for name in dir(cv2.aruco)
-    if name.startswith("DICT_")
-}
 
 
 class Board(Section):
@@ -104,13 +99,8 @@ class Board(Section):
 
     @property
     def markers(self) -> cv2.aruco.Dictionary:
-        """Dictionary of the markers of a ChArUco board. Raises ValueError for an unknown name."""
-        name = str(self.dictionary).upper().removeprefix("DICT_")
-        if name not in DICTIONARIES:
-            raise ValueError(
-                f"unknown dictionary {self.dictionary!r}, valid are {', '.join(DICTIONARIES)}"
-            )
-        return cv2.aruco.getPredefinedDictionary(DICTIONARIES[name])
+        """Dictionary of the markers of a ChArUco board."""
+        return tag_dictionary(self.dictionary or "")
 
     def charuco(self, legacy: bool = False) -> cv2.aruco.CharucoBoard:
         """Return OpenCV's description of a ChArUco board.

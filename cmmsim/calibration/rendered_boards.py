@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
-from cmmsim.geometry.camera import Optics, PinholeCamera
+from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.formation import ImageFormation, Side
-from cmmsim.imaging.prints import Print, print_renderer
+from cmmsim.imaging.formation import ImageFormation
+from cmmsim.imaging.plates import plates_image
+from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, print_renderer
 from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
@@ -46,12 +47,7 @@ GRAZING = 0.35
 TRIES = 4000
 AT_ONCE = 200
 # Constants of its images.
-TILE_PX = 64
 SUPERSAMPLING = 12
-# Each sample of a print is as expensive as the others, and its edges are long.
-PRINT_SUPERSAMPLING = 6
-# Points along each side of the plate, from which the extent of its distorted image is found.
-OUTLINE_POINTS = 15
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
@@ -246,46 +242,11 @@ def render_pairs(
     renderer = print_renderer([_squares(board)]) if board.has_squares else renderer
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
     formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
+    plate = plate_corners(board)
+    samples = PRINT_SUPERSAMPLING if board.has_squares else SUPERSAMPLING
     for pose in poses:
         sides = [
-            noise.expose(_radiance(formation, camera, move @ pose, board), rng)
+            noise.expose(plates_image(formation, camera, move @ pose, [plate], samples), rng)
             for camera, move in zip(rig.cameras, rig.from_camera, strict=True)
         ]
         yield StereoFrame(*sides)
-
-
-def _radiance(
-    formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
-) -> NDArray[np.float32]:
-    """Return the radiance (height, width) of one image.
-
-    Only tiles that can contain a part of the board are rendered; the others are black.
-    """
-    image = np.zeros(
-        (-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX),
-        dtype=np.float32,
-    )
-    corners = _reached_tiles(camera, camera_from_board, board, formation.optics.margin_px)
-    tiles = formation.windows(
-        [Side(camera, camera_from_board[None], corners)],
-        TILE_PX,
-        PRINT_SUPERSAMPLING if board.has_squares else SUPERSAMPLING,
-    )[0]
-    for (x, y), tile in zip(corners, tiles, strict=True):
-        image[y : y + TILE_PX, x : x + TILE_PX] = tile
-    return image[: camera.height, : camera.width]
-
-
-def _reached_tiles(
-    camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int
-) -> NDArray[np.int_]:
-    """Return the first pixels (k, 2) of the tiles within the bounding box of the board's plate."""
-    plate = plate_corners(board)
-    fraction = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
-    outline = ((1.0 - fraction) * plate + fraction * np.roll(plate, -1, axis=0)).reshape(-1, 3)
-    pixels = camera.project(apply(camera_from_board, outline))[0]
-    size = np.array([camera.width, camera.height])
-    first = np.clip(pixels.min(axis=0) - margin - 2.0, 0, size - 1).astype(int) // TILE_PX
-    last = np.clip(pixels.max(axis=0) + margin + 2.0, 0, size - 1).astype(int) // TILE_PX
-    x, y = np.meshgrid(*(TILE_PX * np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
-    return np.column_stack([x.ravel(), y.ravel()])

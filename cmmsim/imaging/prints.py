@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, Views
 
+# Drawn samples per pixel and axis. All of them are computed, and errors along an edge average out.
+PRINT_SUPERSAMPLING = 6
+
 
 @dataclass(frozen=True)
 class Print:

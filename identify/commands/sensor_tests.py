@@ -23,6 +23,7 @@ from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
     from cmmsim.detector_leaderboard import Condition, Score
+    from cmmsim.tag_comparison import MarkScore
 
 DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
 
@@ -150,6 +151,13 @@ def detectors(
         list[float] | None, repeatable("Sigma of the point spread, px", "the sensor's")
     ] = None,
     draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
+    tags: Annotated[
+        list[str] | None,
+        repeatable("OpenCV's dictionary of tags to compare, such as APRILTAG_36h11", "none"),
+    ] = None,
+    tag_poses: Annotated[
+        int, typer.Option(min=2, help="Poses of the platform in the comparison with tags.")
+    ] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,
     out: Annotated[Path | None, new_folder("runs/detectors-SENSOR")] = None,
     json: JsonFile = None,
@@ -162,22 +170,33 @@ def detectors(
     The first row of the table is the sensor's view of the platform at home. The other rows are all
     combinations of the options.
 
+    With --tags, a second table compares poses of the platform from the sensor's stickers with poses
+    from ArUco or AprilTag tags. A tag is drawn on each plane of the platform, as large as fits, and
+    OpenCV finds its corners by each of its methods. Bias and scatter are those of corners or
+    centres, and of poses; the covariance of a pose from tags follows from its residuals.
+
     Reads a sensor file.
 
-    Writes detectors.csv, detectors.json, which is also the JSON, and detectors.png into the folder.
+    Writes detectors.csv, detectors.json, which is also the JSON, and detectors.png into the folder;
+    with --tags also tags.csv.
 
     \b
     Examples:
       cmmsim detectors
+      cmmsim detectors --tags APRILTAG_36h11 --tags 5X5_100
       cmmsim detectors --radius 5 --tilt 0 --noise 1 --draws 1000
     """
     import numpy as np
     import pandas as pd
 
+    from cmmsim.detection.tags import tag_dictionary
     from cmmsim.detector_leaderboard import CONFIDENCE, Condition, compete, scene_of, working_point
     from cmmsim.files.sensor_file import read_sensor_file
+    from cmmsim.tag_comparison import compare_tags
     from identify.verification.sensor_figures import detectors_figure
 
+    for name in tags or ():
+        tag_dictionary(name)
     file = read_sensor_file(sensor)
     at_work = working_point(file)
     grid = product(
@@ -192,14 +211,33 @@ def detectors(
         scores = compete(
             scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance()
         )
+    marks: list[MarkScore] = []
+    if tags:
+        with terminal_progress(quiet).stage("tags", (1 + len(tags)) * tag_poses) as advance:
+            rng = np.random.default_rng(seed)
+            marks = compare_tags(file, tags, tag_poses, rng, advance)
     rows = [_row(score) for score in scores]
     said = {"sensor": file.name, "seed": seed, "draws": draws, "confidence": CONFIDENCE}
     entry = {**said, "working_point": _columns(at_work), "scores": rows}
+    tables = {"detectors.csv": rows}
+    if marks:
+        tables["tags.csv"] = [asdict(score) for score in marks]
+        entry |= {"tag_poses": tag_poses, "tags": tables["tags.csv"]}
+    files = {
+        # RFC 4180 ends the lines of CSV by CR and LF.
+        name: pd.DataFrame(table).to_csv(index=False, na_rep="nan", lineterminator="\r\n")
+        for name, table in tables.items()
+    }
     figure = detectors_figure(scores, at_work)
-    # RFC 4180 ends the lines of CSV by CR and LF.
-    table = pd.DataFrame(rows).to_csv(index=False, na_rep="nan", lineterminator="\r\n")
-    save_files(folder, {"detectors.csv": table, "detectors.json": entry, "detectors.png": figure})
-    tell(entry, json, quiet, lambda: _print_scores(scores, file.name, folder))
+    save_files(folder, {**files, "detectors.json": entry, "detectors.png": figure})
+
+    def say() -> None:
+        _print_scores(scores, file.name)
+        if marks:
+            _print_marks(marks, tag_poses)
+        typer.echo(f"files: {folder}")
+
+    tell(entry, json, quiet, say)
 
 
 def _columns(condition: "Condition") -> dict[str, float]:
@@ -218,7 +256,32 @@ def _row(score: "Score") -> dict[str, Any]:
     return {"detector": figures.pop("detector"), **_columns(score.condition), **figures}
 
 
-def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
+def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
+    """Print one row per kind of marks and method."""
+    print_table(
+        ("marks", "method", "px", "µm", "µrad", "normalised\nerror", "lost\n%", "time\nms"),
+        [
+            (
+                score.marks,
+                score.method.replace("_", " "),
+                f"{score.bias_px:.2g} ± {score.scatter_px:.2g}",
+                f"{score.position_bias_um:.3g} ± {score.position_scatter_um:.3g}",
+                f"{score.angle_bias_urad:.0f} ± {score.angle_scatter_urad:.0f}",
+                f"{score.normalised_error:.2f}",
+                f"{100.0 * score.lost:.0f}",
+                f"{score.milliseconds:.0f}",
+            )
+            for score in scores
+        ],
+        ("marks", "method"),
+        f"errors of stickers and tags at {poses} poses of the platform: bias ± scatter, rms",
+        "bias: error without noise; scatter: change by noise; px: of a centre or corner; µm, µrad: "
+        "of the pose; normalised error: error over its stated standard deviation; time: from two "
+        "whole images to the pose",
+    )
+
+
+def _print_scores(scores: list["Score"], sensor: str) -> None:
     """Print one row per condition, with the bound and the rms error of each detector.
 
     A sentence per detector then describes the working point.
@@ -245,7 +308,6 @@ def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
             f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval "
             f"{s.ratio_low:.3f} to {s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
         )
-    typer.echo(f"files: {folder}")
 
 
 def _cells(scores: list["Score"]) -> tuple[str, ...]:

@@ -178,6 +178,7 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         ("acceptance --volume 0.3 --standard e3124", "the body on its circle needs"),
         ("acceptance --renderer analytic --out mine", "mine is not empty"),
         ("detectors --tilt 85", "tilt 85 degrees"),
+        ("detectors --tags 9X9", "unknown dictionary '9X9': valid are 4X4_100"),
         (
             "calibrate mine --out new",
             "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples",

@@ -13,6 +13,7 @@ import pytest
 
 import cmmsim
 from cmmsim.allowed_plugins import DEFAULT_DETECTOR
+from cmmsim.detection.tags import REFINEMENTS
 from cmmsim.detector_leaderboard import Condition, compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from tests.identify.commands import command, one_line
@@ -242,3 +243,21 @@ def test_detectors_leaves_the_scores_of_the_leaderboard_in_files_a_table_and_a_f
         "detectors.json",
         "detectors.png",
     ]
+
+
+@pytest.mark.slow
+def test_detectors_compares_tags_in_a_table_of_their_own(pictures, tmp_path, capsys):
+    folder = tmp_path / "detectors"
+    options = ("--radius", 3, "--noise", 1, "--draws", 10, "--tags", "4x4_50", "--tag-poses", 2)
+    assert command("detectors", pictures / "small.toml", *options, "--out", folder) == 0
+    assert "stickers and tags at 2 poses" in capsys.readouterr().out
+    written = json.loads((folder / "detectors.json").read_text())["tags"]
+    with (folder / "tags.csv").open(newline="") as table:
+        rows = list(csv.DictReader(table))
+    marks = [("stickers", DEFAULT_DETECTOR), *(("4x4_50", method) for method in REFINEMENTS)]
+    assert [(row["marks"], row["method"]) for row in rows] == marks
+    assert [(entry["marks"], entry["method"]) for entry in written] == marks
+    subpix = written[2]
+    assert subpix["points"] == 12.0
+    assert subpix["lost"] == 0.0
+    assert float(rows[2]["bias_px"]) == pytest.approx(subpix["bias_px"], rel=1e-12)
