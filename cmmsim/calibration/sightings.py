@@ -87,16 +87,16 @@ def view_pairs(
     """Return the views of the board in each pair, and the common size (width, height) px.
 
     ``advance`` is called after each pair. Raises CalibrationError for images that cannot be read or
-    differ in size.
+    differ in size, and for pairs of the same image.
     """
     if not pairs:
         raise CalibrationError("no pairs of images")
     seen = []
     size = (0, 0)
     for pair in pairs:
-        sides = []
-        for path in (pair.left, pair.right):
-            grey = read_grey(path)
+        paths = (pair.left, pair.right)
+        images = [read_grey(path) for path in paths]
+        for path, grey in zip(paths, images, strict=True):
             height, width = grey.shape
             size = (width, height) if path is pairs[0].left else size
             if (width, height) != size:
@@ -104,8 +104,11 @@ def view_pairs(
                     f"{path} is {width} x {height} px, but {pairs[0].left} is {size[0]} x "
                     f"{size[1]} px: all images must have the same size, neither rotated nor cropped"
                 )
-            sides.append(find_board(grey, board))
-        seen.append(PairView(pair.name, *sides))
+        if np.array_equal(images[0], images[1]):
+            raise CalibrationError(
+                f"{pair.left} and {pair.right} are the same image: both cameras need their own"
+            )
+        seen.append(PairView(pair.name, *(find_board(grey, board) for grey in images)))
         advance()
     return seen, size
 

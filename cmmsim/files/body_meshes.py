@@ -89,11 +89,13 @@ def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
     places = marked_body(name, section).nominal
     reach = float(np.linalg.norm(np.ptp(places, axis=0)))
     size = float(np.max(mesh.extents))
-    if size <= min(LARGEST_SIZE, LARGEST_SIZE_RATIO * reach):
+    largest = min(LARGEST_SIZE, LARGEST_SIZE_RATIO * reach)
+    if size <= largest:
         return
     raise SensorFileError(
         f"{name}.mesh {section.mesh} is {size:g} m long, {size / reach:.0f} times the reach of its "
-        f"stickers, {reach:.3g} m; a file in millimetres needs {name}.mesh_unit = 'mm'"
+        f"stickers, {reach:.3g} m; at most {largest:.3g} m is possible; a file in millimetres "
+        f"needs {name}.mesh_unit = 'mm'"
     )
 
 

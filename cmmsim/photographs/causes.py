@@ -27,13 +27,14 @@ SPREADS = (0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
 
 
 def cause_of(
+    error: LostError,
     spots: Sequence[Spots],
     names: Sequence[str],
     observer: Observer,
     base: MarkedBody,
     platform: MarkedBody,
 ) -> str:
-    """Return the cause for which no body was found in the spots of K pairs, or an empty text."""
+    """Return the cause of an error in teaching from the spots of K pairs, or the error's text."""
     counts = [min(len(one.centres[one.good]) for one in pair) for pair in spots]
     if max(counts) == 0:
         return (
@@ -66,7 +67,14 @@ def cause_of(
                 f"{'right' if shift > 0 else 'left'} folder, from {names[0]} on, are left out; "
                 f"did the {side} camera start later?"
             )
-    return ""
+    usual = int(np.median(counts))
+    if usual < len(platform.sticker_ids) or works(spots):
+        return str(error)
+    return (
+        f"{error}, although both images of a pair, such as {names[0]}, show about {usual} bright "
+        "spots: do the images of a pair belong together, and does the sensor file state these "
+        "cameras and stickers?"
+    )
 
 
 def _same(pair: Spots) -> bool:

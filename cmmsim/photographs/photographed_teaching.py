@@ -156,8 +156,8 @@ def teach_from(
     try:
         found = _taught(spots, names, observer, (base, platform), name, known)
     except LostError as error:
-        cause = cause_of(spots, names, observer, base, platform)
-        raise TeachingError(f"teaching failed: {cause or error}") from error
+        cause = cause_of(error, spots, names, observer, base, platform)
+        raise TeachingError(f"teaching failed: {cause}") from error
     said = [doubt] if doubt else []
     if left_out:
         said.append(

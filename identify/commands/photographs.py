@@ -242,6 +242,8 @@ def measure(
             if not one.measurement.ok:
                 lost.append(f"{one.name}: {one.measurement.reason}")
             advance()
+        if len(lost) == count:
+            raise ScenarioError(f"none of {count} pairs has a pose; the first is {lost[0]}")
     write_text(out, text.getvalue())
     print_warnings(lost[:3] + ([f"and {len(lost) - 3} more pairs lost"] if lost[3:] else []))
     if not quiet:

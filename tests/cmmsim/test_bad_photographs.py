@@ -89,6 +89,13 @@ def test_folders_that_are_exchanged_or_shifted_or_of_one_camera_are_said_to_be(s
     assert "are both folders of one camera?" in cause(sensor, same)
 
 
+def test_folders_in_another_order_are_said_not_to_belong_together(sensor, good):
+    mixed = [(good[k][0], good[(k + 3) % COUNT][1]) for k in range(COUNT)]
+    said = cause(sensor, mixed)
+    assert "both images of a pair, such as 00.png, show about 3" in said
+    assert "do the images of a pair belong together" in said
+
+
 def test_a_pair_whose_images_do_not_belong_together_is_left_out_and_named(sensor, good):
     pairs = [*good]
     pairs[2] = good[2][0], good[5][1]

@@ -133,7 +133,12 @@ def shifted(move):
     ("change", "more", "scale", "message"),
     [
         (without_a_face, "", 1.0, "platform.stl is not closed: 3 of its"),
-        (shifted([0.0] * 3), "", 1000.0, r"m long, \d+ times the reach .*mesh_unit = 'mm'"),
+        (
+            shifted([0.0] * 3),
+            "",
+            1000.0,
+            r"m long, \d+ times the reach .*at most 10 m .*mesh_unit = 'mm'",
+        ),
         (
             shifted([0.0, 0.0, -0.004]),
             "",

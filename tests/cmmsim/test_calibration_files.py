@@ -57,7 +57,7 @@ def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
     [
         (("marker = 0.037  # m\n", ""), "charuco needs both"),
         (("0.037", "0.05"), "markers of 0.05 m do not fit into squares of 0.05 m"),
-        (("5X5_100", "5x5_30"), "unknown dictionary '5x5_30', valid are 4X4_100, .*APRILTAG_36H11"),
+        (("5X5_100", "5x5_30"), "unknown dictionary '5x5_30': valid are 4X4_100, .*APRILTAG_36H11"),
         (("columns = 8", "columns = 30"), "31 x 7 squares have 108 markers, .*5X5_100 has 100"),
         (("spacing", "radius = 0.01\nspacing"), "a charuco has no dots"),
     ],
@@ -167,6 +167,9 @@ def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):
             CalibrationError, match=r"cannot read image .*b.1\.png: it is truncated or not"
         ):
             view_pairs([ImagePair(left, right)], DOTS)
+    cv2.imwrite(str(right), np.zeros((8, 8), np.uint8))
+    with pytest.raises(CalibrationError, match=r"a.1\.png and .*b.1\.png are the same image"):
+        view_pairs([ImagePair(left, right)], DOTS)
     cv2.imwrite(str(right), np.zeros((8, 10), np.uint8))
     with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png is 8 x 8"):
         view_pairs([ImagePair(left, right)], DOTS)

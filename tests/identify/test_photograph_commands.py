@@ -104,6 +104,15 @@ def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, tmp_path, capfd
     )
     assert lost["why"].startswith("0 bright spots")
     assert float(lost["time_s"]) == pytest.approx(COUNT / 60.0)
+    out.unlink()
+    for path in (*tmp_path.glob("left/00*"), *tmp_path.glob("right/00*")):
+        path.unlink()
+    pictures = ("--pictures", tmp_path / "found")
+    assert command(*measuring, "--taught", taught, "--out", out, *pictures, "--quiet") == 1
+    said = one_line(capfd.readouterr().err)
+    assert "none of 1 pairs has a pose; the first is 999.png: 0 bright spots" in said
+    assert not out.exists()
+    assert not (tmp_path / "found").exists()
     taught.write_text("{}")
     assert command(*measuring, "--taught", taught, "--out", out) == 1
     assert "taught.json is no taught.json of `cmmsim teach`" in one_line(capfd.readouterr().err)
