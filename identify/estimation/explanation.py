@@ -208,7 +208,8 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
     """
     if ok.sum() < 10 * lags:
         raise EstimationError(
-            f"{ok.sum()} good frames are too few to test {lags} lags, {10 * lags} are needed"
+            f"{ok.sum()} of {len(ok)} frames have a good pose, too few to test whether the model "
+            f"explains them: {10 * lags} are needed for {lags} lags of the residuals"
         )
     centred = np.where(ok[:, None], residuals - residuals[ok].mean(axis=0), 0.0)
     power = np.sum(centred**2, axis=0)

@@ -47,8 +47,8 @@ def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
     """
     if takes_torques(record):
         raise EstimationError(
-            "the commands of the record are torques: these need poses and commands of one frame "
-            "grid (identify.build_record)"
+            "the commands of the record are torques, under which states are fitted from frame to "
+            "frame: poses and commands must be on one frame grid (identify.build_record)"
         )
     robot = side.robot
     ok = record["measured_ok"].values.astype(bool)

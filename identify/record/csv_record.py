@@ -259,7 +259,7 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
                 f"{path} line {number}: {name} is {cell[:40]!r}, which is not a number"
             ) from None
         may_be_empty = name.startswith(("measured_", "covariance_", "command_time"))
-        if not (np.isfinite(values[-1]) or may_be_empty):
+        if np.isinf(values[-1]) or (np.isnan(values[-1]) and not may_be_empty):
             raise RecordError(
                 f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number"
             )

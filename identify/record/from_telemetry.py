@@ -45,13 +45,14 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
     """Return the record of a run from its logs.
 
     stated (6, 6): covariance of the poses if the log holds none. Raises RecordError if more than a
-    tenth of the poses are gross errors, if no command is logged, or as `build_record` and
-    `build_timed_record` do.
+    tenth of the poses are gross errors, if no command is logged, if clocks do not overlap, or as
+    `build_record` and `build_timed_record` do.
     """
     ok = telemetry.poses.ok
     covariances = telemetry.poses.covariance
     if covariances is None:
         covariances = np.tile(stated, (len(ok), 1, 1))
+    _check_clocks(telemetry)
     wrong, notes = _gross(telemetry.poses, covariances)
     poses = replace(telemetry.poses, ok=ok & ~wrong, covariance=covariances)
     telemetry = replace(telemetry, poses=poses)
@@ -162,6 +163,20 @@ def _gross(log: PoseLog, covariances: Array) -> tuple[NDArray[np.bool_], list[st
             wrong,
         )
     return wrong, [f"{count} single poses were left out as gross errors: {named}"]
+
+
+def _check_clocks(telemetry: Telemetry) -> None:
+    """Check that commands act while poses are seen. Raises RecordError with the first command."""
+    commands = telemetry.commands
+    seen = telemetry.poses.time
+    acted = commands.time if commands.written is None else commands.written
+    rows = np.flatnonzero(np.isfinite(acted))
+    if len(rows) and (acted[rows].min() > seen[-1] or acted[rows].max() < seen[0]):
+        raise RecordError(
+            f"{commands.rows.place(int(rows[0]))}: its command acts {acted[rows[0]]:.9g} s after "
+            f"the first pose, the last command {acted[rows].max():.9g} s, and poses are seen for "
+            f"{seen[-1]:.6g} s: the clocks do not overlap"
+        )
 
 
 def _not_on_grid(telemetry: Telemetry, timing: Timing, gross: bool) -> str | None:

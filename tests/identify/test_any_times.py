@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from identify.diagnosis.diagnose import diagnose
-from identify.errors import RecordError
+from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.model.from_record import identified_model
@@ -217,5 +217,13 @@ def test_rows_missing_in_which_a_command_was_held_are_told_from_others():
 def test_clocks_that_do_not_overlap_are_refused():
     telemetry, _ = exact(0)
     other = replace(telemetry.commands, time=telemetry.commands.time + 1e6)
-    with pytest.raises(RecordError, match=r"no stretch .* commands from 1e\+06"):
+    with pytest.raises(RecordError, match=r"line 2: its command acts 1000000 s after .* overlap"):
         record_of(replace(telemetry, commands=other), rss6(), scenario_of(), COVARIANCE)
+
+
+def test_torque_commands_need_the_grid():
+    telemetry = logged(*run_plant(scenario_of(), 0, duration_s=3.0))
+    record = record_of(replace(telemetry, reference=None), rss6(), scenario_of(), COVARIANCE)
+    torques = record.assign_attrs(law="computed_torque", torque_commands=1)
+    with pytest.raises(EstimationError, match=r"torques, under .* on one frame grid"):
+        identified_model(torques, side_of(scenario_of()))

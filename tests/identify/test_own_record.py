@@ -235,6 +235,10 @@ def moved(column, factor=1.0, shift=0.0):
             "line 2: command_1_rad is inf, must be a finite",
         ),
         (
+            lambda t: t.assign(measured_x_m=np.inf),
+            "line 2: measured_x_m is inf, must be a finite",
+        ),
+        (
             lambda t: t.rename(columns={"command_time_s": "command_time_ms"}),
             "use command_time_s, in s",
         ),

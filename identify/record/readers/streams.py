@@ -72,7 +72,9 @@ class Stream:
         try:
             if isinstance(cell, str) and "_" in cell:  # float() would read 1_0 as 10
                 raise ValueError
-            return float(cell)
+            if np.isinf(value := float(cell)):
+                raise ValueError
+            return value
         except ValueError:
             raise RecordError(
                 f"{self.rows.place(row)}: {name} is {str(cell)[:40]!r}, which is not a number"
