@@ -147,6 +147,11 @@ class PoseColumns(Log):
         "the log that stand still, in squares of position_unit and angle_unit: 36 row by row, 21 "
         "of the upper triangle, or 6 standard deviations; without them, [record] states it",
     )
+    covariance_of: Literal["turns", "angles"] = Field(
+        "turns",
+        description='"angles" if the covariance is that of the angles of convention euler_XYZ '
+        "instead of small turns, as in tables of cmmsim measure",
+    )
 
     @property
     def other_conventions(self) -> tuple[str, ...]:
@@ -169,6 +174,10 @@ class PoseColumns(Log):
         if self.covariance is not None and len(self.covariance) not in COVARIANCES:
             raise ValueError(
                 f"covariance names {len(self.covariance)} columns, must be {COVARIANCES_SAID}"
+            )
+        if self.covariance_of == "angles" and self.convention != "euler_XYZ":
+            raise ValueError(
+                f'covariance_of = "angles" is for the convention euler_XYZ, not {self.convention}'
             )
         _check_once([*self.position, *self.orientation, *(self.covariance or [])])
         return self

@@ -43,6 +43,12 @@ that of the poses is estimated with timing.clock_offset_std_s and timing.clock_d
 LARGEST = 200_000_000
 """Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes."""
 
+BESIDE = ("pair", "stickers", "why", "common_")
+"""Beginnings of the columns that `cmmsim measure` writes beside those of a record.
+
+They are not read. Its column ok is that of measured_ok.
+"""
+
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
 
@@ -170,7 +176,8 @@ def read_table(path: Path, robot: Robot) -> Table:
     """
     groups = columns_of(robot)
     lines = lines_of(path)
-    number, header = next(lines, (0, []))
+    number, names = next(lines, (0, []))
+    header = ["measured_ok" if name == "ok" else name for name in names]
     present = _checked_header(path, number, header, groups)
     rows = [(number, _numbers(path, number, header, cells)) for number, cells in lines]
     if not rows:
@@ -216,7 +223,7 @@ def _checked_header(
         )
     known = [name for group in groups.values() for name in group.names]
     for name in header:
-        if name not in known:
+        if name not in known and not name.startswith(BESIDE):
             raise RecordError(f"{path} line {number}: unknown column {name!r}{_meant(name, known)}")
         if header.count(name) > 1:
             raise RecordError(f"{path} line {number}: there are two columns {name!r}")
@@ -250,6 +257,9 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
         )
     values = []
     for name, cell in zip(header, cells, strict=True):
+        if name.startswith(BESIDE):
+            values.append(np.nan)
+            continue
         try:
             if "_" in cell:  # float() would read 1_0 as 10
                 raise ValueError

@@ -10,6 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cmmsim.measuring.measurement import Measurement, lost_measurement
+from cmmsim.photographs.measuring import COLUMNS, MeasuredPair
 from identify.commands.help import DONE, NOT_DONE
 from identify.errors import RecordError, ScenarioError
 from identify.record.recording import poses
@@ -23,6 +25,7 @@ from tests.identify.test_readers import (
     as_table,
     as_vicon,
     change,
+    described,
     record,  # noqa: F401
     telemetry_of,
 )
@@ -108,11 +111,52 @@ def test_a_proposal_for_a_table_finds_poses_references_and_commands(record, tmp_
     found = proposed(table, table)
     assert found["measured"]["time"] == "time_s"
     for section in ("measured", "reference"):
-        answer(table, "convention", '"euler_XYZ"', f"[columns.{section}]")
+        assert found[section]["convention"] == "euler_XYZ"
     check(table, record)
     np.testing.assert_allclose(
         telemetry_of(table).reference.pose, poses(record, "reference"), rtol=0, atol=TOLERANCE
     )
+
+
+def measured_pairs(recorded, rng):
+    """The rows of `cmmsim measure` for the poses of a record, some of which are lost."""
+    for k, pose in enumerate(poses(recorded, "measured")):
+        root = 1e-6 * rng.standard_normal((6, 6))
+        if k == 2 or not np.isfinite(pose).all():
+            found = lost_measurement("0 bright spots, in both images")
+        else:
+            none = np.zeros((0, 3))
+            found = Measurement(
+                pose, root @ root.T, none, none[:, None], none[:, :2], none[:, :2], none, ok=True
+            )
+        yield MeasuredPair(f"{k:03d}.png", k / 60.0, found, None)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_table_of_measured_photographs_is_the_measured_part_of_a_record(record, tmp_path, beside):  # noqa: F811
+    """With the commands in columns beside, or in a file of their own."""
+    pairs = list(measured_pairs(record, np.random.default_rng(0)))
+    found = pd.DataFrame([pair.row for pair in pairs], columns=COLUMNS)
+    names = [f"command_{k}_rad" for k in range(1, 7)]
+    commands = pd.DataFrame(record["command"].values, columns=names)
+    path = tmp_path / "mine.csv"
+    if beside:
+        pd.concat([found, commands], axis=1).to_csv(path, index=False)
+        described(path, "")
+    else:
+        found.to_csv(tmp_path / "poses.csv", index=False)
+        commands.assign(time_s=found["time_s"]).to_csv(tmp_path / "commands.csv", index=False)
+        proposed(path, tmp_path / "poses.csv", tmp_path / "commands.csv")
+    read = telemetry_of(path)
+    np.testing.assert_array_equal(read.poses.ok, [pair.measurement.ok for pair in pairs])
+    assert not read.poses.ok[2]
+    np.testing.assert_allclose(read.commands.command, commands.values, rtol=0, atol=TOLERANCE)
+    for k in np.flatnonzero(read.poses.ok):
+        measured = pairs[k].measurement
+        np.testing.assert_allclose(read.poses.pose[k], measured.pose, rtol=0, atol=TOLERANCE)
+        scale = np.sqrt(np.outer(*2 * [np.diag(measured.covariance)]))
+        gap = (read.poses.covariance[k] - measured.covariance) / scale
+        assert np.abs(gap).max() < 1e-9
 
 
 def test_names_without_units_are_asked_with_the_range_of_their_numbers(record, tmp_path):  # noqa: F811

@@ -45,7 +45,10 @@ WANTED = ("reference", "ref", "desired", "des", "target", "goal", "setpoint", "s
 COMMANDED = ("command", "commands", "cmd", "commanded", *WANTED)
 """Words for commands of joints."""
 
-OTHERWISE = ("velocity", "vel", "effort", "torque", "current", "rate", "acc", "covariance", "error")
+OTHERWISE = (
+    *("velocity", "vel", "effort", "torque", "current", "rate", "acc", "covariance", "error"),
+    "common",  # covariance of common errors, in tables of cmmsim measure
+)
 """Words for what is neither a pose nor a command."""
 
 

@@ -222,6 +222,9 @@ def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -
         )
     found = np.full((len(poses), 6, 6), np.nan)
     own = _matrices(cells[good])
+    if log.covariance_of == "angles":
+        angles = np.stack([stream.numbers(name) for name in log.orientation], axis=1)[good]
+        own = _of_turns(own, ANGLES[log.angle_unit] * angles)
     units = np.repeat([LENGTHS[log.position_unit], ANGLES[log.angle_unit]], 3)
     axes = _axes(log.axes)
     base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
@@ -235,6 +238,17 @@ def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -
     slopes = np.stack([robot.pose_rate(poses[good], one) for one in np.moveaxis(twists, 2, 0)], 2)
     found[good] = slopes @ own @ slopes.transpose(0, 2, 1)
     return found
+
+
+def _of_turns(covariances: Array, angles: Array) -> Array:
+    """Return the covariances (N, 6, 6) of small turns from those of Euler angles (N, 3) XYZ."""
+    about_x = Rotation.from_euler("X", angles[:, :1])
+    about_xy = Rotation.from_euler("XY", angles[:, :2])
+    turns = np.tile(np.eye(6), (len(angles), 1, 1))
+    # The columns are the axes about which the three angles turn.
+    turns[:, 3:, 4] = about_x.apply([0.0, 1.0, 0.0])
+    turns[:, 3:, 5] = about_xy.apply([0.0, 0.0, 1.0])
+    return turns @ covariances @ turns.transpose(0, 2, 1)
 
 
 def _matrices(cells: Array) -> Array:

@@ -17,6 +17,7 @@ from dynamics import Robot
 from identify.errors import RecordError
 from identify.record.columns import ASKED, FRAMES
 from identify.record.columns import TIMES as SECONDS
+from identify.record.csv_record import columns_of
 from identify.record.readers.csv_exports import FRAME
 from identify.record.readers.header_names import (
     COMMANDED,
@@ -101,15 +102,15 @@ def propose(
         "--commands",
     )
     made = Proposal(rate_hz=measured.place.header.rate_hz)
-    _propose_body(made, "measured", measured, None)
+    _propose_body(made, "measured", measured, None, robot)
     _propose_joints(made, joints, measured.place, robot)
     reference = [one for one in wanted if body is None or one.label != measured.label]
     if len(reference) == 1:
-        _propose_body(made, "reference", reference[0], measured.place)
+        _propose_body(made, "reference", reference[0], measured.place, robot)
     return made
 
 
-def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None) -> None:
+def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, robot: Robot) -> None:
     """Add the table of a pose. `rows` is the place of the measured poses, None for themselves."""
     header = body.place.header
     made.lines += ["", f"[columns.{table}]"]
@@ -125,11 +126,21 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None) ->
     stated = f"; the file says {header.rotation}" if header.rotation else ""
     choices = EULER_CHOICES if len(body.orientation) == 3 else "quaternion_xyzw or quaternion_wxyz"
     rotated = "rotation_vector, " if len(body.orientation) == 3 else ""
-    why = "" if body.convention else f"{rotated}{choices}{stated}"
-    made.add(table, "convention", body.convention, why)
+    why = f"{rotated}{choices}{stated}"
+    # The names of a record of our own say all about its poses.
+    own = columns_of(robot)
+    is_own = (*body.position, *body.orientation) == own[table].names
+    convention = "euler_XYZ" if is_own else body.convention
+    made.add(table, "convention", convention, "" if convention else why)
     if len(body.orientation) == 3:
         unit = _unit(header, body.orientation, ("rad", "deg"))
         made.add(table, "angle_unit", unit, f"rad or deg; {_range(cells, body.orientation)}")
+    if is_own and table == "measured":
+        flags = [name for name in header.names if name in ("ok", *own["ok"].names)]
+        made.lines += [f"ok = {_text(name)}" for name in flags]
+        covariance = list(own["covariance"].names)
+        if set(covariance) <= set(header.names):
+            made.lines += [f"covariance = {_text(covariance)}", 'covariance_of = "angles"']
     if header.kind == "Motive":
         made.lines.append(
             '# axes = ["x", "-z", "y"]  # where y is up in the log, as Motive exports by default'
