@@ -78,7 +78,7 @@ def show(
     renderer: Annotated[
         str,
         typer.Option(
-            help="Renderer of the camera images: analytic, or pyrender, which needs OpenGL."
+            help="Renderer of the camera images: analytic, or pyrender or scene, which need OpenGL."
         ),
     ] = "analytic",
     quiet: Quiet = False,

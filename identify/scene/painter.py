@@ -35,8 +35,8 @@ class Viewpoint:
     the scene, in sizes of the scene.
     """
 
-    azimuth_deg: float = -50.0
-    elevation_deg: float = 23.0
+    azimuth_deg: float = -105.0
+    elevation_deg: float = 16.0
     distance: float = 3.0
 
 

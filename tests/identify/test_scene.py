@@ -146,6 +146,20 @@ def drawn(figure):
 
 
 @pytest.mark.slow
+def test_the_base_hides_no_leg_of_the_robot_in_a_picture(cell):
+    """No point along a leg lies within the convex outline of the block with the base's stickers."""
+    _, (block, place) = cell.placed(cell.home)
+    rods = cell.rods(cell.home)
+    painter = Painter(Viewpoint(), rods.reshape(-1, 3).mean(axis=0), 2.0)
+    outline = cv2.convexHull(painter.pixels(apply(place, block.vertices)).astype(np.float32))
+    share = np.linspace(0.0, 1.0, 20)[:, None, None]
+    points = ((1.0 - share) * rods[:, 0] + share * rods[:, 1]).reshape(-1, 3)
+    assert all(
+        cv2.pointPolygonTest(outline, point, measureDist=False) < 0
+        for point in painter.pixels(points).tolist()
+    )
+
+
 def test_figures_are_drawn_with_words_of_what_they_show(cell, view):
     scene = drawn_words(scene_figure(cell, MOVED))
     assert {"left camera", "right camera", "platform", "base", "x", "y", "z"} <= scene
