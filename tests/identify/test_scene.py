@@ -145,7 +145,6 @@ def drawn(figure):
     return cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
 
 
-@pytest.mark.slow
 def test_the_base_hides_no_leg_of_the_robot_in_a_picture(cell):
     """No point along a leg lies within the convex outline of the block with the base's stickers."""
     _, (block, place) = cell.placed(cell.home)
@@ -160,6 +159,7 @@ def test_the_base_hides_no_leg_of_the_robot_in_a_picture(cell):
     )
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_with_words_of_what_they_show(cell, view):
     scene = drawn_words(scene_figure(cell, MOVED))
     assert {"left camera", "right camera", "platform", "base", "x", "y", "z"} <= scene
