@@ -64,7 +64,7 @@ class Friction(Strict):
 
 
 class PassiveFriction(Strict):
-    """Dry friction, N m, and viscous friction, N m s/rad, of one passive joint of every leg."""
+    """Dry friction, N m, and viscous friction, N m s/rad, of a passive joint of all legs or one."""
 
     coulomb: Force | None = None
     viscous: Damping | None = None
@@ -94,7 +94,8 @@ class Parameters(BaseModel):
     passive: dict[str, PassiveFriction] = Field(
         {},
         description="friction of passive joints, each named by the body outwards from it: "
-        "{ link_joint = { viscous = 0.005 }, platform_joint = { coulomb = 0.02 } }",
+        "{ link_joint = { viscous = 0.005 }, platform_joint = { coulomb = 0.02 } }; or in single "
+        "legs: { link3_joint = { viscous = 0.01 } }",
     )
 
     @property

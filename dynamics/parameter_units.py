@@ -1,9 +1,15 @@
 """Units of dynamic parameters by their names."""
 
+import re
+
 from dynamics.spatial_inertia import FIRST_MOMENTS, MOMENTS, PRODUCTS
 
 PASSIVE_JOINT = "{}_joint"
-"""Name of a passive joint: that of the body outwards from it, such as link_joint."""
+"""Name of a passive joint: that of the body outwards from it, such as link_joint.
+
+It is the name of the joints of all legs. The joint of a single leg has the number of the leg, such
+as link3_joint.
+"""
 
 UNITS = (
     {"mass": "kg"}
@@ -18,6 +24,14 @@ REVOLUTE = {
     "ld": "N m s/rad",
 }
 PRISMATIC = {"coulomb": "N", "viscous": "N s/m", "lp": "N/m", "li": "N/(m s)", "ld": "N s/m"}
+
+
+def of_all_legs(name: str) -> str:
+    """Name of a parameter of passive joints for all legs, such as `link_joint.viscous`.
+
+    The parameter may be that of a single leg, such as `link3_joint.viscous`.
+    """
+    return re.sub(r"\d+(?=_joint\.)", "", name)
 
 
 def unit_of(name: str, prismatic: bool = False) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from dynamics.checks import Shape, floats
 from dynamics.errors import ParameterError
 from dynamics.legs.leg import Body, Leg
-from dynamics.parameter_units import PASSIVE_JOINT, unit_of
+from dynamics.parameter_units import PASSIVE_JOINT, of_all_legs, unit_of
 from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL, INERTIAL, MOMENTS, PRODUCTS
 
 PLATFORM = Body("platform", MOMENTS)
@@ -81,8 +81,8 @@ class ParameterLayout:
     are the indices of the bodies of each leg. `prismatic` is True if the actuators slide. `full` is
     True for each body with ten inertial parameters, and False for each centred body, which has
     four. `own_gains` is True if each joint has its own gains, and False if all joints share them.
-    `passive_names` are the parameters of the friction of passive joints, such as
-    link_joint.viscous.
+    `passive_names` are the parameters of the friction of passive joints: link_joint.viscous of all
+    legs, or link3_joint.viscous of one.
     """
 
     bodies: tuple[str, ...]
@@ -223,13 +223,18 @@ class ParameterLayout:
     def converted(self, dynamic: np.ndarray, other: "ParameterLayout") -> np.ndarray:
         """Dynamic parameters (..., p) in the layout of the same robot in another form.
 
-        Parameters that this layout does not have are zero.
+        Parameters that this layout does not have are zero. Friction of passive joints that is
+        shared, and was not, is the mean over the legs.
         """
         inertial = other.rigid_of(self.bodies_of(dynamic))
         passive = np.zeros((*dynamic.shape[:-1], len(other.passive_names)))
         for place, name in enumerate(other.passive_names):
-            if name in self.passive_names:
-                passive[..., place] = dynamic[..., self.dynamic_names.index(name)]
+            for one in self.passive_names:
+                value = dynamic[..., self.dynamic_names.index(one)]
+                if one in (name, of_all_legs(name)):
+                    passive[..., place] = value
+                elif of_all_legs(one) == name:
+                    passive[..., place] += value / self.joints
         rest = dynamic[..., self.rigid.stop : self.dynamic.stop]
         return np.concatenate([inertial, passive, rest], axis=-1)
 
@@ -314,7 +319,7 @@ def may_be_absent(name: str) -> bool:
 
 
 def passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Names of all parameters of the friction of passive joints that a robot can have."""
+    """Names of the parameters of the friction of passive joints that all legs can share."""
     bodies = [
         body.name
         for leg in legs
@@ -323,6 +328,15 @@ def passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
     ]
     joints = [PASSIVE_JOINT.format(name) for name in dict.fromkeys([*bodies, "platform"])]
     return tuple(f"{joint}.{law}" for joint in joints for law in PASSIVE_LAWS)
+
+
+def own_passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
+    """Names of the parameters that passive joints of single legs can have instead."""
+    return tuple(
+        name.replace("_joint.", f"{number}_joint.")
+        for number, leg in enumerate(legs, start=1)
+        for name in passive_parameters([leg])
+    )
 
 
 def parameter_layout(
@@ -336,9 +350,10 @@ def parameter_layout(
     The platform is first. The first bodies of all legs follow, and then their second bodies. `full`
     are the names of the bodies or kinds of bodies with ten inertial parameters, such as link2 or
     link, or "all". `own_gains` is True if each joint has its own gains. `passive` are the names of
-    parameters of passive joints (see `passive_parameters`).
+    parameters of passive joints (see `passive_parameters` and `own_passive_parameters`).
 
-    Raises ParameterError, with the valid names, for an unknown name.
+    Raises ParameterError for an unknown name, and for a passive joint with its own friction and
+    that of all legs.
     """
     leg_bodies: list[tuple[int, Body]] = []
     for place in range(max(len(leg.bodies) for leg in legs)):
@@ -360,10 +375,16 @@ def parameter_layout(
             f"{', '.join(dict.fromkeys(kind.name for kind in kinds))}, or a body such as "
             f"{names[-1]}"
         )
-    possible = passive_parameters(legs) if passive else ()
+    shared = passive_parameters(legs) if passive else ()
+    possible = (*shared, *own_passive_parameters(legs)) if passive else ()
     if unknown := [name for name in passive if name not in possible]:
         raise ParameterError(
-            f"there is no friction {unknown[0]!r} of passive joints; valid: {', '.join(possible)}"
+            f"there is no friction {unknown[0]!r} of passive joints; valid: {', '.join(shared)}, "
+            f"or of one leg, such as {possible[len(shared)]}"
+        )
+    if both := [name for name in passive if of_all_legs(name) in {*passive} - {name}]:
+        raise ParameterError(
+            f"{both[0]} and {of_all_legs(both[0])} are friction of one joint: state one of them"
         )
     return ParameterLayout(
         names,

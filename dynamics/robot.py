@@ -281,9 +281,10 @@ class Robot(RobotDynamics):
     def with_passive_friction(self, names: Sequence[str]) -> Robot:
         """Robot whose passive joints have friction, with one parameter for each name.
 
-        Joints at the same place of all legs share their parameters. A passive joint is named by the
-        body outwards from it. The friction is viscous or dry, see `rigid_body.passive_friction`.
-        New parameters are zero, so that the robot moves as before.
+        A passive joint is named by the body outwards from it. Joints at the same place of all legs
+        share a parameter, or each leg has its own, such as "link3_joint.viscous". The friction is
+        viscous or dry, see `rigid_body.passive_friction`. A leg's own parameter begins with the
+        value that all legs shared, and others with zero, so that the robot moves as before.
 
         Parameters
         ----------
@@ -298,7 +299,8 @@ class Robot(RobotDynamics):
         Raises
         ------
         ParameterError
-            If there is no such parameter. The message lists the valid names.
+            If there is no such parameter, or a joint has its own and that of all legs. The message
+            lists the valid names.
 
         Examples
         --------

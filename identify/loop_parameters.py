@@ -22,6 +22,7 @@ from dynamics.closed_loop import (
 )
 from dynamics.closed_loop.drives import DRIVES, DriveName
 from dynamics.errors import DynamicsError, ParameterError
+from dynamics.parameter_units import of_all_legs
 from dynamics.parameters import JOINT_PID, may_be_absent
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
@@ -214,14 +215,17 @@ def known_value(values: Mapping[str, float], name: str) -> float | None:
     """Return the value of a parameter by name, also of a robot whose parameters have another form.
 
     A first moment, product of inertia or passive friction without a value is zero. The gain of one
-    joint is the shared gain. The shared gain is the mean of those of all joints. None: there is no
-    value.
+    joint is the shared gain, and so is the friction of a passive joint. What is shared is the mean
+    over the joints. None: there is no value.
     """
     if name in values:
         return float(values[name])
     owner, _, entry = name.rpartition(".")
     if may_be_absent(name):
-        return 0.0
+        of_all = of_all_legs(name)
+        own = sum(float(value) for one, value in values.items() if of_all_legs(one) == name)
+        legs = sum(one.startswith("joint") and one.endswith(".coulomb") for one in values)
+        return float(values.get(of_all, own / max(legs, 1)))
     if entry not in JOINT_PID:
         return None
     if owner != "joint_pid":

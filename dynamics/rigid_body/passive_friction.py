@@ -31,7 +31,7 @@ def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -
     if not names:
         return columns
     moving = ca.SX.sym("twist", 6)
-    for name, relative, count in _relative_spins(geometry, pose, moving):
+    for joints, relative, count in _relative_spins(geometry, pose, moving):
         by_twist = ca.jacobian(relative, moving)
         spin = ca.substitute(relative, moving, ca.densify(twist))
         viscous = count * (by_twist.T @ spin)
@@ -40,19 +40,24 @@ def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -
             "coulomb": viscous / ca.sqrt(ca.dot(spin, spin) + SLOW**2),
         }
         for law, wrench in wrenches.items():
-            if f"{name}.{law}" in names:
-                columns[:, names.index(f"{name}.{law}")] += wrench
+            for name in (f"{joint}.{law}" for joint in joints):
+                if name in names:
+                    columns[:, names.index(name)] += wrench
     return columns
 
 
 def _relative_spins(
     geometry: AnyGeometry, pose: ca.SX, twist: ca.SX
-) -> list[tuple[str, ca.SX, int]]:
-    """Name, relative angular velocity (3,) and number of parallel joints of each passive joint."""
+) -> list[tuple[tuple[str, str], ca.SX, int]]:
+    """Names, relative angular velocity (3,) and number of parallel joints of each passive joint.
+
+    The names are that of the joints of all legs, and that of the joint of this leg.
+    """
     nominal = geometry if isinstance(geometry, RobotGeometry) else geometry.nominal
     joints = []
-    for leg, nominal_leg, arm in zip(
-        geometry.legs, nominal.legs, platform_arms(geometry, pose), strict=True
+    arms = platform_arms(geometry, pose)
+    for number, (leg, nominal_leg, arm) in enumerate(
+        zip(geometry.legs, nominal.legs, arms, strict=True), start=1
     ):
         velocity = twist[0:3] + ca.cross(twist[3:6], arm)
         spins = leg.angular_velocities(pose[0:3] + arm, velocity)
@@ -60,9 +65,11 @@ def _relative_spins(
         segments = nominal_leg.segments()
         for body, segment, spin in zip(leg.bodies, segments, spins, strict=True):
             if segment.passive:
-                joints.append((PASSIVE_JOINT.format(body.name), spin - before, len(segment.copies)))
+                joints.append((_names(body.name, number), spin - before, len(segment.copies)))
             before = spin
-        joints.append(
-            (PASSIVE_JOINT.format("platform"), twist[3:6] - before, len(segments[-1].copies))
-        )
+        joints.append((_names("platform", number), twist[3:6] - before, len(segments[-1].copies)))
     return joints
+
+
+def _names(body: str, number: int) -> tuple[str, str]:
+    return PASSIVE_JOINT.format(body), PASSIVE_JOINT.format(f"{body}{number}")

@@ -15,6 +15,7 @@ import numpy as np
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
 from dynamics.geometry import RobotGeometry
+from dynamics.parameter_units import of_all_legs
 from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
@@ -155,10 +156,11 @@ def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed
     """
     geometry = robot.geometry
     names = passive_parameters(geometry.legs)
+    stated = {of_all_legs(one) for one in robot.layout.passive_names}
     columns = [passive_columns(geometry, one) for one in motions]
     found = []
     for place, name in enumerate(names):
-        if name in robot.layout.passive_names:
+        if name in stated:
             continue
         found.append(
             Needed(

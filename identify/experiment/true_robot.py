@@ -11,6 +11,7 @@ from dynamics.parameters import (
     JOINT_PID,
     SIGNED,
     ParameterLayout,
+    own_passive_parameters,
     parameter_layout,
     passive_parameters,
 )
@@ -41,15 +42,16 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
     full = set(stated.full_bodies)
     passive = list(stated.passive_names)
     legs = in_file.geometry.legs
-    possible = passive_parameters(legs)
-    known = parameter_layout(legs, ("all",), stated.own_gains, possible).names
+    shared = passive_parameters(legs)
+    own = own_passive_parameters(legs)
+    known = (*parameter_layout(legs, ("all",), stated.own_gains, shared).names, *own)
     for name in switches.values:
         if name not in known:
             raise ScenarioError(
                 f"plant.values names {name!r}; {robot.name} has {', '.join(stated.bodies)}, each "
                 f"with {', '.join(FULL_INERTIAL)} (such as platform.mcz), "
                 f"{', '.join(stated.joint_names)} with coulomb and viscous, "
-                f"{', '.join(possible)}, and {_gains(stated)}"
+                f"{', '.join(shared)}, or of one leg, such as {own[0]}, and {_gains(stated)}"
             )
         body, entry = name.split(".")
         if is_gain(name) and entry not in READS[switches.drive]:
@@ -59,7 +61,7 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
             )
         if entry in SIGNED:
             full.add(body)
-        if name in possible:
+        if name in (*shared, *own):
             passive.append(name)
     layout = robot.layout
     same_bodies = full == set(layout.full_bodies) and stated.own_gains == layout.own_gains

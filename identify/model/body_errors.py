@@ -20,6 +20,7 @@ import numpy as np
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, equilibrium
+from dynamics.parameter_units import of_all_legs
 from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
@@ -173,8 +174,9 @@ def _errors(robot: Robot) -> Iterator[BodyError]:
                 yield BodyError("centres", f"centres.{kind}.{entry}_kg m", rows, names)
             else:
                 yield BodyError("products", f"products.{kind}.{entry}_kg m^2", rows, names)
+    stated = {of_all_legs(name) for name in layout.passive_names}
     for name in passive_parameters(robot.geometry.legs):
         joint, law = name.split(".")
-        if law == "viscous" and name not in layout.passive_names:
+        if law == "viscous" and name not in stated:
             said = f"passive_friction.{joint}_N m s/rad"
             yield BodyError("passive_friction", said, (), (name,))

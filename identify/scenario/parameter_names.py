@@ -16,7 +16,11 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
         return
     # Late imports: dynamics loads CasADi, which the help of the command line does not need.
     from dynamics.errors import RobotFileError
-    from dynamics.parameters import parameter_layout, passive_parameters
+    from dynamics.parameters import (
+        own_passive_parameters,
+        parameter_layout,
+        passive_parameters,
+    )
     from dynamics.robot_file import read_robot_file
 
     try:
@@ -25,7 +29,8 @@ def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
         legs = read_robot_file(robot).geometry.legs
         passive = passive_parameters(legs)
         layout = parameter_layout(legs, ("all",), passive=passive)
-        valid = {*layout.names, *parameter_layout(legs, own_gains=True).names}
+        own = own_passive_parameters(legs)
+        valid = {*layout.names, *own, *parameter_layout(legs, own_gains=True).names}
     except RobotFileError as error:
         raise ValueError(f"robot: {error}") from None
     for name in known:

@@ -128,8 +128,8 @@ class _Side(Section):
     passive_friction: list[str] | None = Field(
         None,
         description="parameters of the friction of passive joints, each joint named by the body "
-        'outwards from it; ["link_joint.viscous", "platform_joint.coulomb"]; by default those of '
-        "the robot file",
+        'outwards from it; ["link_joint.viscous", "platform_joint.coulomb"] of all legs, or '
+        '["link3_joint.viscous"] of one; by default those of the robot file',
     )
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(

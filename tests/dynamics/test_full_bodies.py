@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 import dynamics
 from dynamics.errors import ParameterError, RobotFileError
-from dynamics.parameters import passive_parameters
+from dynamics.parameter_units import of_all_legs
+from dynamics.parameters import own_passive_parameters, passive_parameters
 from dynamics.pseudo_inertia import (
     about_centre,
     body_fault,
@@ -192,6 +193,31 @@ def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(f
                     power += many * dry * size**2 / np.hypot(size, SLOW)
             ours = twist @ wrench(pose, twist, passive).full().ravel()
             np.testing.assert_allclose(ours, power, rtol=1e-9)
+
+
+@pytest.mark.parametrize("full", ["delta3", "rss6"], indirect=True)
+def test_a_passive_joint_of_one_leg_has_its_share_of_the_friction_of_all_legs(full):
+    """The friction of all legs is the sum of that of single legs, which begin with its value."""
+    robot, values, (poses, twists, _) = full
+    shared = robot.layout.passive_names
+    own = [
+        name for name in own_passive_parameters(robot.geometry.legs) if of_all_legs(name) in shared
+    ]
+    single = robot.with_passive_friction(own)
+    assert single.layout.passive_names == tuple(own)
+    converted = robot.layout.converted(values, single.layout)
+    assert converted[single.layout.passive].min() > 0
+    back = single.layout.converted(converted, robot.layout)
+    np.testing.assert_allclose(back, values, rtol=1e-14)
+    one = np.zeros((len(own), len(converted)))
+    one[:, single.layout.passive] = np.diag(converted[single.layout.passive])
+    alone = values.copy()
+    alone[: robot.layout.inertial.stop] = alone[robot.layout.rigid.stop :] = 0
+    for pose, twist in zip(poses[:3], twists[:3], strict=True):
+        parts = [single.casadi("friction_wrench")(pose, twist, row).full().ravel() for row in one]
+        whole = robot.casadi("friction_wrench")(pose, twist, alone).full().ravel()
+        np.testing.assert_allclose(np.sum(parts, axis=0), whole, atol=1e-9 * np.abs(whole).max())
+        assert all(twist @ part > 0 for part in parts)
 
 
 def test_a_full_body_without_first_moments_and_products_is_a_centred_body(robot, states):

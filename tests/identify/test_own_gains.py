@@ -196,6 +196,9 @@ def test_true_gains_in_another_form():
     known = {"joint1.lp": 1.0, "joint2.lp": 2.0}
     assert known_value(known, "joint_pid.lp") == 1.5
     assert known_value({"joint_pid.lp": 1.0}, "joint7.lp") == 1.0
+    friction = {"joint1.coulomb": 1.0, "joint2.coulomb": 1.0, "link2_joint.viscous": 0.5}
+    assert known_value(friction, "link_joint.viscous") == 0.25
+    assert known_value({"link_joint.viscous": 0.5}, "link2_joint.viscous") == 0.5
     assert known_value({}, "joint_pid.lp") is None
     assert known_value({}, "joint1.coulomb") is None
     assert known_value({}, "platform.mcx") == 0.0
