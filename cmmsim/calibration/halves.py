@@ -1,16 +1,20 @@
 """Comparison of two calibrations, each from one half of the pictures.
 
-It checks the stated covariance, and does not need the true cameras.
+It checks the stated covariance, and does not need the true cameras. With the cameras of each half,
+distances between points of the board are also measured in the pictures of the other half.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.calibrate import FEWEST_PAIRS, CalibrationOptions, calibrate
-from cmmsim.calibration.sightings import PairView
+from cmmsim.calibration.calibrated_rig import Calibration
+from cmmsim.calibration.distances import Distances, measured_distances
+from cmmsim.calibration.sightings import SIDES, PairView
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.known_rig import KnownRig
@@ -22,9 +26,11 @@ class Halves:
 
     ``squares`` (n, p) belong to p independent directions of the free parameters. Each is divided by
     the sum of the variances that both calibrations state, so its expected value is 1.
+    ``distances`` are those of both halves of each split, measured with the cameras of the other.
     """
 
     squares: np.ndarray
+    distances: Sequence[Distances] = ()
 
     @property
     def mean_square(self) -> float:
@@ -51,13 +57,21 @@ class Halves:
             return "the differences agree with the stated covariance"
         return f"the stated covariance is too {'small' if self.mean_square > 1.0 else 'large'}"
 
-    def to_dict(self) -> dict[str, float | int | str]:
+    @property
+    def distance_figures(self) -> dict[str, float]:
+        """Root mean squares over all splits of the figures of `Distances`, by their names."""
+        names = ("rms_m", "normalised_error", "noise_px", "board_m")
+        values = np.array([[getattr(one, name) for name in names] for one in self.distances])
+        return dict(zip(names, np.sqrt(np.mean(values**2, axis=0)).tolist(), strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
         return {
             "splits": len(self.squares),
             "mean_square": self.mean_square,
             "chance_of_one": self.chance,
             "verdict": self.verdict,
+            "distances": self.distance_figures,
         }
 
 
@@ -82,15 +96,24 @@ def compare_halves(
             f"each half of {len(pairs)} pairs of pictures has {half} pairs, fewer than {least}"
         )
     squares = []
+    distances = []
     for _ in range(splits):
         order = rng.permutation(len(pairs))
-        chosen = (sorted(order[:half]), sorted(order[half:]))
-        known = []
+        chosen = [[pairs[k] for k in sorted(part)] for part in (order[:half], order[half:])]
+        found = []
         for part in chosen:
-            known.append(calibrate(board, [pairs[k] for k in part], size, options).known)
+            found.append(calibrate(board, part, size, options))
             advance()
-        squares.append(squared_differences(*known))
-    return Halves(np.array(squares))
+        squares.append(squared_differences(found[0].known, found[1].known))
+        used = [_seen_by_both(one, part) for one, part in zip(found, chosen, strict=True)]
+        distances += [measured_distances(found[k], used[k], used[1 - k]) for k in range(2)]
+    return Halves(np.array(squares), distances)
+
+
+def _seen_by_both(found: Calibration, pairs: Sequence[PairView]) -> list[PairView]:
+    """Return the pairs whose images a calibration has both used."""
+    names = {view.name for view in found.used if len(view.rms_px) == len(SIDES)}
+    return [pair for pair in pairs if pair.name in names]
 
 
 def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:

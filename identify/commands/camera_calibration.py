@@ -70,7 +70,8 @@ def calibrate(
             "--halves",
             min=1,
             help="Number of random splits of the pictures into halves. Both halves of each split "
-            "are calibrated, and compared within their stated uncertainty; ten splits are enough.",
+            "are calibrated, and compared within their stated uncertainty. Distances on the board "
+            "are measured in each half with the cameras of the other. Ten splits are enough.",
         ),
     ] = None,
     render: Annotated[
@@ -299,5 +300,12 @@ def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -
             f"{apart.mean_square:.2f} times their stated variance, on average over "
             f"{len(apart.squares)} splits; 1 ± {apart.chance:.2f} is expected of a single split: "
             f"{apart.verdict}"
+        )
+        lengths = apart.distance_figures
+        typer.echo(
+            "distances between points of the board, measured with the cameras of the other half, "
+            f"differ from the board file by {1e6 * lengths['rms_m']:.3g} um rms, "
+            f"{lengths['normalised_error']:.2f} times their stated standard deviations (images: "
+            f"{lengths['noise_px']:.2g} px; board: {1e6 * lengths['board_m']:.2g} um)"
         )
     typer.echo(f"calibration: {folder}")
