@@ -54,6 +54,7 @@ SOURCES = {
     "geometry": Source("geometry of the robot", "B"),
     "zeros": Source("drives: zeros of the joints", "B"),
     "scale": Source("drives: scale of the commands", "B"),
+    "friction": Source("drives: constants of the law of friction", "B"),
     "start": Source("start of the record", "B"),
     "centres": Source("bodies: centres of mass", "B"),
     "products": Source("bodies: products of inertia", "B"),

@@ -21,7 +21,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import Marginal
 
-MOST = 15
+MOST = 30
 """Largest number of steps."""
 
 

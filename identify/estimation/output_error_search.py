@@ -21,7 +21,9 @@ from identify.estimation.joint_search import with_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import linear_warm_start
+from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
+from identify.record.stored_common_errors import FRICTION, kind_of
 
 LINEARISATIONS = 6
 """Largest number of linearisations in the common errors."""
@@ -82,7 +84,7 @@ def output_error_searches(
     most = (1 + closed_loop + has_common) * problem.stop.max_iterations
     with progress.stage("identify", most) as advance:
         starts = [start, problem.guess.values] if has_common else [start]
-        if has_common and not all(run.begins_in_motion for run in problem.runs):
+        if has_common and not any(_bends_far(run) for run in driven.runs):
             found["noise_alone"] = Search(driven, search(driven, start, advance))
             starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
         found["command_driven"] = searched = search_with_common_errors(driven, starts, advance)
@@ -106,10 +108,11 @@ def search_with_common_errors(
     """
     problem, start = _with_common_errors(problem, starts)
     in_motion = any(run.begins_in_motion for run in problem.runs)
-    if in_motion:
+    bent = any(_bends_far(run) for run in problem.runs)
+    if bent:
         problem, start = with_likely_errors(problem, start)
     solution = search(problem, start, advance)
-    if in_motion and solution.costs[-1] > MISSED * 6 * sum(run.ok.sum() for run in problem.runs):
+    if bent and solution.costs[-1] > MISSED * 6 * sum(run.ok.sum() for run in problem.runs):
         # Far from the right errors, the parameters can have gone to a wrong minimum.
         warm = problem.bounds.nearest(linear_warm_start(problem))
         other, start = with_likely_errors(problem, warm)
@@ -131,6 +134,16 @@ def search_with_common_errors(
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
     return Search(problem, solution)
+
+
+def _bends_far(run: LoopModel) -> bool:
+    """Return whether a run has common errors in which its motion is far from linear.
+
+    These are a start in motion and constants of friction. Parameters that were found with wrong
+    values of them would be far from the optimum.
+    """
+    rubs = any(kind_of(name) == FRICTION for name in run.common.loop_std)
+    return run.begins_in_motion or (run.driven and rubs)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Prior of the common errors that are estimated beside the parameters, and their place in a loop.
 
 Errors of the poses and of the geometry come from the record. Errors of the latency, of the zeros
-and of the scale of commands, and of the bodies have standard deviations in the model's side of a
-scenario. All of them are the same for all poses of a record.
+and of the scale of commands, of the constants of the law of friction, and of the bodies have
+standard deviations in the model's side of a scenario. All of them are the same for all poses of a
+record.
 """
 
 from collections.abc import Mapping
@@ -14,14 +15,23 @@ import numpy as np
 import xarray as xr
 
 from dynamics import Robot
-from dynamics.closed_loop import LoopSettings
+from dynamics.closed_loop import FrictionLaw, LoopSettings
 from identify.arrays import Array
+from identify.errors import ScenarioError
 from identify.loop_parameters import of_actuators
 from identify.model.body_errors import body_error_stds
 from identify.model.model_side import ModelSide
 from identify.record.conditions import takes_torques
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
-from identify.record.stored_common_errors import LATENCY, SCALE, ZERO, read_common_errors
+from identify.record.stored_common_errors import (
+    FRICTION,
+    LATENCY,
+    SCALE,
+    STATIC_RATIO,
+    STRIBECK_VELOCITY,
+    ZERO,
+    read_common_errors,
+)
 from identify.scenario import Model
 
 if TYPE_CHECKING:
@@ -84,14 +94,16 @@ def loop_error_stds(
 ) -> dict[str, float]:
     """Return the standard deviations of the errors in the loop by name, of some kinds.
 
-    Errors that are assumed to be zero are left out. latency_std_s: of the mean latency. Raises the
-    ScenarioError of `of_actuators`.
+    Errors that are assumed to be zero are left out. latency_std_s: of the mean latency. Raises
+    ScenarioError for standard deviations of another kind of actuators or law of friction.
     """
     found = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
     zero = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
     layout = robot.layout
     found |= {zero_name(joint, layout.joint_unit): zero for joint in range(layout.joints)}
     found[SCALE] = model.command_scale_std if "scale" in kinds else 0.0
+    if FRICTION in kinds:
+        found |= _friction_stds(robot, model)
     return {name: std for name, std in found.items() if std}
 
 
@@ -100,20 +112,59 @@ def zero_name(joint: int, unit: str) -> str:
     return f"{ZERO}{joint + 1}_{unit}"
 
 
-def lowest_errors(stds: Mapping[str, float], mean_latency: float) -> Array:
+def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
+    """Return the standard deviations of the constants of the law of friction, by name.
+
+    Raises ScenarioError for those of a law that the model does not have.
+    """
+    velocity = f"{STRIBECK_VELOCITY}_{robot.layout.joint_unit}/s"
+    stds: dict[str, float] = {
+        STATIC_RATIO: model.static_ratio_std,
+        velocity: of_actuators(robot, model, "stribeck_velocity_std") or 0.0,
+    }
+    if any(stds.values()) and model.friction != "stribeck":
+        raise ScenarioError(
+            f"model.friction = {model.friction!r}, but static_ratio_std or stribeck_velocity_std "
+            "is stated: only the law stribeck has these constants"
+        )
+    return stds
+
+
+def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: FrictionLaw) -> Array:
     """Return the smallest errors (k,) that a loop can contain, in their standard deviations.
 
-    No latency is negative, and the scale of the commands stays above zero.
+    No latency is negative, static friction is not below that of Coulomb, and scale and velocities
+    stay above zero.
     """
     least = {LATENCY: -mean_latency, SCALE: LEAST_SCALE - 1.0}
+    if friction.static_ratio is not None and friction.stribeck_velocity is not None:
+        least[STATIC_RATIO] = 1.0 - friction.static_ratio
+        for name in stds:
+            if name.startswith(STRIBECK_VELOCITY):
+                least[name] = (LEAST_SCALE - 1.0) * friction.stribeck_velocity
     return np.array([least.get(name, -np.inf) / std for name, std in stds.items()])
 
 
 def settings_with_errors(settings: LoopSettings, errors: Mapping[str, float]) -> LoopSettings:
-    """Return the settings of a loop whose drives have some errors of zeros and scale."""
+    """Return the settings of a loop with errors of zeros, scale and constants of friction."""
+    if any(name.startswith(FRICTION) for name in errors):
+        settings = replace(settings, friction=_friction_with(settings.friction, errors))
     zeros = tuple(value for name, value in errors.items() if name.startswith(ZERO))
     scale = 1.0 + errors.get(SCALE, 0.0)
     if scale == 1.0 and not any(zeros):
         return settings
     drives = replace(settings.drives, joint_zeros=zeros, command_scale=scale)
     return replace(settings, drives=drives)
+
+
+def _friction_with(friction: FrictionLaw, errors: Mapping[str, float]) -> FrictionLaw:
+    """Return a law of friction with errors of its constants."""
+    if friction.static_ratio is None or friction.stribeck_velocity is None:
+        return friction
+    velocity = sum(value for name, value in errors.items() if name.startswith(STRIBECK_VELOCITY))
+    return replace(
+        friction,
+        # rounding of the lowest errors
+        static_ratio=max(friction.static_ratio + errors.get(STATIC_RATIO, 0.0), 1.0),
+        stribeck_velocity=friction.stribeck_velocity + velocity,
+    )

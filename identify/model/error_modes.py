@@ -11,10 +11,17 @@ import numpy as np
 
 from dynamics.closed_loop import ClosedLoopRun, most_directions
 from identify.arrays import Array
+from identify.record.stored_common_errors import FRICTION, kind_of
 from identify.runtime import in_threads
 
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
+
+FRICTION_STEP = 1e-4
+"""Difference of a constant of the law of friction, in standard deviations. Others have one.
+
+The motion is far from linear in these constants.
+"""
 
 
 def error_modes(
@@ -39,8 +46,10 @@ def error_modes(
     # Errors of poses beyond the noticed ones change nothing.
     unnoticed = range(run.common.noticed, len(run.common.names))
     moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
+    inside = (*run.common.names, *run.common.loop_std, *run.common.body_std)
+    steps = np.diag([FRICTION_STEP if kind_of(name) == FRICTION else 1.0 for name in inside])
     ends = [
-        np.maximum(drawn + sign * np.eye(len(drawn))[k], run.lowest_drawn)
+        np.maximum(drawn + sign * steps[k], run.lowest_drawn)
         for k in moving
         for sign in (1.0, -1.0)
     ]

@@ -175,7 +175,7 @@ class LoopModel:
         mean = self.settings.timing.latency_s if self.acted is None else self.acted.mean()
         free = np.full(len(self.common.names), -np.inf)
         inside = self.common.loop_std | self.common.body_std
-        return np.concatenate([free, lowest_errors(inside, float(mean))])
+        return np.concatenate([free, lowest_errors(inside, float(mean), self.settings.friction)])
 
     @property
     def errors_had(self) -> Array:

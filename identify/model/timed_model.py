@@ -89,9 +89,8 @@ class TimedModel(LoopModel):
     def lowest_drawn(self) -> Array:
         """Smallest allowed values (k,) of the common errors. The clock may have any offset."""
         free = np.full(len(self.common.names), -np.inf)
-        return np.concatenate(
-            [free, lowest_errors(self.common.loop_std | self.common.body_std, np.inf)]
-        )
+        inside = self.common.loop_std | self.common.body_std
+        return np.concatenate([free, lowest_errors(inside, np.inf, self.settings.friction)])
 
     def simulate(
         self,

@@ -34,6 +34,9 @@ COVARIANCE = "common_error_covariance"
 LATENCY = "timing.latency_s"
 ZERO = "zeros.joint"
 SCALE = "scale.commands"
+FRICTION = "friction"
+STATIC_RATIO = "friction.static_ratio"
+STRIBECK_VELOCITY = "friction.stribeck_velocity"
 CLOCK_OFFSET = "clock.offset_s"
 CLOCK_DRIFT = "clock.drift_s/s"
 START = "start"
@@ -257,7 +260,7 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 def kind_of(name: str) -> str:
     """Return the kind of a common error, as `identification.nuisances` names it."""
-    same = ("exposure", "geometry", "zeros", "scale", "clock", START, *ASSUMPTIONS)
+    same = ("exposure", "geometry", "zeros", "scale", FRICTION, "clock", START, *ASSUMPTIONS)
     kinds = {"taught": "teaching", "timing": "latency", **dict(zip(same, same, strict=True))}
     # Each start of a record has its number.
     return kinds.get(name.split(".")[0].rstrip("0123456789"), "rig")

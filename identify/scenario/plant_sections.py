@@ -331,6 +331,15 @@ class Model(_Side):
         ge=0,
         le=0.1,
     )
+    static_ratio_std: float = quantity(
+        0.0, "1", "standard deviation of static_ratio, estimated beside the parameters", ge=0, le=9
+    )
+    stribeck_velocity_std_rad_s: float | None = quantity(
+        None, "rad/s", "the same of stribeck_velocity_rad_s", gt=0
+    )
+    stribeck_velocity_std_m_s: float | None = quantity(
+        None, "m/s", "the same of stribeck_velocity_m_s", gt=0
+    )
     centre_std: float | None = quantity(
         None,
         "1",

@@ -180,6 +180,7 @@ Nuisance = Literal[
     "start",
     "zeros",
     "scale",
+    "friction",
     "geometry",
     "centres",
     "products",

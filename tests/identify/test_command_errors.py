@@ -10,6 +10,7 @@ import pytest
 from dynamics import load_robot
 from dynamics.closed_loop import (
     Drives,
+    FrictionLaw,
     LoopSettings,
     differentiate_servo,
     simulate_commands,
@@ -23,7 +24,13 @@ from identify.experiment.joint_instruments import measure_joints
 from identify.experiment.true_robot import true_deviations, true_zeros
 from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.record.known_geometry import KnownGeometry
-from identify.record.stored_common_errors import LATENCY, SCALE, kind_of
+from identify.record.stored_common_errors import (
+    LATENCY,
+    SCALE,
+    STATIC_RATIO,
+    STRIBECK_VELOCITY,
+    kind_of,
+)
 from tests.identify.synthetic import (
     PERFECT,
     build_plant,
@@ -190,7 +197,9 @@ def test_the_errors_in_the_loop_are_those_of_the_kinds_that_are_asked():
 def test_a_loop_without_errors_is_the_loop():
     settings = side_of(quick()).settings
     assert settings_with_errors(settings, {LATENCY: 0.01}) is settings
-    assert lowest_errors({LATENCY: 0.002, SCALE: 0.1}, 0.01).tolist() == [-5.0, -9.0]
+    law = FrictionLaw("stribeck", static_ratio=1.2, stribeck_velocity=0.05)
+    stds = {LATENCY: 0.002, SCALE: 0.1, STATIC_RATIO: 0.1, f"{STRIBECK_VELOCITY}_rad/s": 0.03}
+    assert np.allclose(lowest_errors(stds, 0.01, law), [-5.0, -9.0, -2.0, -1.5])
 
 
 def test_encoders_read_the_zero_too_little_and_torques_stay():
