@@ -10,6 +10,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from dynamics.body_mesh import BodyMesh
 from dynamics.checks import real
 from dynamics.errors import RobotFileError
 from dynamics.kinematics.platform import FREEDOMS, Chart, base_from_platform
@@ -34,6 +35,7 @@ class RobotGeometry:
     if all joints share them. `passive_friction` are the names of the parameters of passive joints
     (see `parameters.passive_parameters`). `unstated` has the
     standard deviations of the differences between real bodies and joints and this model of them.
+    `meshes` are the meshes that draw bodies of the legs in place of rods.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -47,6 +49,7 @@ class RobotGeometry:
     own_gains: bool = False
     passive_friction: tuple[str, ...] = ()
     unstated: Unstated = EXACT
+    meshes: tuple[BodyMesh, ...] = ()
 
     def __post_init__(self) -> None:
         gravity = np.array(self.gravity, dtype=float)
@@ -69,6 +72,24 @@ class RobotGeometry:
         )
         # raises ParameterError for a full body or passive joint that there is not
         self.layout  # noqa: B018
+        if self.meshes:
+            self._check_meshes()
+
+    def _check_meshes(self) -> None:
+        """Raise RobotFileError for a mesh of a body that there is not."""
+        rows = [row for rows in self.layout.of_leg for row in rows]
+        kinds = dict.fromkeys(self.layout.kinds[row].name for row in rows)
+        valid = [*kinds, *(self.layout.bodies[row] for row in rows)]
+        for mesh in self.meshes:
+            if mesh.body not in valid:
+                raise RobotFileError(
+                    f"meshes: there is no body {mesh.body!r} of a leg; valid: {', '.join(valid)}"
+                )
+
+    def meshes_of(self, row: int) -> list[BodyMesh]:
+        """Meshes of a body, which is given by its row in the layout."""
+        names = (self.layout.bodies[row], self.layout.kinds[row].name)
+        return [mesh for mesh in self.meshes if mesh.body in names]
 
     @property
     def home_pose(self) -> np.ndarray:
@@ -120,7 +141,7 @@ class RobotGeometry:
 
     @property
     def _compared(self) -> tuple[object, ...]:
-        return self.digest, self.travel_limit, self.own_gains, self.unstated
+        return self.digest, self.travel_limit, self.own_gains, self.unstated, self.meshes
 
     @property
     def symbols(self) -> tuple[ca.SX, ...]:

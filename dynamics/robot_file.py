@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from dynamics.body_mesh import BodyMesh
 from dynamics.checks import Acceleration, Place, Travel, check_inertia_forms, shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.files import Name, check_name, is_file, parse_toml, read_text
@@ -16,6 +17,9 @@ from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.parameter_set import Parameters, ParameterSet, Strict, Unstated, parameter_set
+
+MOST_MESHES = 100
+"""Largest number of meshes of a robot."""
 
 MOST_FAULTS = 24
 """Largest number of faults in a message: four for each of six legs."""
@@ -73,6 +77,11 @@ class RobotFile(Strict):
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
         description="a table for each leg; with a family also a single table, in which each key "
         "has one value, or a list with one value per leg"
+    )
+    meshes: list[BodyMesh] = Field(
+        [],
+        max_length=MOST_MESHES,
+        description="meshes that draw bodies of the legs, and hide stickers, in place of rods",
     )
     parameters: dict[str, Parameters] = Field(
         description="named sets: `guess` is the initial guess of an identification, and `truth` "
@@ -217,20 +226,20 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
     valid.
     """
     source, text = _read_text(name_or_path)
-    return parsed_robot(text, f"robot file {source}")
+    return parsed_robot(text, f"robot file {source}", Path(source).absolute().parent)
 
 
-def parsed_robot(text: str, source: str) -> RobotDescription:
+def parsed_robot(text: str, source: str, folder: Path = Path()) -> RobotDescription:
     """Robot from the text of a robot file. `source` is the name of the file in messages.
 
-    Raises the same errors as `read_robot_file`.
+    Paths of meshes are relative to `folder`. Raises the same errors as `read_robot_file`.
     """
     try:
         content = RobotFile.model_validate(parse_toml(text, source, RobotFileError))
     except ValidationError as error:
         raise RobotFileError(f"{source}: {_one_line(error)}") from error
     try:
-        geometry = _geometry(content)
+        geometry = _geometry(content, folder)
         sets = {
             name: parameter_set(name, values, geometry.layout)
             for name, values in content.parameters.items()
@@ -245,8 +254,8 @@ def parsed_robot(text: str, source: str) -> RobotDescription:
     return RobotDescription(content.name, geometry, sets)
 
 
-def _geometry(content: RobotFile) -> RobotGeometry:
-    """Geometry of a robot file. Raises RobotFileError."""
+def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
+    """Geometry of a robot file in a folder. Raises RobotFileError."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -257,6 +266,7 @@ def _geometry(content: RobotFile) -> RobotGeometry:
     passive = dict.fromkeys(
         name for values in content.parameters.values() for name in values.passive_values
     )
+    meshes = [mesh.model_copy(update={"file": str(folder / mesh.file)}) for mesh in content.meshes]
     return RobotGeometry(
         tuple(content.legs),
         chart,
@@ -266,6 +276,7 @@ def _geometry(content: RobotFile) -> RobotGeometry:
         own_gains=any(values.own_gains for values in content.parameters.values()),
         passive_friction=tuple(passive),
         unstated=content.unstated,
+        meshes=tuple(meshes),
     )
 
 

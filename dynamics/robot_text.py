@@ -58,6 +58,10 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     else:
         for number, leg in enumerate(geometry.legs, 1):
             lines += ["", f"# Leg {number}", "[[legs]]", *_fields(leg)]
+    for mesh in geometry.meshes:
+        pose = _value(np.array(mesh.pose))
+        lines += ["", "[[meshes]]", f"body = {_value(mesh.body)}", f"file = {_value(mesh.file)}"]
+        lines += [f"scale = {_value(mesh.scale)}", f"pose = {pose}"]
     for name, values in robot.parameter_sets.items():
         lines += ["", f"[parameters.{_key(name)}]", *_parameters(values, layout)]
     return "\n".join(lines) + "\n"

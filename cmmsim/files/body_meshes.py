@@ -33,10 +33,18 @@ EDGE_TOLERANCE = 1e-6
 
 def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
     """Return the mesh of a body in m. Raises SensorFileError if it is missing or not closed."""
+    path = Path(str(section.mesh))
+    return closed_mesh(path, METRES[section.mesh_unit], f"{name}.mesh {path}")
+
+
+def closed_mesh(path: Path, scale: float, where: str) -> trimesh.Trimesh:
+    """Return the closed mesh of a file in m. One unit of the file is ``scale`` m.
+
+    Raises SensorFileError, which begins with ``where``, if the file is missing or not a closed
+    mesh.
+    """
     import trimesh
 
-    path = Path(str(section.mesh))
-    where = f"{name}.mesh {path}"
     if not path.is_file():
         raise SensorFileError(f"{where}: there is no such file")
     try:
@@ -49,7 +57,7 @@ def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise SensorFileError(f"{where} has no triangles")
     # formats such as GLB store each sharp edge twice, with two normals
-    mesh = trimesh.Trimesh(mesh.vertices * METRES[section.mesh_unit], mesh.faces)
+    mesh = trimesh.Trimesh(mesh.vertices * scale, mesh.faces)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     mesh.update_faces(mesh.nondegenerate_faces())
     if not mesh.is_watertight:

@@ -23,13 +23,24 @@ Such a body has a small mass only because engines require one.
 """
 
 
+class Shape(NamedTuple):
+    """Mesh that draws a body: its file, the length of one unit in it, m, and its place.
+
+    The place (4, 4) is base_from_mesh at home.
+    """
+
+    file: str
+    scale: float
+    place: np.ndarray
+
+
 @dataclass(frozen=True)
 class Solid:
     """Rigid body at home. All vectors are in the axes of the base.
 
     `mass` is in kg, and `centre` (3,) is the centre of mass, m. `inertia` (3, 3) is about the
     centre, kg m^2. `axes` (3, 3) has the axes of the body as columns. `rod` is the length and the
-    radius of the rod that draws the body, m.
+    radius of the rod that draws the body, m. `shapes` are meshes that draw it.
     """
 
     name: str
@@ -38,6 +49,7 @@ class Solid:
     inertia: np.ndarray
     axes: np.ndarray
     rod: tuple[float, float] | None = None
+    shapes: tuple[Shape, ...] = ()
 
 
 class Freedom(NamedTuple):
@@ -357,4 +369,4 @@ def _together(a: Solid, b: Solid) -> Solid:
         shift = one.centre - centre
         inertia += one.inertia + one.mass * (shift @ shift * np.eye(3) - np.outer(shift, shift))
     name = a.name if not b.mass else f"{a.name}+{b.name}"
-    return Solid(name, mass, centre, inertia, a.axes, a.rod or b.rod)
+    return Solid(name, mass, centre, inertia, a.axes, a.rod or b.rod, a.shapes + b.shapes)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from dynamics.body_mesh import BodyMesh
 from dynamics.engines.mechanism import (
     Mechanism,
     MechanismLeg,
@@ -95,6 +96,9 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     geometry = replace(geometry, full_bodies=tuple(full))
     layout = geometry.layout
     notes += _spinning(geometry, mechanism_legs)
+    meshes, said = _meshes(geometry, mechanism_legs)
+    geometry = replace(geometry, meshes=tuple(meshes))
+    notes += said
     friction = np.transpose([mechanism_leg.actuated.friction for mechanism_leg in mechanism_legs])
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     gains = plain.gains
@@ -131,17 +135,52 @@ def _bodies(
     bodies = np.empty((len(layout.bodies), len(platform)))
     bodies[0] = platform
     for k, (mechanism_leg, leg) in enumerate(zip(mechanism_legs, geometry.legs, strict=True)):
-        places = [
-            _numbers(place) for place in leg.placements(ca.SX(mechanism_leg.chain.points[-1]))
-        ]
         for body, place, bars, row in zip(
-            leg.bodies, places, mechanism_leg.bodies, layout.of_leg[k], strict=True
+            leg.bodies,
+            _places(leg, mechanism_leg),
+            mechanism_leg.bodies,
+            layout.of_leg[k],
+            strict=True,
         ):
             try:
                 bodies[row] = _inertia(body, place, bars, geometry.chart.basis[:3])
             except RobotFileError as error:
                 raise RobotFileError(f"leg {k + 1}: {error}") from None
     return bodies
+
+
+def _meshes(
+    geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]
+) -> tuple[list[BodyMesh], list[str]]:
+    """Meshes of the bodies of the legs, and a remark on those of bars, which are left out."""
+    layout = geometry.layout
+    meshes = []
+    left_out = []
+    for k, (mechanism_leg, leg) in enumerate(zip(mechanism_legs, geometry.legs, strict=True)):
+        for (centre, axes), segment, bars, row in zip(
+            _places(leg, mechanism_leg),
+            leg.segments(),
+            mechanism_leg.bodies,
+            layout.of_leg[k],
+            strict=True,
+        ):
+            name = layout.bodies[row]
+            if len(bars) > 1:
+                left_out += [name] * any(bar.shapes for bar in bars)
+                continue
+            for shape in bars[0].shapes:
+                joint = centre - axes @ segment.centre
+                place = axes.T @ (shape.place[:3, 3] - joint)
+                turn = Rotation.from_matrix(axes.T @ shape.place[:3, :3]).as_euler("XYZ")
+                pose = (*place.tolist(), *turn.tolist())
+                meshes.append(BodyMesh(body=name, file=shape.file, scale=shape.scale, pose=pose))
+    said = f"the meshes of {', '.join(left_out)} are not taken, because two bars form the body"
+    return meshes, [said] if left_out else []
+
+
+def _places(leg: Leg, mechanism_leg: MechanismLeg) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centres and axes of the bodies of a leg at home."""
+    return [_numbers(place) for place in leg.placements(ca.SX(mechanism_leg.chain.points[-1]))]
 
 
 def _spinning(geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]) -> list[str]:

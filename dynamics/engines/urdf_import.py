@@ -16,7 +16,7 @@ Home is the position near zero coordinates in which the loops are closed.
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.checks import shown
 from dynamics.engines.mechanism import Connection, Freedom, Mechanism, Solid
 from dynamics.engines.recognition import recognised
+from dynamics.engines.urdf_elements import mesh_shapes, number_in, numbers, origin, real_in
 from dynamics.errors import RobotFileError
 from dynamics.files import LARGEST_XML, LARGEST_YAML, parse_xml, parse_yaml, read_bytes
 from dynamics.legs.chain import SAME
@@ -101,7 +102,7 @@ def robot_of_urdf(path: str | Path, closures: str | Path) -> tuple[RobotDescript
     content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
     root = parse_xml(content, str(path), RobotFileError)
     try:
-        return recognised(_mechanism(root, settings))
+        return recognised(_mechanism(root, settings, Path(path).absolute().parent))
     except RobotFileError as error:
         raise RobotFileError(f"{path} with {closures}: {error}") from None
 
@@ -144,7 +145,7 @@ def _require_once(names: list[str], what: str) -> None:
         raise RobotFileError(f"{what} has {shown(twice[0])} more than once")
 
 
-def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
+def _mechanism(root: Xml.Element, settings: dict[str, list[Any]], folder: Path) -> Mechanism:
     elements = {kind: root.findall(kind) for kind in ("link", "joint")}
     for kind, found in elements.items():
         if len(found) > MOST:
@@ -190,7 +191,12 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]]) -> Mechanism:
     for a, b, welded in loops:
         ball = Freedom("ball", f"closed_loop {a}, {b}", place[a][:3, 3], np.full(3, np.nan))
         connections.append(Connection(number[a], number[b], () if welded else (ball,)))
-    solids = [_solid(links[name], place[name]) for name in number]
+    solids = [
+        replace(
+            _solid(links[name], place[name]), shapes=mesh_shapes(links[name], place[name], folder)
+        )
+        for name in number
+    ]
     ranges = {joint.name: joint.span for joint in joints if joint.span is not None}
     return Mechanism(str(root.get("name") or "robot"), solids, connections, GRAVITY, ranges)
 
@@ -204,7 +210,7 @@ def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
             f"joint {name} is of type {kind} or mimics another; valid: {', '.join(KINDS)}"
         )
     own_kind = KINDS[kind]
-    axes = np.array([_numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
+    axes = np.array([numbers(element, "axis", "xyz", (1.0, 0.0, 0.0)), np.zeros(3)])
     if new_type is not None and re.fullmatch("UJOINT_[XYZ]{2}", new_type):
         own_kind = "universal"
         axes = np.array([np.eye(3)["XYZ".index(letter)] for letter in new_type[7:]])
@@ -220,14 +226,17 @@ def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
     ends = [element.find(end) for end in ("parent", "child")]
     if any(end is None or end.get("link") is None for end in ends):
         raise RobotFileError(f"joint {name} needs parent and child")
-    friction = (_number(element, "dynamics", "friction"), _number(element, "dynamics", "damping"))
+    friction = (
+        number_in(element, "dynamics", "friction"),
+        number_in(element, "dynamics", "damping"),
+    )
     limit = element.find("limit")
     span = None
     if kind != "continuous" and limit is not None and limit.get("lower") and limit.get("upper"):
-        span = (_number(element, "limit", "lower"), _number(element, "limit", "upper"))
+        span = (number_in(element, "limit", "lower"), number_in(element, "limit", "upper"))
     parent, child = (str(end.get("link")) for end in ends if end is not None)
     return _Joint(
-        name, own_kind, parent, child, _origin(element), axes / max(length, 1e-300), friction, span
+        name, own_kind, parent, child, origin(element), axes / max(length, 1e-300), friction, span
     )
 
 
@@ -345,56 +354,13 @@ def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
     axes = place[:3, :3]
     inertial = link.find("inertial")
     shape = link.find("visual/geometry/cylinder")
-    rod = None if shape is None else (_float(shape, "length"), _float(shape, "radius"))
+    rod = None if shape is None else (real_in(shape, "length"), real_in(shape, "radius"))
     if inertial is None:
         return Solid(name, 0.0, place[:3, 3], np.zeros((3, 3)), axes, rod)
-    frame = place @ _origin(inertial)
+    frame = place @ origin(inertial)
     tensor = inertial.find("inertia")
     if tensor is None:
         raise RobotFileError(f"link {name} has an inertial without inertia")
-    rows = [[_float(tensor, f"i{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"]
+    rows = [[real_in(tensor, f"i{min(a, b)}{max(a, b)}") for b in "xyz"] for a in "xyz"]
     turned = frame[:3, :3] @ np.array(rows) @ frame[:3, :3].T
-    return Solid(name, _number(inertial, "mass", "value"), frame[:3, 3], turned, axes, rod)
-
-
-def _origin(element: Xml.Element) -> np.ndarray:
-    """Frame (4, 4) in the tag `origin` of an element."""
-    place = np.eye(4)
-    turn = Rotation.from_euler("xyz", _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
-    place[:3, :3] = turn.as_matrix()
-    place[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0))
-    return place
-
-
-def _numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]) -> np.ndarray:
-    """Three numbers in an attribute of a tag. Raises RobotFileError if they are not finite."""
-    found = element.find(tag)
-    text = None if found is None else found.get(key)
-    if text is None:
-        return np.array(default)
-    try:
-        numbers = np.array([float(word) for word in text.split()])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) != len(default) or not np.isfinite(numbers).all():
-        raise RobotFileError(
-            f"{element.get('name') or tag}: {tag} {key} is {text!r}, must be 3 numbers"
-        )
-    return numbers
-
-
-def _number(element: Xml.Element, tag: str, key: str) -> float:
-    found = element.find(tag)
-    return 0.0 if found is None else _float(found, key)
-
-
-def _float(element: Xml.Element, key: str) -> float:
-    """Number in an attribute. Raises RobotFileError if it is not finite."""
-    text = element.get(key, "0")
-    try:
-        number = float(text)
-    except ValueError:
-        number = np.nan
-    if not np.isfinite(number):
-        raise RobotFileError(f"{element.tag} {key} is {text!r}, must be a finite number")
-    return number
+    return Solid(name, number_in(inertial, "mass", "value"), frame[:3, 3], turned, axes, rod)

@@ -1,6 +1,7 @@
 """Command ``import``: robots from files of other programs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -105,6 +106,8 @@ def _write(
 
     if out.suffix != ".toml":
         raise OutputFolderError(f"cannot write {out}: the name of a robot file ends in .toml")
+    description, said = _with_usable_meshes(description)
+    notes = [*notes, *said]
     text = robot_text(description, [source, *notes])
     write_files({out: text.encode()}, parents=True, check=read_robot_file)
     if quiet:
@@ -116,3 +119,21 @@ def _write(
     )
     for line in [f"legs: {kinds}", *notes, f"robot: {out}; judge it with: cmmsim check {out}"]:
         typer.echo(line)
+
+
+def _with_usable_meshes(description: "RobotDescription") -> "tuple[RobotDescription, list[str]]":
+    """Leave out meshes that cannot be drawn, with a remark on each."""
+    from cmmsim import CmmError
+    from identify.experiment.leg_bodies import stated_mesh
+
+    meshes = []
+    said = []
+    for mesh in description.geometry.meshes:
+        try:
+            stated_mesh(mesh, mesh.body)
+        except (CmmError, RobotFileError) as error:
+            said.append(f"{mesh.body} is drawn as a rod: {error}")
+        else:
+            meshes.append(mesh)
+    geometry = replace(description.geometry, meshes=tuple(meshes))
+    return replace(description, geometry=geometry), said

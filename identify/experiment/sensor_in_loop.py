@@ -3,25 +3,20 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-import trimesh
-from numpy.typing import NDArray
 
 import cmmsim
 from cmmsim.files import SensorFile
 from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.schema import unit
-from cmmsim.imaging.scene_bodies import PlacedBodies, rod_transforms
 from cmmsim.uncertainty.known_rig import KnownRig
 from cmmsim.visibility import SightLines, stated_covariance
 from dynamics import Robot
-from dynamics.bodies import Part, parts_of
-from dynamics.geometry import RobotGeometry
 from identify.arrays import Array
 from identify.errors import ScenarioError
+from identify.experiment.leg_bodies import robot_meshes, robot_transforms
 from identify.experiment.rig_as_known import known_rig
 from identify.progress import Advance, Progress
 from identify.random_streams import CALIBRATION, TEACHING, stream_seed
@@ -29,47 +24,6 @@ from identify.scenario.sections import Rig
 
 OFF_PLATFORM_M = 0.05
 """Largest distance, m, of a leg's end from the platform in the sensor file, and of both homes."""
-
-
-def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Return the meshes [m] of the bodies of all legs, by name. The bodies can hide stickers.
-
-    A rod lies along its z axis and begins at its first joint.
-    """
-    return dict(_meshes(robot.geometry))
-
-
-@lru_cache(maxsize=4)
-def _meshes(geometry: RobotGeometry) -> dict[str, trimesh.Trimesh]:
-    """Return the meshes of a geometry. They are cached for studies with a single robot."""
-    return {
-        part.name: cmmsim.rod(
-            float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius
-        )
-        for part in _drawn(geometry)[0]
-    }
-
-
-@lru_cache(maxsize=16)
-def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """Return the parts of a geometry sorted by body, their names, and their unsorted indices."""
-    parts = parts_of(geometry).all
-    places = sorted(range(len(parts)), key=lambda place: parts[place].body)
-    return (
-        [parts[place] for place in places],
-        tuple(parts[place].name for place in places),
-        np.array(places),
-    )
-
-
-def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
-    """Return base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,).
-
-    The order is that of their meshes.
-    """
-    _, names, order = _drawn(robot.geometry)
-    ends = parts_of(robot.geometry).rods(robot, pose)[order]
-    return PlacedBodies(names, rod_transforms(ends[:, 0], ends[:, 1]))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dynamics.closure import Closure
 from dynamics.errors import ConvergenceError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.experiment.sensor_in_loop import robot_transforms
+from identify.experiment.leg_bodies import robot_transforms
 from identify.geometry.calibration import measured_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators

@@ -120,8 +120,15 @@ def draw_scene(
     painter = Painter(viewpoint, *extent(shown))
     for body, place in placed:
         _solid(painter, body, place)
+    meshes = cell.leg_meshes
+    places = cell.obstacles(pose) if meshes else {}
     for part, ends in zip(cell.parts, rods, strict=True):
-        painter.faces(*tube(ends, part.segment.radius), leg_colour(cell, part.leg, part.body))
+        colour = leg_colour(cell, part.leg, part.body)
+        if part.name in meshes:
+            mesh = meshes[part.name]
+            painter.faces(apply(places[part.name], mesh.vertices), mesh.faces, colour)
+        else:
+            painter.faces(*tube(ends, part.segment.radius), colour)
     for ends in cell.frame:
         painter.line(ends, DARK, 1.6)
     for camera in cell.cameras:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
@@ -23,7 +24,8 @@ from dynamics import Robot
 from dynamics.bodies import Part, parts_of
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms
+from identify.experiment.leg_bodies import meshed_parts, robot_meshes, robot_transforms
+from identify.experiment.sensor_in_loop import check_platform
 
 PLATE_M = 0.012
 """Half the thickness, in m, of the plate drawn for a platform without a given shape."""
@@ -132,6 +134,18 @@ class Workcell:
     def parts(self) -> tuple[Part, ...]:
         """Bodies of the robot's legs, leg by leg from the base. There are none without a robot."""
         return () if self.robot is None else tuple(parts_of(self.robot.geometry).all)
+
+    @cached_property
+    def leg_meshes(self) -> Mapping[str, trimesh.Trimesh]:
+        """Meshes of the robot file of bodies of the legs, by the names of their parts.
+
+        Parts without a mesh are rods.
+        """
+        if self.robot is None or not self.robot.geometry.meshes:
+            return {}
+        meshes = robot_meshes(self.robot)
+        meshed = meshed_parts(self.robot.geometry)
+        return {name: meshes[name] for name, own in zip(meshes, meshed, strict=True) if own}
 
     def rods(self, pose: Array) -> Array:
         """Return the ends (parts, 2, 3) of the legs' bodies in the base frame, m.

@@ -151,6 +151,28 @@ def test_a_robot_written_as_urdf_with_closures_has_the_same_dynamics(
     assert (description.parameter_sets["guess"].joint_pid > 0).all()
 
 
+def test_meshes_of_a_urdf_come_with_its_bodies(tmp_path):
+    """The frames of the links that are written are those of the bodies."""
+    robot = load_robot("rss6")
+    urdf, closures = urdf_texts(robot, with_bodies(robot))
+    visual = (
+        '<visual><origin xyz="0.01 0.02 0.03" rpy="0.1 0.2 0.3"/><geometry>'
+        '<mesh filename="package://arm/meshes/{}.stl" scale="0.001 0.001 0.001"/>'
+        "</geometry></visual>"
+    )
+    for name in ("crank2", "link3"):
+        urdf = urdf.replace(f'<link name="{name}">', f'<link name="{name}">{visual.format(name)}')
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "link3.stl").touch()
+    found, _ = robot_of(tmp_path, urdf, closures)
+    assert [mesh.body for mesh in found.geometry.meshes] == ["crank2", "link3"]
+    assert [mesh.scale for mesh in found.geometry.meshes] == [0.001, 0.001]
+    assert found.geometry.meshes[1].file == str(tmp_path / "meshes" / "link3.stl")
+    turn = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_euler("XYZ")
+    for mesh in found.geometry.meshes:
+        np.testing.assert_allclose(mesh.pose, [0.01, 0.02, 0.03, *turn], atol=1e-9)
+
+
 def test_loops_that_are_open_where_all_coordinates_are_zero_are_closed_first(tmp_path):
     """By cranks that stand up to 0.2 rad from home at zero: the home that is found is another, the
     robot is not.

@@ -18,8 +18,8 @@ from identify.errors import RecordError, TrajectoryError
 from identify.estimation.explanation import SUSPICIOUS
 from identify.estimation.identification import identify
 from identify.experiment.joint_instruments import measure_joints
+from identify.experiment.leg_bodies import robot_meshes, robot_transforms
 from identify.experiment.run import run_plant
-from identify.experiment.sensor_in_loop import robot_meshes, robot_transforms
 from identify.experiment.truth import check_truth, read_truth, true_poses
 from identify.progress import SilentProgress
 from identify.record.recording import poses
