@@ -23,8 +23,9 @@ from cmmsim.detection.detector import (
     find_detector,
 )
 from cmmsim.errors import CmmError
+from cmmsim.files.light_and_print import NARROWEST_PSF
 from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
-from cmmsim.files.schema import NARROWEST_PSF, SensorFile
+from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import coverage, project_discs
 from cmmsim.geometry.pose import Array, apply, pose_to_transform

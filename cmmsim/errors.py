@@ -80,6 +80,10 @@ class DividedError(LostError):
     """Error that two groups of stickers in one frame agree on different poses."""
 
 
+class TeachingWarning(UserWarning):
+    """Teaching that cameras and stickers as stated do not explain."""
+
+
 class TeachingError(CmmError):
     """The stickers could not be taught; the message names the step."""
 

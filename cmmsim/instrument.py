@@ -18,7 +18,7 @@ from cmmsim.allowed_plugins import is_plugin_name, require_renderer
 from cmmsim.checks import checked_seed, require_kind
 from cmmsim.detection.detector import find_detector
 from cmmsim.errors import CmmError, UnknownOptionError
-from cmmsim.files.rig_and_bodies import marked_body, require_corner
+from cmmsim.files.rig_and_bodies import lens_from_file, marked_body, require_corner
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array
@@ -41,6 +41,7 @@ from cmmsim.teaching import (
 from cmmsim.true_cameras import TrueCameras
 from cmmsim.uncertainty.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.uncertainty.known_rig import KnownRig
+from cmmsim.uncertainty.print_errors import known_errors
 from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
 TEACHING_STREAM = 0
@@ -84,7 +85,10 @@ class Instrument:
         self.noise = CameraNoise(
             **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
         )
-        self.optics = Optics(**file.lens.model_dump())
+        lens = lens_from_file(file)
+        # An estimator that does not know the lens takes all depths for in focus.
+        blur = Optics(lens.psf_px, lens.vignetting)
+        self.optics = lens if file.lens.known else blur
         self.platform = marked_body("platform", file.platform)
         self.base = marked_body("base", file.base)
         if taught is not None:
@@ -166,8 +170,8 @@ class Instrument:
     def estimator(self) -> PoseEstimator:
         """Estimator that computes poses from images, including images from other sources."""
         common = None
-        if self._known is not None:
-            known = self._known.covariance
+        if self._known is not None or self._geometry.print is not None:
+            known = self._known_rig.covariance
             common = partial(
                 self._geometry.pose_covariance, rig_covariance=known, method=self.method
             )
@@ -178,7 +182,14 @@ class Instrument:
     @cached_property
     def _geometry(self) -> MeasuringGeometry:
         """Geometry of cameras, bodies and taught frames, as the estimator knows it."""
-        return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
+        bodies = self.platform, self.base
+        errors = known_errors(self._file)
+        return MeasuringGeometry(self.rig, *bodies, self.taught, self.home, errors)
+
+    @property
+    def _known_rig(self) -> KnownRig:
+        """Known rig, with the covariance zero if it is known exactly."""
+        return self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
 
     @property
     def observer(self) -> Observer:
@@ -376,7 +387,7 @@ class Instrument:
         (1, 6)
         """
         self._require_registration("common errors can be computed for")
-        known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
+        known = self._known_rig
         at = np.asarray(poses, dtype=float)
         along = np.asarray(rates, dtype=float)
         return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)

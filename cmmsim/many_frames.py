@@ -38,7 +38,8 @@ class Frames:
     """N frames of a platform at ``poses`` (N, 6), which change at ``rates`` (N, 6).
 
     Each frame has its own generator of noise in ``rngs``. Stickers are searched near the poses
-    ``near`` (N, 6). Obstacles stand still at base_from_body (4, 4), by name.
+    ``near`` (N, 6). Obstacles stand still at base_from_body (4, 4), by name. ``period`` is the time
+    between two frames, s.
     """
 
     estimator: PoseEstimator
@@ -47,6 +48,7 @@ class Frames:
     near: Array
     rngs: Sequence[np.random.Generator]
     obstacles: Mapping[str, Array]
+    period: float
 
     @property
     def expected(self) -> Array:
@@ -70,11 +72,15 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)
+    period = 0.5 * frames.period * rates
+    before = back @ transforms_of(poses - period)
+    after = back @ transforms_of(poses + period)
     parts = [slice(start, start + BLOCK) for start in range(0, len(poses), BLOCK)]
 
     def block(part: slice) -> MeasuredExposures:
         images = camera.look_many(poses[part], rngs[part], frames.obstacles, rates[part])
-        return measure_exposures(estimator, images, expected[part], (first[part], last[part]))
+        ends = (first[part], last[part]), (before[part], after[part])
+        return measure_exposures(estimator, images, expected[part], *ends)
 
     return on_all_cores(block, parts, camera.formation.renderer)
 
@@ -120,15 +126,17 @@ def measure_exposures(
     images: ManyExposures,
     expected: Array,
     exposure_ends: tuple[Array, Array],
+    frame_ends: tuple[Array, Array] | None = None,
 ) -> MeasuredExposures:
     """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
 
     ``exposure_ends`` are the expected camera_from_platform (N,4,4) at the beginning and at the end
-    of the exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
+    of the exposures, and ``frame_ends`` half a frame period before and after their middles. The
+    results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places
     normals = estimator.platform.sticker_normals
-    seen = estimator.read(images, expected, places, normals).observed(exposure_ends)
+    seen = estimator.read(images, expected, places, normals).observed(exposure_ends, frame_ends)
     solved = solve_frames(seen, expected, estimator, estimator.platform, places)
     poses, covariances = estimator.in_base(solved.camera_from_body, solved.covariances)
     of = seen.index // len(places)

@@ -366,13 +366,21 @@ class Sensor(Instrument):
         self._frame += len(at)
         streams = range(first, first + len(at))
         rngs = [np.random.default_rng([self._run_seed, RUN_STREAM, k]) for k in streams]
-        return Frames(self.estimator, at, rates, around, rngs, placed)
+        period = 1.0 / self.timing.frame_rate
+        return Frames(self.estimator, at, rates, around, rngs, placed, period)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """Return a tracker, which measures frame after frame."""
         # The faster tracker knows each sticker of the scene, and teaching can lack some.
         whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
-        if self.renderer != STATISTICAL.name or self.method != "registration" or not whole:
+        # It knows no print either.
+        perfect = self._file.print.is_perfect
+        if (
+            self.renderer != STATISTICAL.name
+            or self.method != "registration"
+            or not whole
+            or not perfect
+        ):
             return Tracker(self.estimator)
         # Imported late, because importing numba takes time.
         from cmmsim.without_images.statistical_tracker import StatisticalTracker

@@ -15,6 +15,7 @@ from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.measuring.layout_search import SMALLEST_STEP
 from cmmsim.measuring.observation import DetectionSettings
+from cmmsim.measuring.print_allowance import print_allowance
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.teaching import WindowSizes, largest_radius, radius_at, window_sizes
 from cmmsim.uncertainty.known_rig import KnownRig
@@ -46,8 +47,10 @@ class StickerView:
             largest_radius(self.rig, place, self.base, radius),
             largest_radius(self.rig, self._camera_from_platform, self.platform, radius),
         )
-        blurred = self.optics.psf_px > 0.0 or self.file.timing.exposure > 0.0
-        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
+        focal_px = float(self.rig.left.focal_px)
+        psf_px = float(self.optics.spreads_px(focal_px, self._stickers[:, 2]).max())
+        blurred = psf_px > 0.0 or self.file.timing.exposure > 0.0
+        return window_sizes(at_target, at_teaching, psf_px, blurred)
 
     def settings(self, noise: CameraNoise, centre_error_px: float) -> DetectionSettings:
         """Return the settings of the search for stickers in windows.
@@ -55,17 +58,22 @@ class StickerView:
         ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
         """
         timing = self.file.timing
+        size = self.file.stickers.radius
+        at_target = radius_at(self.rig, self.camera_from_base, np.array(self.file.rig.target), size)
+        allowed = print_allowance(self.file, noise, at_target, self.sizes.fit)
         return DetectionSettings(
             self.sizes.window,
             self.sizes.fit,
             radius=self.file.stickers.radius,
             detector=self.file.detection.detector,
-            limits=FitLimits(smallest_contrast=SMALLEST_STEP * noise.white_level),
+            limits=FitLimits(SMALLEST_STEP * noise.white_level, allowed.largest_misfit),
             optics=self.optics,
             centre_error_px=centre_error_px,
             exposed_share=timing.exposure * timing.frame_rate,
+            row_share=timing.row_time * timing.frame_rate,
             line_error_px=0.0 if self.known is None else self.known.line_std(self._stickers),
             dark=self.file.stickers.dark,
+            allowed=allowed,
         )
 
     @property

@@ -14,6 +14,7 @@ the image at the nearest working distance, assumed a fifth nearer than the rig's
 largest image in view of both cameras at teaching.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
@@ -22,22 +23,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.allowed_plugins import DEFAULT_DETECTOR
-from cmmsim.errors import LostError, TeachingError
+from cmmsim.errors import LostError, TeachingError, TeachingWarning
 from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.disc_image import sticker_outlines
-from cmmsim.geometry.pose import Array, apply, apply_each, compose_covariance, invert
-from cmmsim.geometry.registration import register, register_sets
+from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
+from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.scene_bodies import placed_stickers
 from cmmsim.imaging.stereo_camera import Quality
+from cmmsim.measuring.constellation import plane_normals, platform_frame
 from cmmsim.measuring.layout_search import bright_ellipses, candidate_points, find_layout
 from cmmsim.measuring.observation import Observer, StickerExposure, faces_camera
 from cmmsim.measuring.pose_estimator import (
     FEWEST_NOMINAL,
     NOMINAL_TOLERANCE,
     by_planes,
-    frames_by_planes,
 )
 from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.measuring.taught import Taught, setup_of
@@ -50,6 +51,11 @@ TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
 # m: in averaged exposures, an unhidden sticker is seen within a few micrometres of its place.
 LARGEST_GAP = 1e-4
+# Largest rms of the distances of two rays of the base's stickers, in deviations. It is 1.2 to 1.4
+# with cameras and stickers as stated.
+LARGEST_PARTING = 3.0
+# The same for errors by print, in standard deviations.
+PRINT_REACH = 20.0
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
 # a sticker's radius at the rig's target.
@@ -132,15 +138,18 @@ class Teacher:
                 self.plan.base,
                 self.plan.base_window,
             )
+            self._warn_of_parted_rays(base)
+            base = replace(base, covariances=base.covariances + self._constant(base.points))
             camera_from_base, base_covariance, base = by_planes(
-                base, self.base, _plane_normals(self.base, start[0])
+                base, self.base, plane_normals(self.base, start[0])
             )
             report(2, steps)
             seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
         except LostError as error:
             raise TeachingError(f"teaching failed: {error}") from error
         base_from_camera = invert(camera_from_base)
-        places, place_covariances, platform_covariance = platform_frame(self.platform, seen)
+        found = platform_frame(self.platform, seen, self._constant(seen[0].points))
+        places, place_covariances, platform_covariance = found
         return Taught(
             sensor_name,
             base_from_camera,
@@ -150,6 +159,27 @@ class Teacher:
             platform_covariance,
             apply(base_from_camera, base.points),
         )
+
+    def _warn_of_parted_rays(self, base: StickerObservation) -> None:
+        """Warn if the two rays of the base's stickers are farther apart than noise explains.
+
+        Known errors of rig or print part them as well, so they are then not tested.
+        """
+        settings = self.observer.settings
+        exact = settings.line_error_px == 0.0 and not settings.allowed.known
+        parting = float(np.sqrt(np.mean(base.rays**2)))
+        if exact and parting > LARGEST_PARTING:
+            warnings.warn(
+                f"taught by {self.base.name}: the two rays of a sticker pass each other at "
+                f"{parting:.1f} times their noise, at most {LARGEST_PARTING:g} are explained by "
+                "cameras and stickers as stated; poses err by more than is stated",
+                TeachingWarning,
+                stacklevel=2,
+            )
+
+    def _constant(self, points: Array) -> Array:
+        """Return the covariances (n, 3, 3) of points that are the same in all views."""
+        return self.observer.settings.allowed.constant_covariances(self.observer.rig, points)
 
     def _look_at(
         self,
@@ -215,7 +245,7 @@ class Teacher:
             )
             if k == 0:
                 body_from_camera = invert(
-                    by_planes(seen[0], self.platform, _plane_normals(self.platform, rough))[0]
+                    by_planes(seen[0], self.platform, plane_normals(self.platform, rough))[0]
                 )
                 places = apply(body_from_camera, seen[0].points)
             now = register(places, seen[-1].points, seen[-1].covariances).transform
@@ -232,50 +262,15 @@ class Teacher:
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px
-        limit = LARGEST_GAP + self.observer.settings.line_error_px * depth / focal
+        settings = self.observer.settings
+        errors = settings.line_error_px + PRINT_REACH * settings.allowed.changing_px
+        limit = LARGEST_GAP + errors * depth / focal
         if gaps.max() > limit:
             worst = self.platform.sticker_ids[gaps.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its "
                 f"place, allowed are {limit * 1e6:.0f} um; perhaps it is partly hidden"
             )
-
-
-def platform_frame(
-    platform: MarkedBody, seen: list[StickerObservation]
-) -> tuple[Array, Array, Array]:
-    """Return sticker places (n, 3) on the platform with their covariances (n, 3, 3).
-
-    The third result is the covariance (6, 6) of the platform frame. Each view must contain all
-    stickers.
-    """
-    views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
-    mean, covariances = mean_constellation(*views)
-    rough_normals = _plane_normals(
-        platform, register(platform.nominal, mean, covariances).transform
-    )
-    whole = replace(seen[0], points=mean, covariances=covariances)
-    mean_from_body, frame_covariance, _ = by_planes(whole, platform, rough_normals)
-    body_from_mean = invert(mean_from_body)
-    turn = body_from_mean[:3, :3]
-    return (
-        apply(body_from_mean, mean),
-        turn @ covariances @ turn.T,
-        compose_covariance(body_from_mean, frame_covariance),
-    )
-
-
-def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
-    """Return the sticker places (c, n, 3) of c teachings; ``platform_frame`` does so for one.
-
-    Each teaching has v views of the stickers, at points (c, v, n, 3) with covariances (c, v, n, 3,
-    3).
-    """
-    mean, covariances = mean_constellation(points, covariances)
-    rough_normals = _plane_normals(
-        platform, register_sets(platform.nominal, mean, covariances).transform
-    )
-    return apply_each(invert(frames_by_planes(platform, mean, covariances, rough_normals)), mean)
 
 
 def teaching_path(home: Array, count: int) -> Array:
@@ -285,40 +280,6 @@ def teaching_path(home: Array, count: int) -> Array:
     """
     angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
     return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
-
-
-def _plane_normals(body: MarkedBody, camera_from_body: Array) -> Array:
-    """Return the normals (..., 3, 3) of a body's planes in the camera frame.
-
-    The body stands at camera_from_body (..., 4, 4).
-    """
-    return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
-
-
-def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the weighted mean (..., n, 3) of v views of the same stickers, laid onto each other.
-
-    The mean has about the place and orientation of the first view. The second result contains the
-    covariances (..., n, 3, 3) of the mean. Views are points (..., v, n, 3) with covariances (...,
-    v, n, 3, 3).
-    """
-    weights = np.linalg.inv(covariances)
-    mean = points[..., 0, :, :]
-    spread = covariances[..., 0, :, :, :]
-    # Mean and transforms depend on each other, because the weights rotate with the views. Three
-    # alternating steps are enough for convergence.
-    for _ in range(3):
-        sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
-        found = register_sets(
-            sets, points.reshape(sets.shape), covariances.reshape(*sets.shape, 3)
-        ).transform
-        to_mean = invert(found).reshape(*points.shape[:-2], 4, 4)
-        turn = to_mean[..., None, :3, :3]
-        turned = turn @ weights @ turn.swapaxes(-1, -2)
-        weighted = (turned @ apply_each(to_mean, points)[..., None]).sum(axis=-4)
-        spread = np.linalg.inv(turned.sum(axis=-4))
-        mean = (spread @ weighted)[..., 0]
-    return mean, spread
 
 
 @dataclass(frozen=True)

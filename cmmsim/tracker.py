@@ -14,6 +14,8 @@ from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 # The whole images are searched as well if the predicted windows show fewer stickers than this share
 # of those in the last frame. A wrong prediction places windows beside the stickers.
 EXPECTED_SHARE = 0.7
+Ends = tuple[Array, Array] | None
+"""Transforms camera_from_platform (4, 4) at the beginning and at the end of some time, or None."""
 
 
 class Tracker:
@@ -111,13 +113,11 @@ class Tracker:
         try:
             if self._step_before is not None:
                 predicted = self._predicted()
-                return self._estimator.measure(images, predicted, self._exposure_ends(predicted))
+                return self._estimator.measure(images, predicted, *self._ends(predicted))
             found = self._estimator.measure(images, self._last)
-            exposure_ends = self._exposure_ends(found[1])
+            ends = self._ends(found[1])
             return (
-                found
-                if exposure_ends is None
-                else self._estimator.measure(images, found[1], exposure_ends)
+                found if ends == (None, None) else self._estimator.measure(images, found[1], *ends)
             )
         except LostError:
             return None
@@ -127,16 +127,25 @@ class Tracker:
         found = self._estimator.locate(images)
         if self._last is None:
             return self._estimator.measure_anew(images, found)
-        return self._estimator.measure(images, found, self._exposure_ends(found))
+        return self._estimator.measure(images, found, *self._ends(found))
 
-    def _exposure_ends(self, middle: Array) -> tuple[Array, Array] | None:
-        """Return camera_from_platform (4, 4) at the beginning and at the end of an exposure.
+    def _ends(self, middle: Array) -> tuple[Ends, Ends]:
+        """Return the ends of the exposure, and those of a frame period about its middle.
 
-        In the middle of the exposure, camera_from_platform is ``middle``. The speed is the mean
-        speed since the last frame. The result is None without a last frame, or if the exposure
-        takes no time.
+        The ends are None if the exposure takes no time, or all rows are exposed at once.
         """
-        share = self._estimator.settings.exposed_share
+        settings = self._estimator.settings
+        whole = 1.0 if settings.row_share > 0.0 else 0.0
+        return self._part_of_frame(middle, settings.exposed_share), self._part_of_frame(
+            middle, whole
+        )
+
+    def _part_of_frame(self, middle: Array, share: float) -> Ends:
+        """Return camera_from_platform (4, 4) at the beginning and at the end of a share of a frame.
+
+        In the middle, camera_from_platform is ``middle``. The speed is the mean speed since the
+        last frame. The result is None without a last frame, or if the share is zero.
+        """
         if self._last is None or share == 0.0:
             return None
         step = invert(self._last) @ middle

@@ -14,11 +14,13 @@ import trimesh
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import CmmError, UnknownBodyError
-from cmmsim.files.rig_and_bodies import MarkedBody, rig_from_file
+from cmmsim.files.printed import print_sizes
+from cmmsim.files.rig_and_bodies import MarkedBody, lens_from_file, rig_from_file
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
 from cmmsim.imaging.formation import ImageFormation
+from cmmsim.imaging.painted_stickers import painter_of
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
 from cmmsim.imaging.scene_bodies import (
     Mesh,
@@ -188,7 +190,8 @@ class TrueCameras:
     def _without_images(self) -> StatisticalStereoCamera:
         """Return cameras that give the detected stickers without images."""
         stickers = self._file.stickers
-        light = Light(stickers.sticker_level / 255.0, stickers.ring_level / 255.0, self._optics)
+        levels = stickers.sticker_level / 255.0, stickers.ring_level / 255.0
+        light = Light(*levels, self._optics, print_sizes(self._file))
         require_proved(self._file, self._noise, light)
         return StatisticalStereoCamera(
             self.rig,
@@ -217,13 +220,18 @@ class TrueCameras:
             self.rig,
             self.camera_from_base,
             ImageFormation(
-                self.renderer, drawable, file.stickers.background_level / 255.0, self._optics
+                self.renderer,
+                drawable,
+                file.stickers.background_level / 255.0,
+                lens_from_file(file),
+                painter_of(file, self.scene, self._bodies, drawable),
             ),
             self._noise,
             list(self.obstacles),
             file.timing.exposure,
             file.camera.pattern_seed,
             self.right_later,
+            file.timing.row_time,
         )
 
     def _draw_anew(self) -> None:

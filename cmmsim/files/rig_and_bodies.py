@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import SensorFileError, ShapeError, TeachingError
-from cmmsim.files.schema import Body, Calibrated, Rig, RightFromLeft, StickerPlane, unit
-from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.files.schema import (
+    Body,
+    Calibrated,
+    Rig,
+    RightFromLeft,
+    SensorFile,
+    StickerPlane,
+    unit,
+)
+from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
@@ -49,6 +57,15 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
         return rig, camera_from_base
     rig = replace(rig, right_from_left=_right_from_left(section.right_from_left))
     return rig, placed_rig(rig, position, target)
+
+
+def lens_from_file(file: SensorFile) -> Optics:
+    """Return the optics of both lenses."""
+    lens = file.lens
+    distance = float(np.linalg.norm(np.subtract(file.rig.position, file.rig.target)))
+    x, y = lens.ghost_offset_px
+    focus = lens.focus or distance
+    return Optics(lens.psf_px, lens.vignetting, lens.aperture, focus, lens.ghost, (int(x), int(y)))
 
 
 def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) -> PinholeCamera:

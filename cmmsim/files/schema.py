@@ -15,8 +15,10 @@ from pydantic import AfterValidator, Field, model_validator
 from cmmsim.allowed_plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
 from cmmsim.checks import Section, check_name
 from cmmsim.errors import SensorFileError
+from cmmsim.files.light_and_print import Lens, Light, Print
 from cmmsim.files.quantities import (
     Angle,
+    Bounds,
     Direction3,
     Distance,
     Distortion,
@@ -38,8 +40,6 @@ from cmmsim.geometry.pose import Array
 
 # Largest deviation of a frame's latency from the mean, in standard deviations.
 WIDEST_JITTER = 3.0
-# px: narrowest point spread that the samples of drawn images can resolve.
-NARROWEST_PSF = 0.1
 
 
 class Timing(Section):
@@ -51,6 +51,12 @@ class Timing(Section):
     frame_rate: Frequency = quantity(..., "Hz", "stereo frames per second")
     exposure: Duration = quantity(
         0.0, "s", "exposure time of an image; 0 means an instantaneous image without blur"
+    )
+    row_time: Annotated[float, Bounds(1e-9, 1e-4, "s", zero=True)] = quantity(
+        0.0,
+        "s",
+        "time between the exposures of two rows of pixels; 0 means all rows at once, and the pose "
+        "is that at the middle row",
     )
     latency: Duration = quantity(
         0.0, "s", "mean delay from the middle of the exposure to the use of the pose"
@@ -209,26 +215,6 @@ class Camera(Section):
         return self
 
 
-class Lens(Section):
-    """Blur and vignetting of both lenses. Distortion belongs to the entries of each camera.
-
-    The vignetting grows with the square of the distance from the principal point.
-    """
-
-    psf_px: Annotated[float, Field(ge=0.0, le=4.0)] = quantity(
-        0.0, "px", "standard deviation of the Gaussian point spread"
-    )
-    vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = quantity(
-        0.0, "", "fraction of the light that is lost in the farthest corner of the image"
-    )
-
-    @model_validator(mode="after")
-    def _drawable(self) -> Lens:
-        if 0.0 < self.psf_px < NARROWEST_PSF:
-            raise ValueError(f"psf_px {self.psf_px:g} must be 0 or at least {NARROWEST_PSF:g} px")
-        return self
-
-
 class Detection(Section):
     """Detection of stickers during measurement.
 
@@ -373,6 +359,8 @@ class SensorFile(Section):
     rig: Rig
     camera: Camera
     lens: Lens = Field(default_factory=Lens)
+    light: Light = Field(default_factory=Light)
+    print: Print = Field(default_factory=Print)
     detection: Detection = Field(default_factory=Detection)
     stickers: Stickers
     platform: Platform

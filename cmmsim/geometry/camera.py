@@ -254,16 +254,22 @@ def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
 
 @dataclass(frozen=True)
 class Optics:
-    """Point spread and vignetting of a lens.
+    """Point spread, vignetting, defocus and ghost of a lens.
 
     ``psf_px`` is the standard deviation of the Gaussian point spread, px. ``vignetting`` is the
     fraction of the light that is missing in the corner farthest from the principal point. The loss
-    grows with the square of the distance from the principal point. If both are zero, the image is
-    that of a pinhole camera.
+    grows with the square of the distance from the principal point. ``aperture`` is the diameter of
+    the aperture, m, and ``focus`` the depth in focus, m. A share ``ghost`` of the light appears
+    again ``ghost_offset`` px beside its place. If all but the focus and the offset are zero, the
+    image is that of a pinhole camera.
     """
 
     psf_px: float = 0.0
     vignetting: float = 0.0
+    aperture: float = 0.0
+    focus: float = 1.0
+    ghost: float = 0.0
+    ghost_offset: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         if not (self.psf_px >= 0.0 and 0.0 <= self.vignetting < 1.0):
@@ -272,7 +278,20 @@ class Optics:
     @property
     def margin_px(self) -> int:
         """Largest distance, px (an integer), from which light outside a window reaches into it."""
-        return ceil(PSF_REACH * self.psf_px)
+        return self.reach_px(self.psf_px)
+
+    @staticmethod
+    def reach_px(psf_px: float) -> int:
+        """Return the reach of a point spread, px (an integer)."""
+        return ceil(PSF_REACH * psf_px)
+
+    def spreads_px(self, focal_px: float, depths: Array) -> Array:
+        """Return the standard deviations (k,) px of the point spread at ``depths`` (k,), m.
+
+        A blur circle of diameter c has the variance c² / 16 along each axis.
+        """
+        circles = focal_px * self.aperture * np.abs(1.0 / self.focus - 1.0 / depths)
+        return np.sqrt(self.psf_px**2 + circles**2 / 16.0)
 
     def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:
         """Return the relative illumination (...) of pixels (..., 2).

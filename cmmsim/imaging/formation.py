@@ -11,23 +11,20 @@ quadratics in between. In windows of some tens of pixels, the interpolation erro
 Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so it
 neither moves nor widens edges. Source: R. G. Keys, Cubic convolution interpolation for digital
 image processing, IEEE Trans. ASSP 29 (1981).
-
-A whole image is drawn finely only around bright spots. Most of the scene stands still during an
-exposure. A window without any body is filled with the background, and a window without a moving
-body is drawn only once.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array, frozen
-from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
+from cmmsim.imaging.renderer import Drawable, Renderer, Views
+from cmmsim.imaging.scene_bodies import DiscStack
 
 # Matrix that maps the values of a quadratic at -1, 0 and 1 to its coefficients.
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
@@ -39,18 +36,10 @@ SHARP_SUB_PIXELS = 12
 SIDE_STEP = 4
 # Number of drawn pixels that the cubic needs on either side.
 REACH = 2
-# px: side of the finely drawn window around a bright spot.
-PASTED_SIZE = 24
-# px: largest side of a finely drawn window; larger spots are drawn coarsely.
-LARGEST_PASTED_SIZE = 96
-# px: margin that is drawn finely around a large spot.
-DARK_RIM = 8
-# Radiance above which a spot is drawn finely.
-BRIGHT = 0.4
-# px: side of the pieces in which a whole image is distorted and blurred.
-TILE = 64
-# Number of drawn samples per pixel and axis away from bright spots.
-COARSE = 2
+# Depths to which the blur of defocus is limited, in shares of the usual distance.
+DEPTHS = (0.7, 1.5)
+# px: point spreads of windows are rounded to multiples of this.
+SPREAD_STEP = 0.01
 
 
 def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.float32]:
@@ -77,16 +66,32 @@ class Side:
     corners: NDArray[np.int_]
 
 
+class Painter(Protocol):
+    """Painter that adds light and print to what a renderer draws."""
+
+    def draw(
+        self, renderer: Renderer, views: Views, supersampling: int, background: float
+    ) -> NDArray[np.float32]:
+        """Draw the radiance (n, h, w) of n windows."""
+
+    @property
+    def paints_background(self) -> bool:
+        """True if windows without any body are not empty."""
+
+
 @dataclass(frozen=True)
 class ImageFormation:
     """Image formation by a renderer, with the drawn bodies, the radiance of the background, and the
     optics of the lenses.
+
+    ``painter`` replaces the renderer's evenly lit and printed stickers; None leaves them.
     """
 
     renderer: Renderer
     drawable: Drawable
     background: float
     optics: Optics
+    painter: Painter | None = None
 
     def centre_error_px(self, cameras: Sequence[PinholeCamera], supersampling: int) -> float:
         """Return the error of a sticker's centre due to drawing with ``supersampling``, px rms."""
@@ -100,6 +105,8 @@ class ImageFormation:
 
     def draws_pixels(self, cameras: Sequence[PinholeCamera]) -> bool:
         """Tell whether images are drawn directly on their pixels, without a finer grid."""
+        if self.painter is not None or self.optics.aperture > 0.0:
+            return False
         return self.optics.psf_px == 0.0 and all(camera.distortion.is_zero for camera in cameras)
 
     def windows(
@@ -116,18 +123,29 @@ class ImageFormation:
         replaces the default number of fine pixels. If ``shade`` is True, the windows are multiplied
         by the relative illumination.
         """
-        if self.draws_pixels([side.camera for side in sides]):
-            windows = self._drawn(
-                [(s.camera.ideal, s.bodies, s.corners) for s in sides], size, supersampling
-            )
-        else:
-            windows = self._formed(sides, size, supersampling, sub_pixels or self.sub_pixels)
+        windows = self._light(sides, size, supersampling, sub_pixels or self.sub_pixels)
+        if self.optics.ghost > 0.0:
+            offset = np.array(self.optics.ghost_offset)
+            beside = [replace(s, corners=s.corners - offset) for s in sides]
+            again = self._light(beside, size, supersampling, sub_pixels or self.sub_pixels)
+            share = np.float32(self.optics.ghost)
+            windows = [w + share * other for w, other in zip(windows, again, strict=True)]
         if shade and self.optics.vignetting > 0.0:
             windows = [
                 w * self.optics.window_illumination(s.camera, s.corners, size).astype(np.float32)
                 for w, s in zip(windows, sides, strict=True)
             ]
         return windows
+
+    def _light(
+        self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
+    ) -> list[NDArray[np.float32]]:
+        """Return windows without ghost and vignetting; see ``windows`` for the parameters."""
+        if self.draws_pixels([side.camera for side in sides]):
+            return self._drawn(
+                [(s.camera.ideal, s.bodies, s.corners) for s in sides], size, supersampling
+            )
+        return self._formed(sides, size, supersampling, sub_pixels)
 
     def reached(
         self,
@@ -143,11 +161,27 @@ class ImageFormation:
         Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2).
         See ``windows`` for ``size`` and ``sub_pixels``.
         """
+        reached = self._reached(camera, moments, corners, size, sub_pixels)
+        if self.optics.ghost > 0.0:
+            beside = corners - self.optics.ghost_offset
+            reached |= self._reached(camera, moments, beside, size, sub_pixels)
+        return reached
+
+    def _reached(
+        self,
+        camera: PinholeCamera,
+        moments: Sequence[Array],
+        corners: NDArray[np.int_],
+        size: int,
+        sub_pixels: int | None,
+    ) -> NDArray[np.bool_]:
+        """Return the mask of ``reached``, without the ghost."""
         first = corners
         drawn_size = size
         if not self.draws_pixels([camera]):
-            fine_size = (size + 2 * self.optics.margin_px) * (sub_pixels or self.sub_pixels)
-            places = _shown_places(camera, corners, size, self.optics.margin_px, fine_size)
+            margin = self._margin_px(camera)
+            fine_size = (size + 2 * margin) * (sub_pixels or self.sub_pixels)
+            places = _shown_places(camera, corners, size, margin, fine_size)
             (first,), drawn_size = _drawn_parts([places])
         bounds = np.hstack([first - 0.5, first - 0.5 + drawn_size])
         return np.stack(
@@ -158,16 +192,18 @@ class ImageFormation:
         self, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: int, supersampling: int
     ) -> list[NDArray[np.float32]]:
         """Return windows of one size as the renderer draws them."""
-        images = self.renderer.draw(
-            self.drawable, Views.of_sides(sides, (size, size)), supersampling, self.background
-        )
+        views = Views.of_sides(sides, (size, size))
+        if self.painter is None:
+            images = self.renderer.draw(self.drawable, views, supersampling, self.background)
+        else:
+            images = self.painter.draw(self.renderer, views, supersampling, self.background)
         return np.split(images, np.cumsum([len(at) for _, _, at in sides])[:-1])
 
     def _formed(
         self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
     ) -> list[NDArray[np.float32]]:
         """Return windows that are drawn finely, distorted, blurred and averaged over pixels."""
-        margin = self.optics.margin_px
+        margin = max(self._margin_px(side.camera) for side in sides)
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
         first, drawn_size = _drawn_parts(nodes)
@@ -176,14 +212,62 @@ class ImageFormation:
             (c, s.bodies, at * sub_pixels) for c, s, at in zip(cameras, sides, first, strict=True)
         ]
         drawn = self._drawn(finer, drawn_size * sub_pixels, -(-supersampling // sub_pixels))
-        response = pixel_response(self.optics.psf_px, size, margin, sub_pixels)
         distorted = [
             _distorted(
                 side, windows, (places - at[:, None, None] + 0.5) * sub_pixels - 0.5, fine_size
             )
             for side, windows, places, at in zip(sides, drawn, nodes, first, strict=True)
         ]
-        return [np.asarray(response @ fine @ response.T) for fine in distorted]
+        return [
+            self._blurred(side, fine, size, margin, sub_pixels)
+            for side, fine in zip(sides, distorted, strict=True)
+        ]
+
+    def _blurred(
+        self, side: Side, fine: NDArray[np.float32], size: int, margin: int, sub_pixels: int
+    ) -> NDArray[np.float32]:
+        """Return windows (k, size, size), blurred and averaged over pixels.
+
+        Each window has the point spread of the sticker that is nearest to its middle.
+        """
+        if self.optics.aperture == 0.0:
+            response = pixel_response(self.optics.psf_px, size, margin, sub_pixels)
+            return np.asarray(response @ fine @ response.T)
+        middles = np.asarray(side.corners + 0.5 * (size - 1), dtype=float)
+        spreads = SPREAD_STEP * np.round(self._spreads_px(side, middles) / SPREAD_STEP)
+        windows = np.empty((len(fine), size, size), dtype=np.float32)
+        for spread in np.unique(spreads):
+            response = pixel_response(float(spread), size, margin, sub_pixels)
+            own = spreads == spread
+            windows[own] = response @ fine[own] @ response.T
+        return windows
+
+    def _spreads_px(self, side: Side, pixels: Array) -> Array:
+        """Return the point spread (k,) px at the stickers that are nearest to pixels (k, 2)."""
+        moves = side.bodies[self._sticker_bodies]
+        points = np.einsum("nij,nj->ni", moves[:, :3, :3], self._sticker_places) + moves[:, :3, 3]
+        shown = side.camera.project(points)[0]
+        gaps = np.linalg.norm(pixels[:, None] - shown, axis=2)
+        low, high = (share * self.drawable.distance for share in DEPTHS)
+        depths = np.clip(points[gaps.argmin(axis=1), 2], low, high)
+        return self.optics.spreads_px(side.camera.focal_px, depths)
+
+    def _margin_px(self, camera: PinholeCamera) -> int:
+        """Return the largest distance, px (an integer), from which light reaches a window."""
+        depths = self.drawable.distance * np.array(DEPTHS)
+        return self.optics.reach_px(float(self.optics.spreads_px(camera.focal_px, depths).max()))
+
+    @cached_property
+    def _sticker_bodies(self) -> NDArray[np.int_]:
+        """Body (n,) of each sticker."""
+        stacks = [isinstance(patch, DiscStack) for patch in self.drawable.patches]
+        return self.drawable.body_index[stacks]
+
+    @cached_property
+    def _sticker_places(self) -> Array:
+        """Places (n, 3) of the stickers in the axes of their bodies, m."""
+        stacks = [patch for patch in self.drawable.patches if isinstance(patch, DiscStack)]
+        return np.array([stack.discs[-1].centre for stack in stacks])
 
 
 def _shown_places(
@@ -266,108 +350,3 @@ def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> ND
     weights = into_pixels.astype(np.float32)
     weights.setflags(write=False)
     return weights
-
-
-def exposed_windows(
-    formation: ImageFormation,
-    camera: PinholeCamera,
-    moments: Sequence[Array],
-    corners: NDArray[np.int_],
-    size: int,
-    supersampling: int,
-    sub_pixels: int | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the mean and the largest radiance (k, size, size) of windows over several moments.
-
-    Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2). The
-    result has no vignetting. See ``ImageFormation.windows`` for ``supersampling`` and
-    ``sub_pixels``.
-    """
-    reached = formation.reached(camera, moments, corners, size, sub_pixels)
-    # Mask of the patches whose bodies move.
-    moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
-    drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
-    drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often
-
-    def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
-        if not which.any():
-            return np.empty((0, size, size), dtype=np.float32)
-        sides = [Side(camera, bodies, corners[which])]
-        return formation.windows(sides, size, supersampling, sub_pixels, shade=False)[0]
-
-    mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
-    mean[drawn_once] = draw(moments[0], drawn_once)
-    total = draw(moments[0], drawn_often)
-    largest = total.copy()
-    for bodies in moments[1:]:
-        window = draw(bodies, drawn_often)
-        total += window
-        np.maximum(largest, window, out=largest)
-    brightest = mean.copy()
-    mean[drawn_often] = total / np.float32(len(moments))
-    brightest[drawn_often] = largest
-    return mean, brightest
-
-
-def whole_image(
-    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
-) -> NDArray[np.float32]:
-    """Return the mean radiance (height, width) of one camera's image over several moments.
-
-    Each moment states camera_from_body (b, 4, 4). The image is drawn coarsely, except for finely
-    drawn windows around bright spots.
-    """
-    image, bright = _coarse(formation, camera, moments)
-    corners, size = _spots(
-        bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera])
-    )
-    if len(corners):
-        fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
-        for (x, y), window in zip(corners, fine, strict=True):
-            image[y : y + size, x : x + size] = window
-    if formation.optics.vignetting == 0.0:
-        return image
-    pixels = np.stack(
-        np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1
-    )
-    return image * formation.optics.illumination(camera, pixels).astype(np.float32)
-
-
-def _coarse(
-    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the mean radiance (height, width), drawn with COARSE² samples per pixel.
-
-    The second result is a mask of the pixels that are bright at one moment at least.
-    """
-    if len(moments) == 1 and formation.draws_pixels([camera]):
-        view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
-        image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
-        return image, image > BRIGHT
-    rows = -(-camera.height // TILE)
-    columns = -(-camera.width // TILE)
-    x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
-    corners = np.column_stack([x.ravel(), y.ravel()])
-    mean, brightest = (
-        tiles.reshape(rows, columns, TILE, TILE)
-        .swapaxes(1, 2)
-        .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
-        for tiles in exposed_windows(
-            formation, camera, moments, corners, TILE, COARSE, sub_pixels=1
-        )
-    )
-    return mean, brightest > BRIGHT
-
-
-def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
-    """Return the first pixels (k, 2) of the windows around bright spots, and their side in px."""
-    _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
-    keep = np.isfinite(centres[1:]).all(axis=1)
-    sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-    size = PASTED_SIZE
-    if not fixed_size:
-        keep &= sides <= LARGEST_PASTED_SIZE - 2 * DARK_RIM
-        size = max(size, int(sides[keep].max(initial=0)) + 2 * DARK_RIM)
-    size = min(size, *bright.shape)
-    highest = np.array(bright.shape[::-1]) - size
-    return np.clip(np.rint(centres[1:][keep]).astype(int) - size // 2, 0, highest), size

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, apply
-from cmmsim.imaging.formation import TILE, ImageFormation, Side
+from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.whole_image import TILE
 
 # Points along each side of a plate, from which the extent of its distorted image is found.
 OUTLINE_POINTS = 15

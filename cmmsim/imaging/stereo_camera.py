@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, apply_each, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.formation import ImageFormation, Side, whole_image
+from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.row_sweep import drawn_row_by_row, row_sweeps
 from cmmsim.imaging.scene_bodies import DiscStack
+from cmmsim.imaging.whole_image import whole_image
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from cmmsim.radiometry.stereo_images import StereoFrame, Windows
 
@@ -72,7 +74,8 @@ class VirtualStereoCamera:
     ``rig`` and ``camera_from_base`` (4, 4) have their true values. In the drawable of
     ``formation``, body 0 is the platform and body 1 the base. The further bodies are the obstacles,
     in the order of ``obstacle_names``. ``exposure`` is in s. ``pattern_seed`` is the seed of the
-    fixed pattern. The right camera exposes ``right_later`` s after the left camera.
+    fixed pattern. The right camera exposes ``right_later`` s after the left camera, and each row of
+    pixels ``row_time`` s after the row above it.
     """
 
     rig: StereoRig
@@ -83,6 +86,7 @@ class VirtualStereoCamera:
     exposure: float = 0.0
     pattern_seed: int = 0
     right_later: float = 0.0
+    row_time: float = 0.0
 
     def look(
         self,
@@ -98,9 +102,9 @@ class VirtualStereoCamera:
         derivative. Obstacles stand still.
         """
         rates = None if pose_rate is None else pose_rate[None]
-        return LiveImages(
-            self, self._moments(pose[None], rates, obstacles or {})[0], rng, quality or Quality()
-        )
+        moments = self._moments(pose[None], rates, obstacles or {})[0]
+        sweep = self._sweeps(pose[None], rates)[0]
+        return LiveImages(self, moments, rng, quality or Quality(), sweep)
 
     def look_many(
         self,
@@ -113,7 +117,8 @@ class VirtualStereoCamera:
 
         Each exposure is taken as in ``look`` and has its own noise.
         """
-        return ManyLiveImages(self, self._moments(poses, pose_rates, obstacles), rngs)
+        moments = self._moments(poses, pose_rates, obstacles)
+        return ManyLiveImages(self, moments, rngs, self._sweeps(poses, pose_rates))
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
         """Return the cameras after changes (24,) of the rig's parameters.
@@ -130,18 +135,27 @@ class VirtualStereoCamera:
         corners: Sequence[NDArray[np.int_]],
         size: int,
         supersampling: int,
+        sweeps: Sequence[Array | None] | None = None,
     ) -> list[NDArray[np.float32]]:
         """Return the mean radiance (2, n, size, size) of windows over the moments of each exposure.
 
         For each exposure, the windows have first pixels ``corners`` (2, n, 2) in the left and the
-        right image. The first moments of all exposures are drawn together, then the second ones,
-        and so on. In this way no more memory is needed than without motion.
+        right image, and ``sweeps`` has those of ``row_sweeps``. The
+        first moments of all exposures are drawn together, then the second ones, and so on. In this
+        way no more memory is needed than without motion.
         """
-        light = self._drawn([first for first, *_ in moments], corners, size, supersampling)
+        swept_by = [None] * len(moments) if sweeps is None else sweeps
+        light = self._drawn(
+            [first for first, *_ in moments], corners, size, supersampling, swept_by
+        )
         for k in range(1, max(map(len, moments))):
             going = [n for n, own in enumerate(moments) if len(own) > k]
             drawn = self._drawn(
-                [moments[n][k] for n in going], [corners[n] for n in going], size, supersampling
+                [moments[n][k] for n in going],
+                [corners[n] for n in going],
+                size,
+                supersampling,
+                [swept_by[n] for n in going],
             )
             for n, more in zip(going, drawn, strict=True):
                 light[n] += more
@@ -156,6 +170,7 @@ class VirtualStereoCamera:
         corners: Sequence[NDArray[np.int_]],
         size: int,
         supersampling: int,
+        sweeps: Sequence[Array | None],
     ) -> list[NDArray[np.float32]]:
         """Return the radiance (2, n, size, size) of windows at one moment of each exposure.
 
@@ -167,6 +182,8 @@ class VirtualStereoCamera:
             for at, first in zip(placed, corners, strict=True)
             for side in zip(self.rig.cameras, at, first, strict=True)
         ]
+        if any(sweep is not None for sweep in sweeps):
+            return drawn_row_by_row(self.formation, sides, sweeps, size, supersampling)
         together = max(len(sides), 2) if self.formation.draws_pixels(self.rig.cameras) else 2
         windows = [
             window
@@ -177,11 +194,25 @@ class VirtualStereoCamera:
         ]
         return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]
 
+    def _sweeps(self, poses: Array, rates: Array | None) -> list[Array | None]:
+        """Return ``row_sweeps`` of a platform with poses (N, 6) that change at rates (N, 6)."""
+        if self.row_time == 0.0 or rates is None:
+            return [None] * len(poses)
+        return row_sweeps(poses, rates, self.row_time, self._from_base)
+
     def whole_exposure(
-        self, side: int, moments: Sequence[Array], supersampling: int
+        self,
+        side: int,
+        moments: Sequence[Array],
+        supersampling: int,
+        sweep: Array | None = None,
     ) -> NDArray[np.float32]:
-        """Return the mean radiance (height, width) of one whole image over all moments."""
-        return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
+        """Return the mean radiance (height, width) of one whole image over all moments.
+
+        ``sweep`` (2, 4, 4) is that of ``row_sweeps``.
+        """
+        own = None if sweep is None else sweep[side]
+        return whole_image(self.formation, self.rig.cameras[side], moments, supersampling, own)
 
     def centre_error_px(self, quality: Quality) -> float:
         """Return the error of a sticker's centre that drawing causes, px rms."""
@@ -282,18 +313,22 @@ class LiveImages:
         moments: Moments,
         rng: np.random.Generator,
         quality: Quality,
+        sweep: Array | None,
     ) -> None:
         self._camera = camera
         self._moments = moments
         self._rng = rng
         self._quality = quality
+        self._sweep = sweep
 
     def full(self) -> StereoFrame:
         """Return both whole images."""
         images = []
         for side, pattern in enumerate(self._camera.patterns):
             moments = [placed[side] for placed in self._moments]
-            radiance = self._camera.whole_exposure(side, moments, self._quality.supersampling)
+            radiance = self._camera.whole_exposure(
+                side, moments, self._quality.supersampling, self._sweep
+            )
             images.append(self._camera.noise.expose(radiance, self._rng, pattern))
         return StereoFrame(*images)
 
@@ -303,7 +338,7 @@ class LiveImages:
         The first pixels (2, n, 2) are (x, y).
         """
         (radiance,) = self._camera.radiances(
-            [self._moments], [corners], size, self._quality.supersampling
+            [self._moments], [corners], size, self._quality.supersampling, [self._sweep]
         )
         pattern = self._camera.pattern_in(corners, size)
         if self._quality.exposures == 1:
@@ -321,10 +356,12 @@ class ManyLiveImages:
         camera: VirtualStereoCamera,
         moments: Sequence[Moments],
         rngs: Sequence[np.random.Generator],
+        sweeps: Sequence[Array | None],
     ) -> None:
         self._camera = camera
         self._moments = moments
         self._rngs = rngs
+        self._sweeps = sweeps
 
     def windows_of(
         self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int
@@ -338,7 +375,11 @@ class ManyLiveImages:
         shown = np.unique(exposures)
         own = np.split(corners, np.searchsorted(exposures, shown[1:]), axis=1)
         drawn = camera.radiances(
-            [self._moments[k] for k in shown], own, size, Quality().supersampling
+            [self._moments[k] for k in shown],
+            own,
+            size,
+            Quality().supersampling,
+            [self._sweeps[k] for k in shown],
         )
         grey = [
             camera.noise.expose(light, self._rngs[k], camera.pattern_in(at, size))

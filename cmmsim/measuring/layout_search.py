@@ -53,6 +53,8 @@ SMALLEST_TRIANGLE = 0.002
 MOST_TOGETHER = 64
 # Share of the layout's stickers whose recognition ends the search.
 ENOUGH = 0.8
+# Blurs that are tried where a lens has depths out of focus, px.
+DEFOCUSED_PX = (0.2, 0.4, 0.6, 0.9)
 
 
 def bright_ellipses(
@@ -68,14 +70,30 @@ def bright_ellipses(
     limits = replace(settings.limits, largest_misfit=np.inf)
     found = []
     for image in (noise.bright(frame.left), noise.bright(frame.right)):
+        image = _without_ghost(image, observer)
         corners = np.rint(find_blobs(image, noise.white_level, size) - 0.5 * (size - 1)).astype(int)
         windows = cut_windows(image, corners, size)
-        found.append(
-            fit_ellipses(
-                windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px
-            )
-        )
+        spots = windows, corners, noise, settings.fit_size, limits
+        fits = fit_ellipses(*spots, psf_px=settings.optics.psf_px)
+        # Spots out of focus are fitted with the point spread that agrees best.
+        for blur in DEFOCUSED_PX if settings.optics.aperture > 0.0 else ():
+            others = fit_ellipses(*spots, psf_px=float(np.hypot(settings.optics.psf_px, blur)))
+            better = others.misfits < fits.misfits
+            fits = fits.with_others(np.flatnonzero(better), others, better)
+        found.append(fits)
     return found[0], found[1]
+
+
+def _without_ghost(image: GreyImage, observer: Observer) -> GreyImage:
+    """Return an image (height, width) without the lens's ghost, to first order."""
+    optics = observer.settings.optics
+    if optics.ghost == 0.0:
+        return image
+    x, y = optics.ghost_offset
+    light = image.astype(float) - observer.noise.black_level
+    clean = image - optics.ghost * np.roll(light, (y, x), axis=(0, 1))
+    grey = np.clip(np.rint(clean), 0, observer.noise.white_level)
+    return np.asarray(grey, dtype=observer.noise.image_type)
 
 
 def candidate_points(

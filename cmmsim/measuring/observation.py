@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
@@ -20,6 +21,7 @@ from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply_each
 from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.measuring.print_allowance import PrintAllowance
 from cmmsim.measuring.sticker_windows import StickerObservation, StickerWindows
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import ManyExposures, StereoImages, Windows
@@ -43,9 +45,11 @@ class DetectionSettings:
     detector         name of the detector
     optics           point spread and vignetting of the lenses
     exposed_share    ratio of exposure time to frame period
+    row_share        ratio of the time between two rows of pixels to the frame period
     line_error_px    standard deviation of an image's distance from its epipolar line that errors of
                      the rig cause; it increases the allowed distance between two rays
     dark             True for dark stickers in bright rings
+    allowed          what is allowed for by the print of the stickers
     """
 
     window_size: int = 16
@@ -57,8 +61,10 @@ class DetectionSettings:
     detector: str = DEFAULT_DETECTOR
     optics: Optics = field(default_factory=Optics)
     exposed_share: float = 0.0
+    row_share: float = 0.0
     line_error_px: float = 0.0
     dark: bool = False
+    allowed: PrintAllowance = field(default_factory=PrintAllowance)
 
 
 @runtime_checkable
@@ -97,13 +103,16 @@ class Observer:
         places: Array,
         normals: Array,
         exposure_ends: tuple[Array, Array] | None = None,
+        frame_ends: tuple[Array, Array] | None = None,
     ) -> StickerObservation:
         """Observe stickers of a body near an expected pose camera_from_body (4, 4).
 
         The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``exposure_ends``
         are the expected camera_from_body at the beginning and at the end of the exposure, or None.
+        ``frame_ends`` are the same half a frame period before and after its middle.
         """
-        return self.read(images, camera_from_body, places, normals).observed(exposure_ends)
+        read = self.read(images, camera_from_body, places, normals)
+        return read.observed(exposure_ends, frame_ends)
 
     def read(
         self,
@@ -134,9 +143,11 @@ class Observer:
             if isinstance(images, StickerExposure):
                 found = images.detected(corners, size, self)
             elif isinstance(images, ManyExposures):
-                windows = self.evenly_lit(images.windows_of(exposures, corners, size), corners)
+                many = images
+                windows = self._as_lit(lambda at: many.windows_of(exposures, at, size), corners)
             else:
-                windows = self.evenly_lit(images.windows(corners, size), corners)
+                one = images
+                windows = self._as_lit(lambda at: one.windows(at, size), corners)
             windows = self.upright.bright(windows)
             offsets = np.stack(
                 [
@@ -146,6 +157,22 @@ class Observer:
             )
         body = camera_from_body, places[index % len(places)], normals[index % len(places)]
         return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
+
+    def _as_lit(
+        self, read: Callable[[NDArray[np.int_]], Windows], corners: NDArray[np.int_]
+    ) -> Windows:
+        """Return windows without the lens's ghost and vignetting, to third order in the ghost.
+
+        ``read`` returns the windows with first pixels ``corners`` (2, n, 2).
+        """
+        windows = read(corners)
+        optics = self.settings.optics
+        if optics.ghost > 0.0:
+            for order in (1, 2, 3):
+                beside = read(corners - order * np.array(optics.ghost_offset))
+                light = np.asarray(beside - self.noise.black_level, dtype=float)
+                windows = np.asarray(windows + (-optics.ghost) ** order * light, dtype=float)
+        return self.evenly_lit(windows, corners)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
         """Return windows (2, n, size, size) in which vignetting has the same value as in the

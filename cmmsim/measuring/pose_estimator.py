@@ -15,6 +15,7 @@ from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, frames_of_points
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, poses_of, skew
 from cmmsim.geometry.registration import register
+from cmmsim.measuring.first_movement import frame_ends_of
 from cmmsim.measuring.frame_solver import SolvedFrames, consistent
 from cmmsim.measuring.layout_search import (
     ENOUGH,
@@ -171,30 +172,39 @@ class PoseEstimator(Observer):
         images: StereoImages,
         expected: Array,
         exposure_ends: tuple[Array, Array] | None = None,
+        frame_ends: tuple[Array, Array] | None = None,
     ) -> tuple[Measurement, Array]:
         """Return the measurement, and the measured camera_from_platform (4, 4).
 
         ``expected`` is a first guess of camera_from_platform. ``exposure_ends`` are the expected
-        transforms at the beginning and at the end of the exposure. Without ``exposure_ends`` and
-        without point spread, the error of the pose exceeds its covariance if stickers move by more
-        than half a pixel; use ``measure_anew`` in this case. Raises LostError.
+        transforms at the beginning and at the end of the exposure, and ``frame_ends`` half a frame
+        period before and after its middle, for rows that are not exposed at once. Without
+        ``exposure_ends`` and without point spread, the error of the pose exceeds its covariance if
+        stickers move by more than half a pixel; use ``measure_anew`` in this case. Raises
+        LostError.
         """
         return self.measured(
-            self.observe(images, expected, *self._stickers, exposure_ends), expected
+            self.observe(images, expected, *self._stickers, exposure_ends, frame_ends), expected
         )
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
-        """Measure as ``measure`` does, and estimate the movement during the exposure from streaks.
+        """Measure as ``measure`` does, and estimate the movement from this frame alone.
 
-        Raises LostError, which states the length of streaks if there are any.
+        Streaks tell of the movement during the exposure, and rows that are not exposed at once of
+        that between them. Raises LostError, which states the length of streaks if there are any.
         """
-        if self.settings.exposed_share == 0.0:
+        settings = self.settings
+        if settings.exposed_share == 0.0 and settings.row_share == 0.0:
             return self.measure(images, expected)
         read = self.read(images, expected, *self._stickers)
-        streaks = None if read.found is not None else find_streaks(read)
+        streaks = None
+        if read.found is None and settings.exposed_share > 0.0:
+            streaks = find_streaks(read)
+        frame_ends, factor = frame_ends_of(read) if settings.row_share > 0.0 else (None, 1.0)
         try:
-            seen = read.observed(None if streaks is None else streaks.exposure_ends)
-            return self.measured(seen, expected)
+            exposure_ends = None if streaks is None else streaks.exposure_ends
+            found, move = self.measured(read.observed(exposure_ends, frame_ends), expected)
+            return replace(found, covariance=factor * found.covariance), move
         except LostError as error:
             if streaks is None:
                 raise

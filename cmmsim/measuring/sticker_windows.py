@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from cmmsim.detection.detector import DetectedCentres, SpotWindows
 from cmmsim.detection.ellipse_fit import (
@@ -20,7 +19,8 @@ from cmmsim.detection.ellipse_fit import (
     EllipseFits,
     fit_ellipses,
 )
-from cmmsim.geometry.pose import Array, apply_each
+from cmmsim.geometry.disc_image import NARROWEST_PX
+from cmmsim.geometry.pose import Array, apply, apply_each
 from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.radiometry.stereo_images import Windows
 
@@ -30,12 +30,10 @@ if TYPE_CHECKING:
 # A smear is the movement of a sticker's image during the exposure. The longest smear that can be
 # measured is about the size of a sticker.
 LONGEST_SMEAR_PX = 8.0
+# Point spreads of stickers out of focus are rounded to multiples of this, which a fit can model.
+SPREAD_STEP_PX = 0.01
 # Shortest smear that changes the result of a fit, in standard deviations of the point spread.
 SHORTEST_SMEAR = 1.5
-# Probability that light across the stickers is fitted in an evenly lit frame, and the squared
-# movement of its pose, in units of noise, that this allows.
-LIGHT_CHANCE = 1e-4
-LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
 
 
 @dataclass(frozen=True)
@@ -112,8 +110,12 @@ class StickerWindows:
     offsets: Array
     found: DetectedCentres | None = None
 
-    def observed(self, exposure_ends: tuple[Array, Array] | None = None) -> StickerObservation:
-        """Return the stickers in these windows; see ``Observer.observe`` for ``exposure_ends``."""
+    def observed(
+        self,
+        exposure_ends: tuple[Array, Array] | None = None,
+        frame_ends: tuple[Array, Array] | None = None,
+    ) -> StickerObservation:
+        """Return the stickers in these windows; see ``Observer.observe`` for the parameters."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             pixels = none[:, :2]
@@ -122,14 +124,18 @@ class StickerWindows:
                 self.index, pixels, pixels, none, np.zeros((0, 3, 3)), each, each
             )
         settings = self.observer.settings
-        fits = self.found or self._detected()
+        fits = self.found or self.centres()
         smears = np.zeros((2, len(self.index), 2))
         if exposure_ends is not None and self.found is None:
             fits = self._more_likely(fits, exposure_ends, smears)
         if self.found is None and isinstance(fits, EllipseFits):
             fits = self._lit(fits, smears)
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
+        if settings.row_share > 0.0 and frame_ends is not None:
+            seen_at = seen_at - self._swept(frame_ends)
+        allowed = settings.allowed
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
+        systematic += allowed.changing_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
         # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
         # would be too near to the ray of the sharper image.
@@ -143,7 +149,7 @@ class StickerWindows:
         good = np.all(fits.good.reshape(2, -1), axis=0)
         # Mean variance over two coordinates in two images.
         noise = 0.25 * np.einsum("ckii->k", spread)
-        outlines = _outlines(fits, settings.centre_error_px**2)
+        outlines = _outlines(fits, settings.centre_error_px**2 + allowed.outline_px**2)
         found = StickerObservation(
             self.index, left, right, seen.points, seen.covariances, noise, seen.rays, outlines
         )
@@ -159,15 +165,41 @@ class StickerWindows:
         """
         settings = self.observer.settings
         limits = replace(settings.limits, largest_misfit=np.inf)
-        return fit_ellipses(
-            *self._flat,
-            self.observer.upright,
-            settings.fit_size,
-            limits,
-            psf_px=settings.optics.psf_px,
-            smears=smears,
-            lit=lit,
-        )
+        windows, corners = self._flat
+
+        def fit(own: NDArray[np.int_] | slice, psf_px: float) -> EllipseFits:
+            return fit_ellipses(
+                windows[own],
+                corners[own],
+                self.observer.upright,
+                settings.fit_size,
+                limits,
+                psf_px=psf_px,
+                smears=None if smears is None else smears[own],
+                lit=lit,
+            )
+
+        if settings.optics.aperture == 0.0:
+            return fit(slice(None), settings.optics.psf_px)
+        groups = [np.flatnonzero(self._spreads_px == psf) for psf in np.unique(self._spreads_px)]
+        fits = [fit(own, float(self._spreads_px[own[0]])) for own in groups]
+        order = np.argsort(np.concatenate(groups))
+        parts = zip(*(vars(each).values() for each in fits), strict=True)
+        return EllipseFits(*(np.concatenate(values)[order] for values in parts))
+
+    @cached_property
+    def _spreads_px(self) -> Array:
+        """Point spreads (2k,) px at the expected depths of the stickers, in steps."""
+        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
+        near = apply_each(moves, self.places[:, None])[:, 0]
+        spreads = [
+            self.observer.settings.optics.spreads_px(camera.focal_px, apply(move, near)[:, 2])
+            for camera, move in zip(
+                self.observer.rig.cameras, self.observer.rig.from_camera, strict=True
+            )
+        ]
+        steps = SPREAD_STEP_PX * np.round(np.concatenate(spreads) / SPREAD_STEP_PX)
+        return np.where(steps < NARROWEST_PX, 0.0, steps)
 
     @cached_property
     def ellipses_at_rest(self) -> EllipseFits:
@@ -177,7 +209,7 @@ class StickerWindows:
         """
         return self.ellipses()
 
-    def _detected(self, smears: Array | None = None) -> DetectedCentres:
+    def centres(self, smears: Array | None = None) -> DetectedCentres:
         """Return the centres that the detector finds in the windows."""
         detector = self.observer.detector
         noise = self.observer.upright
@@ -219,7 +251,7 @@ class StickerWindows:
             np.searchsorted(self.exposures[good], exposures),
             sizes,
         )
-        shown = (sizes > LARGEST_LIGHT)[self.exposures]
+        shown = (sizes > self.observer.settings.allowed.largest_light)[self.exposures]
         if not shown.any():
             return even
         part = self._selected(shown)
@@ -242,7 +274,7 @@ class StickerWindows:
         smears, shown = self._smears(exposure_ends)
         if still.misfits is None or not shown.any():
             return still
-        moving = self._selected(shown)._detected(smears[:, shown].reshape(-1, 2))
+        moving = self._selected(shown).centres(smears[:, shown].reshape(-1, 2))
         again = np.tile(shown, 2)
         if moving.misfits is None:
             return still
@@ -261,15 +293,34 @@ class StickerWindows:
         The mask is False for exposures in which the longest movement is too short compared with the
         point spread, or too long to be measured.
         """
-        moves = (pose.reshape(-1, 4, 4)[self.exposures] for pose in exposure_ends)
-        first, last = (
-            self.observer.rig.project(apply_each(move, self.places[:, None])[:, 0])[0]
-            for move in moves
-        )
+        moved = self._moved(exposure_ends)
         shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
         longest = np.zeros(self.exposures[-1] + 1)
-        np.maximum.at(longest, self.exposures, np.linalg.norm(last - first, axis=-1).max(axis=0))
-        return last - first, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
+        np.maximum.at(longest, self.exposures, np.linalg.norm(moved, axis=-1).max(axis=0))
+        return moved, ((shortest < longest) & (longest < LONGEST_SMEAR_PX))[self.exposures]
+
+    def _moved(self, ends: tuple[Array, Array]) -> Array:
+        """Return the stickers' movements (2, k, 2) px between two camera_from_body."""
+        first, last = (
+            self.observer.rig.project(
+                apply_each(pose.reshape(-1, 4, 4)[self.exposures], self.places[:, None])[:, 0]
+            )[0]
+            for pose in ends
+        )
+        return np.asarray(last - first)
+
+    def _swept(self, frame_ends: tuple[Array, Array]) -> Array:
+        """Return the stickers' movements (2, k, 2) px from the exposure of the middle row to that
+        of their own.
+        """
+        return np.asarray(self.late()[..., None] * self._moved(frame_ends))
+
+    def late(self) -> Array:
+        """Return the delays (2, k) of the stickers' rows after the middle row, in frame periods."""
+        rows = self.corners[..., 1] + 0.5 * (self.windows.shape[-1] - 1)
+        middles = [0.5 * (camera.height - 1) for camera in self.observer.rig.cameras]
+        share = self.observer.settings.row_share
+        return np.asarray(share * (rows - np.array(middles)[:, None]))
 
     def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
         """Return the windows of only some of the stickers."""

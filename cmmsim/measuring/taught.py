@@ -173,7 +173,11 @@ def setup_of(file: SensorFile) -> str:
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")
     }
     stickers = file.stickers.model_dump(include={"placement", "placement_seed"})
-    return json.dumps({"rig": rig, "stickers": stickers, **bodies}, sort_keys=True)
+    entries = {"rig": rig, "stickers": stickers, **bodies}
+    # Print moves the taught places. Earlier results have no print.
+    if not file.print.is_perfect:
+        entries["print"] = file.print.model_dump(exclude={"known"})
+    return json.dumps(entries, sort_keys=True)
 
 
 def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:

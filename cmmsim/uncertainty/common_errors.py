@@ -2,7 +2,8 @@
 
 The noise of a measured pose is new in every frame. Other errors are constant during a run, because
 they come from parameters that the estimator assumes to be exact: the rig (24 numbers), the taught
-frames of base and platform (12), and the time at which the right camera exposes (1).
+frames of base and platform (12), thickness and retro-reflection of the stickers (2), and the
+time at which the right camera exposes (1).
 
 To first order, these errors d change a measured pose by J(pose) d. J is computed without images:
 sticker centres are projected through a rig with errors and triangulated with the known rig.
@@ -35,14 +36,17 @@ from cmmsim.geometry.pose import (
     transforms_of,
 )
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig, triangulate
+from cmmsim.measuring.constellation import platform_places
 from cmmsim.measuring.observation import faces_camera
 from cmmsim.measuring.pose_estimator import frames_by_planes
 from cmmsim.measuring.taught import Taught
-from cmmsim.teaching import platform_places, teaching_path
+from cmmsim.teaching import teaching_path
+from cmmsim.uncertainty.print_errors import PRINT_NAMES, PrintErrors
 
 NAMES = (
     *PARAMETER_NAMES,
     *(f"taught.{body}.{name}" for body in ("base", "platform") for name in PLACE_NAMES),
+    *PRINT_NAMES,
     "exposure.right_later_s",
 )
 """Names of all common errors.
@@ -81,13 +85,17 @@ class CommonErrors:
 
 @dataclass(frozen=True)
 class MeasuringGeometry:
-    """Geometry as an estimator knows it. ``home`` (6,) is the pose of the platform at teaching."""
+    """Geometry as an estimator knows it. ``home`` (6,) is the pose of the platform at teaching.
+
+    ``print`` has the errors of the stickers' print; None if they count as perfect.
+    """
 
     rig: StereoRig
     platform: MarkedBody
     base: MarkedBody
     taught: Taught
     home: Array
+    print: PrintErrors | None = None
 
     @property
     def camera_from_base(self) -> Array:
@@ -124,12 +132,19 @@ class MeasuringGeometry:
             rig_covariance,
             self.taught.base_covariance,
             self.taught.platform_covariance,
+            np.zeros((2, 2)) if self.print is None else np.diag(self.print.std**2),
             exposure_std**2,
         )
         kept = np.flatnonzero(np.diag(covariance) > 0.0)
         view = _view(self, transforms_of(poses))
         small = np.concatenate(
-            [self._by_rig(view), view.by_taught_frames(), view.by_delay(poses, rates)], axis=2
+            [
+                self._by_rig(view),
+                view.by_taught_frames(),
+                self._by_print(view),
+                view.by_delay(poses, rates),
+            ],
+            axis=2,
         )
         changes = np.stack([pose_jacobian(pose) for pose in poses]) @ small[:, :, kept]
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
@@ -166,19 +181,72 @@ class MeasuringGeometry:
         )
         return errors, (places[0] - places[1]) / twice[:, None, None]
 
+    def _by_print(self, view: _View) -> Array:
+        """Return the small errors (N, 6, 2) of base_from_platform per m of the print's errors."""
+        if self.print is None:
+            return np.zeros((len(view.frames), 6, 2))
+        frames, places = self._taught_by_print(self.print)
+        camera_from_platform = self.camera_from_base @ view.frames
+        pixels = self.print.shifts(
+            self.rig, camera_from_platform, self.taught.platform_places, self.platform
+        )
+        points = view.points_by_pixels(pixels[:, :, view.seen]) - view.points_by_places(places)
+        std = self.print.std
+        return (view.registered(points) + view.levers @ frames) / np.where(std > 0.0, std, 1.0)
+
+    def _taught_by_print(self, print_errors: PrintErrors) -> tuple[Array, Array]:
+        """Errors of teaching per standard deviation of the print's errors.
+
+        The results are as those of ``taught_by_rig``, (6, 2) and (2, n, 3). They are zero if the
+        sensor was not taught by images.
+        """
+        if not self.taught.place_covariances.any():
+            return np.zeros((6, 2)), np.zeros((2, *self.taught.platform_places.shape))
+        base, path, points = self._teaching_points
+        shifts = np.concatenate(
+            [
+                print_errors.shifts(
+                    self.rig, self.camera_from_base[None], self.taught.base_places, self.base
+                ).reshape(2, len(base), 2, 2),
+                print_errors.shifts(
+                    self.rig, path, self.taught.platform_places, self.platform
+                ).reshape(2, -1, 2, 2),
+            ],
+            axis=1,
+        )
+        moved = np.moveaxis(np.concatenate([0.5 * shifts, -0.5 * shifts], axis=-1), -1, 1)
+        frames, places = self._taught_from(self.rig.project(points)[0][:, None] + moved, points)
+        errors = [_small_error(frames[k], frames[2 + k]) for k in range(2)]
+        return np.stack(errors, axis=1), places[:2] - places[2:]
+
+    @property
+    def _teaching_points(self) -> tuple[Array, Array, Array]:
+        """Stickers of the base (b, 3), camera_from_platform (v, 4, 4) on the path of teaching, and
+        all points (m, 3) that teaching sees: those of the base, then those of each view.
+        """
+        path = self.camera_from_base @ transforms_of(teaching_path(self.home, TEACHING_POSES))
+        base = apply(self.camera_from_base, self.taught.base_places)
+        views = apply_each(path, self.taught.platform_places)
+        return base, path, np.concatenate([base, views.reshape(-1, 3)])
+
     def _teach(self, true: Sequence[StereoRig]) -> tuple[Array, Array]:
         """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) from r teachings.
 
         In each teaching, one of the rigs ``true`` forms the images without noise, and the known rig
         measures them.
         """
-        path = transforms_of(teaching_path(self.home, TEACHING_POSES))
-        places = self.taught.platform_places
-        base = apply(self.camera_from_base, self.taught.base_places)
-        views = apply_each(self.camera_from_base @ path, places)
-        points, covariances = self._observed(true, np.concatenate([base, views.reshape(-1, 3)]))
-        split = len(base)
-        of_views = (len(true), *views.shape)
+        points = self._teaching_points[2]
+        return self._taught_from(np.stack([rig.project(points)[0] for rig in true], axis=1), points)
+
+    def _taught_from(self, pixels: Array, near: Array) -> tuple[Array, Array]:
+        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) from r teachings.
+
+        Each teaching sees the points ``near`` (m, 3) of ``_teaching_points`` at ``pixels``
+        (2, r, m, 2).
+        """
+        points, covariances = self._observed(pixels, near)
+        split = len(self.taught.base_places)
+        of_views = (len(points), TEACHING_POSES, *self.taught.platform_places.shape)
         rough_normals = self.base.normals @ self.camera_from_base[:3, :3].T
         camera_from_base = frames_by_planes(
             self.base, points[:, :split], covariances[:, :split], rough_normals
@@ -189,17 +257,16 @@ class MeasuringGeometry:
             covariances[:, split:].reshape(*of_views, 3),
         )
 
-    def _observed(self, true: Sequence[StereoRig], points: Array) -> tuple[Array, Array]:
-        """Return points (r, n, 3), and covariances (r, n, 3, 3) per px² of noise.
+    def _observed(self, pixels: Array, near: Array) -> tuple[Array, Array]:
+        """Return points (r, m, 3), and covariances (r, m, 3, 3) per px² of noise.
 
-        Each of the rigs ``true`` sees the points (n, 3) in the camera frame, and the known rig
-        triangulates them.
+        The known rig triangulates ``pixels`` (2, r, m, 2) of points near ``near`` (m, 3).
         """
-        pixels = np.stack([rig.project(points)[0] for rig in true], axis=1).reshape(2, -1, 2)
-        spread = np.broadcast_to(np.eye(2), (*pixels.shape[:2], 2, 2))
-        near = np.tile(points, (len(true), 1))
-        triangulated = triangulate(self.rig, pixels[0], pixels[1], spread[0], spread[1], near)
-        shape = (len(true), *points.shape)
+        flat = pixels.reshape(2, -1, 2)
+        spread = np.broadcast_to(np.eye(2), (*flat.shape[:2], 2, 2))
+        around = np.tile(near, (pixels.shape[1], 1))
+        triangulated = triangulate(self.rig, flat[0], flat[1], spread[0], spread[1], around)
+        shape = (*pixels.shape[1:3], 3)
         return triangulated.points.reshape(shape), triangulated.covariances.reshape(*shape, 3)
 
 
@@ -248,11 +315,11 @@ class _View:
         )
         pixels = np.zeros((*self.slopes.shape[:-1], 1))
         pixels[1, ..., 0] = np.einsum("nmij,nmj->nmi", self.slopes[1], velocities)
-        return self.registered(self._points(pixels))
+        return self.registered(self.points_by_pixels(pixels))
 
     def points_by_rig(self) -> Array:
         """Return the changes (N, n, 3, 24) of triangulated points per unit of the rig's errors."""
-        return self._points(self.by_rig)
+        return self.points_by_pixels(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
         """Return the changes (N, n, 3, 24) of expected points per unit of the rig's errors.
@@ -282,7 +349,7 @@ class _View:
         """Information matrix (N, n, 3, 3) of each point for pixel noise of 1 px²."""
         return np.einsum("cnmki,cnmkj->nmij", self.slopes, self.slopes)
 
-    def _points(self, pixels: Array) -> Array:
+    def points_by_pixels(self, pixels: Array) -> Array:
         """Return changes (N, n, 3, p) of triangulated points.
 
         ``pixels`` (2, N, n, 2, p) are the changes of their pixels.

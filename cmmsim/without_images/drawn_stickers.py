@@ -26,6 +26,7 @@ from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import curvature_shift, distort_outlines, project_discs
 from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.sticker_print import PrintSizes, SeenStickers
 from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies
 from cmmsim.imaging.stereo_camera import Quality
@@ -54,11 +55,15 @@ ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
 
 @dataclass(frozen=True)
 class Light:
-    """Radiances, 0 to 1, of stickers and of their rings, and the properties of the lens."""
+    """Radiances, 0 to 1, of stickers and of their rings, and the properties of the lens.
+
+    ``print`` has thickness and retro-shift of the stickers.
+    """
 
     sticker: float
     ring: float
     optics: Optics
+    print: PrintSizes
 
 
 def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
@@ -69,6 +74,16 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
     low, high = (float(np.sqrt(noise.variance(np.array(grey)))) for grey in (ring, bright))
     stickers = file.stickers
     detector = file.detection.detector
+    others = {
+        "print.unevenness": file.print.unevenness,
+        "print.outline": file.print.outline,
+        "light.lamps": len(file.light.lamps),
+        "light.fall_off": file.light.fall_off,
+        "light.clutter": file.light.clutter,
+        "lens.aperture": file.lens.aperture,
+        "lens.ghost": file.lens.ghost,
+        "timing.row_time": file.timing.row_time,
+    }
     wrong = [
         (detector != DEFAULT_DETECTOR, f"detection.detector {detector!r}", DEFAULT_DETECTOR),
         (stickers.dark, "dark stickers", "bright ones in dark rings"),
@@ -85,6 +100,7 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
         (stickers.ring_radius < RING_REACH * stickers.radius, "stickers.ring_radius "
                                                               f"{stickers.ring_radius:g} m",
          f"at least {RING_REACH:g} times radius {stickers.radius:g} m"),
+        *((value != 0, f"{key} {value:g}", "0") for key, value in others.items()),
     ]  # fmt: skip
     for refused, what, needed in wrong:
         if refused:
@@ -217,6 +233,12 @@ class StatisticalStereoCamera:
         facing &= np.isfinite(shapes).all(axis=(1, 2))
         middles = np.where(facing[:, None], middles, 0.0)
         shapes = np.where(facing[:, None, None], shapes, np.eye(2))
+        printed = self.light.print
+        if printed.thickness or printed.retro_shift:
+            seen = SeenStickers.through(
+                camera.focal_lengths, places[facing], normals[facing], self.scene.radius
+            )
+            middles[facing] += seen.shifts_of_kind(printed).sum(axis=-1)
         if not camera.distortion.is_zero:
             holds = camera.distort(middles)[1]
             shift = curvature_shift(camera, middles, shapes)

@@ -8,8 +8,9 @@ import pytest
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.disc_image import coverage
-from cmmsim.imaging.formation import ImageFormation, Side, exposed_windows
+from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.stereo_camera import LARGEST_STEP_PX, sub_frame_poses
+from cmmsim.imaging.whole_image import exposed_windows
 from tests.cmmsim.sensors import (
     CROPPED,
     NOISE,

@@ -110,7 +110,11 @@ def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     without |= {
         f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")
     }
-    sections = ("timing", "rig", "camera", "lens", "stickers")
+    without |= {"lens.ghost", "lens.known", "light.ambient", "light.fall_off"}
+    without |= {"light.lamps.direction", "light.lamps.strength"}
+    without |= {f"light.clutter{what}" for what in ("", "_level", "_seed")}
+    without |= {f"print.{what}" for what in ("rim_level", "unevenness", "seed", "known")}
+    sections = ("timing", "rig", "camera", "lens", "light", "print", "stickers")
     fields = {path: field for path, field in valid_keys(None).items() if path.startswith("sensor.")}
     keys = {path.removeprefix("sensor.") for path in fields}
     units = {key: factor_unit(f"sensor.{key}") for key in keys if key.partition(".")[0] in sections}

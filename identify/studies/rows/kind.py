@@ -91,6 +91,8 @@ SENSOR = (
     "sensor.rig.",
     "sensor.camera.",
     "sensor.lens.",
+    "sensor.light.",
+    "sensor.print.",
     "sensor.detection.",
     "sensor.stickers.",
     "sensor.platform.",

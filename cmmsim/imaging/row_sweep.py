@@ -1,0 +1,75 @@
+"""Exposure of an image row after row, as by a rolling shutter.
+
+A pose belongs to the middle row of an image. Each window is drawn as the platform stands when the
+middle row of the window is exposed. The platform hardly moves while the few rows of a window are
+exposed.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, transforms_of
+from cmmsim.imaging.formation import ImageFormation, Side
+
+# Number of rows over which the movement of a platform is divided, for its change a row.
+SWEPT_ROWS = 100.0
+
+
+def row_sweeps(
+    poses: Array, rates: Array, row_time: float, from_base: Sequence[Array]
+) -> list[Array | None]:
+    """Return the changes (2, 4, 4) of camera_from_platform from one row to the next.
+
+    The platform has poses (N, 6) that change at rates (N, 6), and a row is exposed ``row_time`` s
+    after the row above it. ``from_base`` are camera_from_base (4, 4) of both cameras. The change is
+    None for a platform at rest.
+    """
+    ahead, behind = (
+        transforms_of(poses + sign * 0.5 * SWEPT_ROWS * row_time * rates) for sign in (1.0, -1.0)
+    )
+    steps = (ahead - behind) / SWEPT_ROWS
+    sweeps = np.stack([camera @ steps for camera in from_base], axis=1)
+    return [sweep if sweep.any() else None for sweep in sweeps]
+
+
+def swept(
+    camera: PinholeCamera, bodies: Array, sweep: Array | None, first_row: int, size: int
+) -> Array:
+    """Return camera_from_body (b, 4, 4) when the middle row of a window is exposed.
+
+    ``bodies`` (b, 4, 4) belong to the middle row of the image. ``sweep`` (4, 4) is the change of
+    the first body's transform from one row to the next, or None. The window begins at
+    ``first_row`` and has ``size`` rows.
+    """
+    if sweep is None:
+        return bodies
+    moved = bodies.copy()
+    moved[0] += (first_row + 0.5 * (size - 1) - 0.5 * (camera.height - 1)) * sweep
+    return moved
+
+
+def drawn_row_by_row(
+    formation: ImageFormation,
+    sides: Sequence[Side],
+    sweeps: Sequence[Array | None],
+    size: int,
+    supersampling: int,
+) -> list[NDArray[np.float32]]:
+    """Return the radiance (2, n, size, size) of windows of each exposure.
+
+    ``sides`` are the left and the right side of each exposure, and ``sweeps`` the changes (2, 4, 4)
+    of ``row_sweeps``.
+    """
+    windows = []
+    for k, side in enumerate(sides):
+        sweep = sweeps[k // 2]
+        own = None if sweep is None else sweep[k % 2]
+        parts = [
+            Side(side.camera, swept(side.camera, side.bodies, own, at[1], size), at[None])
+            for at in side.corners
+        ]
+        windows.append(np.concatenate(formation.windows(parts, size, supersampling)))
+    return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]

@@ -1,0 +1,83 @@
+"""Constellation of a body's stickers: the mean of many views, and the frame that it teaches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cmmsim.files.rig_and_bodies import MarkedBody
+from cmmsim.geometry.pose import Array, apply, apply_each, compose_covariance, invert
+from cmmsim.geometry.registration import register, register_sets
+from cmmsim.measuring.pose_estimator import by_planes, frames_by_planes
+from cmmsim.measuring.sticker_windows import StickerObservation
+
+
+def platform_frame(
+    platform: MarkedBody, seen: list[StickerObservation], constant: Array
+) -> tuple[Array, Array, Array]:
+    """Return sticker places (n, 3) on the platform with their covariances (n, 3, 3).
+
+    The third result is the covariance (6, 6) of the platform frame. Each view must contain all
+    stickers. ``constant`` (n, 3, 3) are the covariances of what all views have in common.
+    """
+    views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
+    mean, covariances = mean_constellation(*views)
+    covariances = covariances + constant
+    rough_normals = plane_normals(platform, register(platform.nominal, mean, covariances).transform)
+    whole = replace(seen[0], points=mean, covariances=covariances)
+    mean_from_body, frame_covariance, _ = by_planes(whole, platform, rough_normals)
+    body_from_mean = invert(mean_from_body)
+    turn = body_from_mean[:3, :3]
+    return (
+        apply(body_from_mean, mean),
+        turn @ covariances @ turn.T,
+        compose_covariance(body_from_mean, frame_covariance),
+    )
+
+
+def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
+    """Return the sticker places (c, n, 3) of c teachings; ``platform_frame`` does so for one.
+
+    Each teaching has v views of the stickers, at points (c, v, n, 3) with covariances (c, v, n, 3,
+    3).
+    """
+    mean, covariances = mean_constellation(points, covariances)
+    rough_normals = plane_normals(
+        platform, register_sets(platform.nominal, mean, covariances).transform
+    )
+    return apply_each(invert(frames_by_planes(platform, mean, covariances, rough_normals)), mean)
+
+
+def plane_normals(body: MarkedBody, camera_from_body: Array) -> Array:
+    """Return the normals (..., 3, 3) of a body's planes in the camera frame.
+
+    The body stands at camera_from_body (..., 4, 4).
+    """
+    return np.asarray(body.normals @ camera_from_body[..., :3, :3].swapaxes(-1, -2))
+
+
+def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
+    """Return the weighted mean (..., n, 3) of v views of the same stickers, laid onto each other.
+
+    The mean has about the place and orientation of the first view. The second result contains the
+    covariances (..., n, 3, 3) of the mean. Views are points (..., v, n, 3) with covariances (...,
+    v, n, 3, 3).
+    """
+    weights = np.linalg.inv(covariances)
+    mean = points[..., 0, :, :]
+    spread = covariances[..., 0, :, :, :]
+    # Mean and transforms depend on each other, because the weights rotate with the views. Three
+    # alternating steps are enough for convergence.
+    for _ in range(3):
+        sets = np.broadcast_to(mean[..., None, :, :], points.shape).reshape(-1, *points.shape[-2:])
+        found = register_sets(
+            sets, points.reshape(sets.shape), covariances.reshape(*sets.shape, 3)
+        ).transform
+        to_mean = invert(found).reshape(*points.shape[:-2], 4, 4)
+        turn = to_mean[..., None, :3, :3]
+        turned = turn @ weights @ turn.swapaxes(-1, -2)
+        weighted = (turned @ apply_each(to_mean, points)[..., None]).sum(axis=-4)
+        spread = np.linalg.inv(turned.sum(axis=-4))
+        mean = (spread @ weighted)[..., 0]
+    return mean, spread

@@ -1,0 +1,91 @@
+"""What a fit of stickers allows for if their print is not perfect.
+
+Uneven print and outlines that are not round move a sticker's centre. Most of this is the same in
+all frames, and in the taught places of the stickers as well. The rest changes with the place of the
+centre within a pixel, as noise does. The factors below were found from images without noise, with
+stickers of 3 to 4 px radius.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from cmmsim.detection.detector import FitLimits
+from cmmsim.files.printed import print_sizes
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.pose import Array
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.radiometry.noise import CameraNoise
+
+# Probability that light across the stickers is fitted in an evenly lit frame, and the squared
+# movement of its pose, in units of noise, that this allows.
+LIGHT_CHANCE = 1e-4
+LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
+# px of errors of a centre for an unevenness of 1, and for an outline that is off by 1 px. Those
+# that change within a pixel are smaller with a point spread.
+CONSTANT = (0.04, 0.08)
+CHANGING = (0.12, 0.10)
+CHANGING_BLURRED = (0.04, 0.03)
+# px of errors of the entries of an ellipse's matrix for an unevenness of 1, an outline that is off
+# by 1 px, and a rim of 1 px.
+SHAPE = (0.5, 0.8, 0.7)
+# Ratio of the largest misfit that print causes to the mean one.
+MISFIT_SPREAD = 4.0
+
+
+@dataclass(frozen=True)
+class PrintAllowance:
+    """Sizes of what print causes, and limits that follow from them.
+
+    constant_px     rms of errors of a centre that are the same in all frames, px
+    changing_px     rms of errors of a centre that change from frame to frame, px
+    outline_px      rms of errors of the entries of an ellipse's matrix, px
+    largest_misfit  largest accepted reduced chi-square
+    largest_light   light that rises across the stickers is fitted in exposures in which it would
+                    move the pose by more than this, as a squared movement in units of noise
+    known           True if print is not perfect, and its sizes are known
+    """
+
+    constant_px: float = 0.0
+    changing_px: float = 0.0
+    outline_px: float = 0.0
+    largest_misfit: float = FitLimits.largest_misfit
+    largest_light: float = LARGEST_LIGHT
+    known: bool = False
+
+    def constant_covariances(self, rig: StereoRig, points: Array) -> Array:
+        """Return the covariances (n, 3, 3) of points (n, 3) due to constant errors of centres."""
+        slopes = rig.derivatives(points)[0].reshape(2, len(points), 2, 3)
+        known = np.einsum("cnki,cnkj->nij", slopes, slopes)
+        return np.asarray(self.constant_px**2 * np.linalg.inv(known))
+
+
+def print_allowance(
+    file: SensorFile, noise: CameraNoise, radius_px: float, fit_size: int
+) -> PrintAllowance:
+    """Return the allowance of an estimator that knows the sizes of its stickers' print.
+
+    ``radius_px`` is the radius of a sticker in the image, and ``fit_size`` the side of the fitted
+    part of a window, px. Uneven print is fitted as light that rises.
+    """
+    if file.print.is_perfect or not file.print.known:
+        return PrintAllowance()
+    sizes = print_sizes(file)
+    both = np.array([sizes.unevenness, sizes.outline * radius_px])
+    rim = sizes.thickness * sizes.rim * radius_px
+    bright = float(noise.mean_grey(np.array(file.stickers.sticker_level / 255.0)))
+    share = np.pi * radius_px**2 / fit_size**2
+    # Squared differences from the model on the sticker, and at its rim of one pixel width.
+    misfit = share * (both[0] ** 2 + 2.0 / radius_px * (both[1] ** 2 + rim**2))
+    misfit *= (bright - noise.black_level) ** 2 / float(noise.variance(np.array(bright)))
+    return PrintAllowance(
+        float(np.linalg.norm(CONSTANT * both)),
+        float(np.linalg.norm((CHANGING_BLURRED if file.lens.psf_px > 0.0 else CHANGING) * both)),
+        float(np.linalg.norm(np.multiply(SHAPE, [*both, rim]))),
+        FitLimits.largest_misfit + MISFIT_SPREAD * misfit,
+        0.0 if both.any() else LARGEST_LIGHT,
+        known=True,
+    )

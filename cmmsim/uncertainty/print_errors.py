@@ -1,0 +1,80 @@
+"""Errors of sticker centres by the thickness and the retro-reflection of all stickers.
+
+The estimator knows the sizes of these errors, but not their values. They depend on the angle of
+view alone, so they are the same in all frames from the same view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmmsim.files.printed import print_sizes
+from cmmsim.files.rig_and_bodies import MarkedBody
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.pose import Array, apply_each
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.sticker_print import PrintSizes, SeenStickers
+
+PRINT_NAMES = ("taught.stickers.thickness_m", "taught.stickers.retro_shift_m")
+
+
+@dataclass(frozen=True)
+class PrintErrors:
+    """Sizes of the errors of all stickers, and the radius of the stickers, m."""
+
+    sizes: PrintSizes
+    radius: float
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (2,) of thickness and retro-shift, m."""
+        return self.radius * np.abs([self.sizes.thickness, self.sizes.retro_shift])
+
+    def shifts(
+        self, rig: StereoRig, camera_from_body: Array, places: Array, body: MarkedBody
+    ) -> Array:
+        """Return the shifts (2, N, n, 2, 2) px of the centres of stickers in both images.
+
+        The last axis is the error, of the size of one standard deviation. The body stands at
+        camera_from_body (N, 4, 4), and its stickers lie at ``places`` (n, 3).
+        """
+        turns = camera_from_body[:, None, :3, :3]
+        points = apply_each(camera_from_body, places)
+        normals = (turns @ body.sticker_normals[..., None])[..., 0]
+        axes = turns @ body.in_plane
+        flat = points.reshape(-1, 3)
+        slopes = rig.derivatives(flat)[0].reshape(2, *points.shape[:2], 2, 3)
+        return np.stack(
+            [
+                self._seen(points - eye, normals, axes, slope)
+                for eye, slope in zip(_eyes(rig), slopes, strict=True)
+            ]
+        )
+
+    def _seen(self, rays: Array, normals: Array, axes: Array, slopes: Array) -> Array:
+        """Return the shifts (N, n, 2, 2) px in the image of one camera."""
+        shape = rays.shape[:2]
+        seen = SeenStickers.of(
+            rays.reshape(-1, 3),
+            normals.reshape(-1, 3),
+            axes.reshape(-1, 3, 2),
+            self.radius,
+            slopes.reshape(-1, 2, 3),
+        )
+        return seen.shifts_of_kind(self.sizes).reshape(*shape, 2, 2)
+
+
+def known_errors(file: SensorFile) -> PrintErrors | None:
+    """Return the errors by print of which an estimator with this sensor file knows, or None."""
+    sizes = print_sizes(file)
+    if file.print.known and (sizes.thickness or sizes.retro_shift):
+        return PrintErrors(sizes, file.stickers.radius)
+    return None
+
+
+def _eyes(rig: StereoRig) -> Sequence[Array]:
+    """Return the centres (3,) of both cameras in the camera frame."""
+    return [-move[:3, :3].T @ move[:3, 3] for move in rig.from_camera]
