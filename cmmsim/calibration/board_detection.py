@@ -26,6 +26,7 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.square_detection import find_charuco, find_chessboard
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.detection.tags import find_tags
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
@@ -101,6 +102,12 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
         found = find_charuco(grey, board)
     else:
         found, radius = find_dots(grey, board) or (None, None)
+    if found is None and board.kind == "charuco":
+        count = len(find_tags(grey, board.markers, "none"))
+        return (
+            f"no charuco of {board.columns} x {board.rows} corners found, but {count} markers of "
+            f"{board.dictionary}"
+        )
     if found is None:
         return f"no {board.kind} of {board.columns} x {board.rows} found"
     measured = np.isfinite(found).all(axis=1)
