@@ -76,7 +76,7 @@ def test_the_prediction_goes_on_through_missed_frames():
         return pose_to_transform([1e-3 * frame, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     class Estimator(PoseEstimator):
-        settings = SimpleNamespace(exposed_share=0.0)
+        settings = SimpleNamespace(exposed_share=0.0, row_share=0.0)
 
         def __init__(self):
             pass
@@ -84,8 +84,8 @@ def test_the_prediction_goes_on_through_missed_frames():
         def locate(self, images):
             return at(images.number)
 
-        def measure(self, images, predicted, exposure_ends=None):
-            assert exposure_ends is None
+        def measure(self, images, predicted, exposure_ends=None, frame_ends=None):
+            assert exposure_ends is frame_ends is None
             expected.append(predicted[0, 3])
             return lost_measurement("stands for a good one"), at(images.number)
 
