@@ -25,8 +25,11 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 LARGEST_SIZE = 10.0
 # Largest ratio of a mesh's length to the largest distance between its stickers.
 LARGEST_SIZE_RATIO = 100.0
+# Smallest ratio of a mesh's length to the largest distance between its stickers.
+SMALLEST_SIZE_RATIO = 0.3
 # m: depth below the surface up to which the body does not hide the dark ring of a sticker.
 LARGEST_DEPTH = 0.0002
+REMEDY = "; {}.drop = true moves the planes of stickers onto the surface"
 # Fraction of a triangle by which a line may miss it, so that no line passes between two triangles.
 EDGE_TOLERANCE = 1e-6
 
@@ -85,7 +88,8 @@ def with_meshes(file: SensorFile, source: str) -> SensorFile:
             mesh = read_mesh(section, name)
             require_size(mesh, section, name)
             on_mesh = _dropped(mesh, section, name) if section.drop else section
-            _require_on_surface(mesh, marked_body(name, on_mesh), file.stickers.radius)
+            remedy = "" if section.drop else REMEDY.format(name)
+            _require_on_surface(mesh, marked_body(name, on_mesh), file.stickers.radius, remedy)
         except SensorFileError as error:
             raise SensorFileError(f"{source}: {error}") from error
         changes[name] = on_mesh
@@ -93,11 +97,16 @@ def with_meshes(file: SensorFile, source: str) -> SensorFile:
 
 
 def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
-    """Raise SensorFileError if a mesh is so large that its unit is probably wrong."""
+    """Raise SensorFileError if a mesh is so large or small that its unit is probably wrong."""
     places = marked_body(name, section).nominal
     reach = float(np.linalg.norm(np.ptp(places, axis=0)))
     size = float(np.max(mesh.extents))
     largest = min(LARGEST_SIZE, LARGEST_SIZE_RATIO * reach)
+    if size < SMALLEST_SIZE_RATIO * reach:
+        raise SensorFileError(
+            f"{name}.mesh {section.mesh} is {size:.3g} m long, and its stickers reach over "
+            f"{reach:.3g} m: is {name}.mesh_unit = '{section.mesh_unit}' its unit?"
+        )
     if size <= largest:
         return
     raise SensorFileError(
@@ -156,8 +165,13 @@ def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
     return section.model_copy(update={"planes": section.planes.model_copy(update=planes)})
 
 
-def _require_on_surface(mesh: trimesh.Trimesh, body: MarkedBody, radius: float) -> None:
-    """Raise SensorFileError, with a name, unless all stickers lie on the surface of a mesh."""
+def _require_on_surface(
+    mesh: trimesh.Trimesh, body: MarkedBody, radius: float, remedy: str
+) -> None:
+    """Raise SensorFileError unless all stickers lie on the surface of a mesh.
+
+    The message has the name of a sticker, and the remedy.
+    """
     from trimesh.proximity import closest_point_naive  # needs no R-tree
 
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)
@@ -169,6 +183,5 @@ def _require_on_surface(mesh: trimesh.Trimesh, body: MarkedBody, radius: float) 
             words = f"{height:.4g} m below" if deep else f"{away:.4g} m away from"
             raise SensorFileError(
                 f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, at most "
-                f"{LARGEST_DEPTH if deep else radius:g} m is possible; {body.name}.drop = true "
-                "moves the planes of stickers onto the surface"
+                f"{LARGEST_DEPTH if deep else radius:g} m is possible{remedy}"
             )

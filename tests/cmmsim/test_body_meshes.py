@@ -139,6 +139,7 @@ def shifted(move):
             1000.0,
             r"m long, \d+ times the reach .*at most 10 m .*mesh_unit = 'mm'",
         ),
+        (shifted([0.0] * 3), "", 0.001, r"stickers reach over .*mesh_unit = 'm' its unit\?"),
         (
             shifted([0.0, 0.0, -0.004]),
             "",
