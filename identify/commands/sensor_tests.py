@@ -265,8 +265,8 @@ def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
                 score.marks,
                 score.method.replace("_", " "),
                 f"{score.bias_px:.2g} ± {score.scatter_px:.2g}",
-                f"{score.position_bias_um:.3g} ± {score.position_scatter_um:.3g}",
-                f"{score.angle_bias_urad:.0f} ± {score.angle_scatter_urad:.0f}",
+                f"{_short(score.position_bias_um)} ± {_short(score.position_scatter_um)}",
+                f"{_short(score.angle_bias_urad)} ± {_short(score.angle_scatter_urad)}",
                 f"{score.normalised_error:.2f}",
                 f"{100.0 * score.lost:.0f}",
                 f"{score.milliseconds:.0f}",
@@ -279,6 +279,11 @@ def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
         "of the pose; normalised error: error over its stated standard deviation; time: from two "
         "whole images to the pose",
     )
+
+
+def _short(value: float) -> str:
+    """Return a number with two digits, or without decimals."""
+    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _print_scores(scores: list["Score"], sensor: str) -> None:
