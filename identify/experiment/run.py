@@ -10,7 +10,7 @@ import xarray as xr
 
 import cmmsim
 from cmmsim.uncertainty.drift_watch import DriftWatch
-from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
+from dynamics.closed_loop import ClosedLoopRun, Reference
 from dynamics.closed_loop.command_schedule import acting_times
 from identify.arrays import Array
 from identify.estimation.prior import starting_guess
@@ -151,7 +151,7 @@ def run_plant(
         )
         model = guess.values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
-    done = plant.run(reference, RateSensor(eye.measure), latencies.true, true_load, in_loop)
+    done = plant.run(reference, eye.over(times), latencies.true, true_load, in_loop)
     record = _record(plant, reference, done, eye, seed, latencies.known)
     truth = plant.truth(done)
     if in_loop is not None:

@@ -1,7 +1,7 @@
 """Rendering stereo sensor as the pose sensor of the closed loop, with a log of its measurements."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,6 +14,7 @@ from cmmsim.files.schema import unit
 from cmmsim.uncertainty.known_rig import KnownRig
 from cmmsim.visibility import SightLines, stated_covariance
 from dynamics import Robot
+from dynamics.closed_loop import IdealSensor, RateSensor
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.experiment.leg_bodies import robot_meshes, robot_transforms
@@ -188,6 +189,19 @@ class PoseSensor(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class DrawnFrames:
+    """Measurements of a sensor that does not look at the platform, drawn before the run.
+
+    noise (N, 6): what each measurement adds to the true pose, m and rad. covariance (6, 6): of one
+    measurement. lost: the reason for which each frame is lost, empty for a measured frame.
+    """
+
+    noise: Array
+    covariance: Array
+    lost: Sequence[str]
+
+
 class SensorInLoop:
     """Sensor for the closed loop, with a log.
 
@@ -206,6 +220,23 @@ class SensorInLoop:
         self.lost: list[str] = []
         self.seconds = 0.0
         sensor.start_run(seed)
+
+    def over(self, times: Array) -> IdealSensor | RateSensor:
+        """Return the sensor for a loop with frames at these times (N,), s.
+
+        A sensor with a method `in_advance` draws all frames before the run. The loop then runs
+        compiled, without a call at each frame, and gives the same numbers.
+        """
+        drawn = getattr(self._sensor, "in_advance", None)
+        if drawn is None:
+            return RateSensor(self.measure)
+        made: DrawnFrames = drawn(len(times))
+        for frame, (t, reason) in enumerate(zip(times, made.lost, strict=True)):
+            self.covariances.append(np.full((6, 6), np.nan) if reason else made.covariance)
+            if reason:
+                self._lose(frame, t, reason)
+        self._advance(len(times))
+        return IdealSensor(np.array([bool(reason) for reason in made.lost]), made.noise)
 
     @property
     def common(self) -> Array:
@@ -230,6 +261,10 @@ class SensorInLoop:
         self._advance()
         self.covariances.append(measured.covariance if measured.ok else np.full((6, 6), np.nan))
         if not measured.ok:
-            self.lost.append(f"frame {frame} (t = {t:.3f} s): {measured.reason}")
+            self._lose(frame, t, measured.reason)
             return None
         return np.asarray(measured.pose, dtype=float)
+
+    def _lose(self, frame: int, t: float, reason: str) -> None:
+        """Note why a frame is lost."""
+        self.lost.append(f"frame {frame} (t = {t:.3f} s): {reason}")

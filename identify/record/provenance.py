@@ -6,8 +6,9 @@ digests to detect files that no longer belong together.
 
 import json
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -87,9 +88,18 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
             "scenario.to_toml()"
         )
     try:
-        return scenario_from_toml(text, "the record's attribute scenario")
+        return _scenario_of(text, Path.cwd())
     except ScenarioError as error:
         raise RecordError(str(error)) from error
+
+
+@lru_cache(maxsize=8)
+def _scenario_of(text: str, folder: Path) -> Scenario:
+    """Read the scenario of records, whose paths are relative to the folder, the current one.
+
+    Records of one experiment share their scenario, and are checked several times.
+    """
+    return scenario_from_toml(text, "the record's attribute scenario")
 
 
 def recorded_seed(record: xr.Dataset) -> int:

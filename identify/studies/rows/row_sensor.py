@@ -20,14 +20,18 @@ from cmmsim.files import SensorFile
 from cmmsim.measuring.measurement import lost_measurement, measurement_without_stickers
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
-from identify.experiment.sensor_in_loop import PoseSensor, SensorPlan, teach
+from identify.experiment.sensor_in_loop import DrawnFrames, PoseSensor, SensorPlan, teach
 from identify.progress import SilentProgress
 from identify.scenario.section import Section
+from identify.scenario.sections import Rig
 from identify.setup import Setup
 from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
 """Number of cached sensors per process. A sensor takes about a megabyte."""
+
+DROPPED = "dropped frame"
+"""Reason for which a drawn frame is lost."""
 
 Teaching = Literal["exact", "sensor"]
 """Way of teaching.
@@ -84,6 +88,15 @@ def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
     return _built(file, method, renderer, exactly_taught(file), 0)
 
 
+@lru_cache(maxsize=SENSORS_KEPT)
+def drawn_covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
+    """Return the covariance that a sensor states for a pose at rest, from a cache."""
+    file = SensorFile.model_validate_json(file_json)
+    covariance = SensorPlan("", file, "analytic", method, Rig(), 1).covariance(np.array(pose))
+    covariance.flags.writeable = False
+    return covariance
+
+
 def _built(
     file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught | None, seed: int
 ) -> RowSensor:
@@ -117,12 +130,23 @@ class DrawnSensor:
         pose_rate: ArrayLike | None = None,
     ) -> cmmsim.Measurement:
         """Return the pose (6,) with noise. Obstacles and speed have no effect."""
+        noise, dropped = self._drawn()
+        if dropped:
+            return lost_measurement(DROPPED)
+        return measurement_without_stickers(np.asarray(pose, dtype=float) + noise, self._covariance)
+
+    def in_advance(self, frames: int) -> DrawnFrames:
+        """Return what the next calls of `measure` would draw."""
+        drawn = [self._drawn() for _ in range(frames)]
+        noise = np.array([one for one, _ in drawn]).reshape(frames, 6)
+        reasons = [DROPPED if dropped else "" for _, dropped in drawn]
+        return DrawnFrames(noise, self._covariance, reasons)
+
+    def _drawn(self) -> tuple[Array, bool]:
+        """Return the noise (6,) of the next frame, and whether the frame is dropped."""
         # Noise is also drawn for a dropped frame, so that dropout does not change later noise.
         noise = self._factor @ self._rng.standard_normal(6)
-        dropped = self._rng.random() < self._dropout
-        if dropped:
-            return lost_measurement("dropped frame")
-        return measurement_without_stickers(np.asarray(pose, dtype=float) + noise, self._covariance)
+        return noise, self._rng.random() < self._dropout
 
 
 def rms_um(errors: Array) -> float:
@@ -170,7 +194,9 @@ def pose_figures(errors: Array, covariances: Array) -> Row:
 def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
     """Return the sensor of a row, taught if it has images. Raises the exceptions of the sensor."""
     if options.sensor == "drawn":
-        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
+        plan = setup.sensor_plan
+        home = setup.nominal.home_pose
+        covariance = drawn_covariance(plan.file.model_dump_json(), plan.method, tuple(home))
         return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
     teach(setup.sensor, SilentProgress())
     return setup.sensor
