@@ -18,7 +18,10 @@ from the estimate without bounds, the unheld estimate. Linearised about the boun
 
     unheld = estimate - W^-1 g,
 
-with the information W and the part g of the cost's gradient that the active bounds balance. The
+with the information W and the part g of the cost's gradient that the active bounds balance. A
+search in log-Cholesky coordinates ends at a flat body if only an impossible body would explain the
+record better. There g is the gradient with respect to the ten numbers of the body, which is zero
+where the search ends inside. The
 interval of the unheld estimate, truncated at the bounds, has the stated coverage. But it can be
 empty, or not contain the estimate. The returned interval is the union of the intervals of both
 estimates and the range between them, truncated at the smallest allowed value. It is never empty,
@@ -67,6 +70,13 @@ INSIDE = 1e-3
 The logarithms of a flat body are infinite.
 """
 
+FLAT_STDS = 0.1
+"""Distance of the unheld estimate from a full body, in standard deviations, by which the body is
+flat.
+
+The search ends that close to the best body that is not flat.
+"""
+
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 """Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
 
@@ -106,7 +116,7 @@ class ParameterBounds:
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
             allowed[self.layout.inertial] = self.layout.rigid_of(bodies)
-            for own in self._log_cholesky:
+            for own in self.log_cholesky:
                 second = allowed[own][4:7].sum() / 2
                 allowed[own] = nearest_body(allowed[own], INSIDE * second)
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
@@ -118,30 +128,30 @@ class ParameterBounds:
         """
         beyond = self.linear_coordinates(parameters) < self.lower
         marked = np.asarray((self.matrix != 0) | np.eye(len(beyond), dtype=bool)) @ beyond
-        for own in self._log_cholesky:
+        for own in self.log_cholesky:
             marked[own] = bool(body_fault(parameters[own]))
         return np.asarray(marked, dtype=bool)
 
     def coordinates(self, parameters: Array) -> Array:
         """Return the coordinates (p,) of parameters (p,) within the bounds."""
         found = self.linear_coordinates(parameters)
-        for own in self._log_cholesky:
+        for own in self.log_cholesky:
             found[own] = log_cholesky(parameters[own])
         return found
 
     def parameters(self, coordinates: Array) -> Array:
         """Return the parameters (p,) of coordinates (p,)."""
         found = np.asarray(self.matrix @ coordinates, dtype=float)
-        for own in self._log_cholesky:
+        for own in self.log_cholesky:
             found[own] = from_log_cholesky(coordinates[own])
         return found
 
     def slope(self, coordinates: Array) -> Array:
         """Return the derivatives (p, p) of the parameters with respect to the coordinates (p,)."""
-        if not self._log_cholesky:
+        if not self.log_cholesky:
             return self.matrix
         found = self.matrix.copy()
-        for own in self._log_cholesky:
+        for own in self.log_cholesky:
             found[own, own] = log_cholesky_slope(coordinates[own])
         return found
 
@@ -157,7 +167,7 @@ class ParameterBounds:
         return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
 
     @property
-    def _log_cholesky(self) -> tuple[slice, ...]:
+    def log_cholesky(self) -> tuple[slice, ...]:
         """Slices of the full bodies that have log-Cholesky coordinates."""
         pairs = zip(self.layout.body_slices, self.layout.full, strict=True)
         return tuple(own for own, full in pairs if full and self.physical)
@@ -177,7 +187,10 @@ class ParameterBounds:
         at_bound (p,): True for coordinates at their bounds.
         """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
-        return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
+        found = np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
+        for own in self.log_cholesky:
+            found[own] = gradient[own]
+        return found
 
 
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
@@ -197,6 +210,9 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
         for own, full in zip(layout.body_slices, layout.full, strict=True):
             lower[own] = -np.inf if full else lower[own]
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
+    for body, own, full in zip(layout.bodies, layout.body_slices, layout.full, strict=True):
+        if full and physical:
+            statements[own.start] = f"pseudo-inertia of {body} > 0"
     centred = [body for body, full in zip(layout.bodies, layout.full, strict=True) if not full]
     for body in centred if physical else ():
         first = names.index(f"{body}.Ixx")
@@ -259,9 +275,12 @@ class BoundedEstimate:
             return ()
         beyond = self.bounds.lower - self.bounds.linear_coordinates(self.unheld)
         to_coordinates = np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float)
-        std = combined_std(to_coordinates, self.covariance)
+        distances = beyond / combined_std(to_coordinates, self.covariance)
+        moved = self.unheld - self.estimate
+        for own in self.bounds.log_cholesky:
+            distances[own.start] = distance_in_std(moved[own], self.covariance[own, own])
         said = ", ".join(
-            f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})"
+            f"{self.bounds.statements[k]} ({max(distances[k], 0):.2g})"
             for k in np.flatnonzero(self.at_bound)
         )
         return (
@@ -284,5 +303,13 @@ def bounded_estimate(
     gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
     `BoundedEstimate`.
     """
-    unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
-    return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)
+    moved = -np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    held = at_bound.copy()
+    for own in bounds.log_cholesky:
+        held[own.start] = distance_in_std(moved[own], covariance[own, own]) > FLAT_STDS
+    return BoundedEstimate(estimate, held, estimate + moved, covariance, bounds)
+
+
+def distance_in_std(change: Array, covariance: Array) -> float:
+    """Return the Mahalanobis distance of a change (n,) with a covariance (n, n)."""
+    return float(np.sqrt(change @ np.linalg.solve(covariance, change)))

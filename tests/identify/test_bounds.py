@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares, minimize, nnls
 
 from dynamics.inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.pseudo_inertia import pseudo_inertia
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import (
     BoundedEstimate,
@@ -20,6 +21,7 @@ from identify.estimation.bounds import (
 )
 from identify.estimation.identification import identify
 from identify.estimation.output_error_search import InCoordinates
+from identify.estimation.prior import StartingGuess
 from identify.scenario import load_scenario
 from tests.identify.synthetic import (
     LAYOUT,
@@ -177,6 +179,31 @@ def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
     held, free = (platform([2.0, 0.8, 0.9, 1.0], physical) for physical in (True, False))
     assert np.allclose(held.estimate, free.estimate, atol=1e-9)
     assert held.active_bounds == free.active_bounds == ()
+
+
+@pytest.mark.parametrize(("moment", "refused"), [(0.34, False), (0.37, True)])
+def test_a_full_body_that_the_data_refuse_is_flat_and_keeps_the_estimate_without_bounds(
+    moment, refused
+):
+    """The data see a platform whose largest moment may exceed the sum of the other two. In a linear
+    problem the estimate without bounds is what the data see."""
+    rng = np.random.default_rng(4)
+    layout = rss6().with_full_bodies(["platform"]).layout
+    own = layout.body_slices[0]
+    seen = np.ones(len(layout.names))
+    seen[own] = 25.0, 0.4, -0.3, 0.2, 0.18, 0.17, moment, 0.02, 0.0, -0.01
+    bounds = parameter_bounds(StartingGuess(layout, seen, 0.3 * seen), physical=True)
+    rows = rng.standard_normal((30, 10)) / np.array([5.0, *3 * [0.4], *6 * [0.05]])
+    matrix = block_diag(rows / 0.03, np.eye(len(seen) - 10))
+    start = seen.copy()
+    start[own.start + 6] = 0.3
+    found = fitted(matrix, matrix @ seen, bounds, bounds.nearest(start))
+    assert np.allclose(found.unheld, seen, atol=1e-4 * np.abs(seen).max())
+    assert np.linalg.eigvalsh(pseudo_inertia(found.estimate[own])).min() > -1e-9
+    assert found.active_bounds == (("pseudo-inertia of platform > 0",) if refused else ())
+    away = np.linalg.norm(matrix @ (found.estimate - seen))
+    said = f"pseudo-inertia of platform > 0 ({away:.2g})"
+    assert [said in text for text in found.warnings()] == [True] * refused
 
 
 def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
