@@ -303,7 +303,8 @@ def bounded_estimate(
     gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
     `BoundedEstimate`.
     """
-    moved = -np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    balanced = bounds.balanced(gradient, at_bound)
+    moved = -np.asarray(np.linalg.solve(information, balanced), dtype=float)
     held = at_bound.copy()
     for own in bounds.log_cholesky:
         held[own.start] = distance_in_std(moved[own], covariance[own, own]) > FLAT_STDS
