@@ -6,7 +6,7 @@ the valid names.
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -323,24 +323,23 @@ def scenario_schema() -> dict[str, Any]:
     return Scenario.model_json_schema()
 
 
-def numbers_by_name() -> Iterator[str]:
-    """Yield the dotted keys whose values are tables of numbers by name.
+def tables_by_name() -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys whose values can be tables by name, and the type of their entries.
 
-    These names can contain dots.
+    The names can contain dots.
     """
     for section, field in Scenario.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            entries = field.annotation.model_fields.items()
-            yield from (
-                f"{section}.{name}"
-                for name, entry in entries
-                if entry.annotation == dict[str, float]
-            )
+            for name, entry in field.annotation.model_fields.items():
+                for form in (entry.annotation, *get_args(entry.annotation)):
+                    # Entries that are sections have paths of their own.
+                    if get_origin(form) is dict and not isinstance(get_args(form)[1], type(Section)):
+                        yield f"{section}.{name}", get_args(form)[1]
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
     # The keys of such a table can contain dots, so the path is split only up to the table.
-    tables = ("sensor_changes", *numbers_by_name())
+    tables = ("sensor_changes", *(table for table, _ in tables_by_name()))
     table = next((one for one in tables if path.startswith(f"{one}.")), "")
     *sections, key = path.split(".", table.count(".") + 1 if table else -1)
     for section in sections:

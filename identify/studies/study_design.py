@@ -25,7 +25,7 @@ from cmmsim.files import SensorFile
 from identify.errors import ScenarioError, StudyError
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
-from identify.scenario.scenario import numbers_by_name
+from identify.scenario.scenario import tables_by_name
 from identify.setup import Setup, with_renderer
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
@@ -318,11 +318,12 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
 def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
     """Return the field of a dotted path that a study can vary, or None.
 
-    The path can also name a number in a table of a scenario.
+    The path can also name an entry of a table of a scenario, such as `scenario.plant.values`.
     """
-    tables = (f"scenario.{table}." for table in numbers_by_name())
-    entry = FieldInfo(annotation=float) if path.startswith(tuple(tables)) else None
-    return valid_keys(options).get(path, entry)
+    for table, entry in tables_by_name():
+        if path.startswith(f"scenario.{table}."):
+            return FieldInfo(annotation=entry)
+    return valid_keys(options).get(path)
 
 
 def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
