@@ -8,6 +8,7 @@ prevents stalling near unstable loops.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -29,6 +30,12 @@ SMALLEST_RADIUS = 1e-10
 AT_BOUND = 1e-12  # distance from a bound that counts as rounding, in scales of the parameter
 
 Linearisation = tuple[float, Array, Array]
+
+Proposal = Callable[[Array, Array, Array, Array, Array, float], tuple[Array, float]]
+"""Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain).
+
+The step stays within the bounds and within `radius` times the scale.
+"""
 
 
 class Problem(Protocol):
@@ -87,8 +94,10 @@ def minimise(
     criteria: StopCriteria,
     on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
     ahead: bool = True,
+    upper: Array | None = None,
+    propose: Proposal | None = None,
 ) -> Solution:
-    """Minimise a least-squares problem within lower bounds.
+    """Minimise a least-squares problem within bounds.
 
     Parameters
     ----------
@@ -105,7 +114,14 @@ def minimise(
     ahead : bool
         Whether the problem can be linearised at a trial step before the step is accepted. This
         must be False for a problem with a state that follows the accepted steps.
+    upper : ndarray, shape (p,), optional
+        Upper bounds.
+    propose : Proposal, optional
+        Function that chooses a step. The default minimises the linearised cost.
     """
+    if upper is None:
+        upper = np.full(len(start), np.inf)
+    propose = propose or partial(_box_step, upper)
     parameters = start.copy()
     radius = 1.0
     trusted = True
@@ -114,8 +130,8 @@ def minimise(
     evaluations = 1
     reason = ""
     while not reason:
-        step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
-        trial = np.maximum(parameters + step, lower)
+        step, predicted = propose(factor, residual, parameters, lower, scale, radius)
+        trial = np.clip(parameters + step, lower, upper)
         evaluations += predicted > 0
         goes_on = ahead and trusted and predicted > criteria.cost_tolerance * cost
         new_cost, linearised = _tried(problem, trial, goes_on) if predicted > 0 else (cost, None)
@@ -159,13 +175,20 @@ def _tried(problem: Problem, trial: Array, goes_on: bool) -> tuple[float, Linear
 
 
 def _box_step(
-    factor: Array, residual: Array, parameters: Array, lower: Array, scale: Array, radius: float
+    upper: Array,
+    factor: Array,
+    residual: Array,
+    parameters: Array,
+    lower: Array,
+    scale: Array,
+    radius: float,
 ) -> tuple[Array, float]:
     """Return the minimiser of the linearised cost in the box, and the gain that it predicts."""
     low = np.maximum((lower - parameters) / scale, -radius)
+    high = np.minimum((upper - parameters) / scale, radius)
     scaled = factor * scale
     # The box always contains the step zero.
-    box = (np.minimum(low, -1e-15), np.full(len(scale), radius))
+    box = (np.minimum(low, -1e-15), np.maximum(high, 1e-15))
     solved = lsq_linear(scaled, -residual, bounds=box, method="bvls")
     gain = residual @ residual - np.sum((residual + scaled @ solved.x) ** 2)
     return solved.x * scale, float(gain)

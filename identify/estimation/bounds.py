@@ -10,18 +10,16 @@ the second moments of its mass along its axes, J_x = integral of x^2 dm and so o
 and the triangle inequality of the moments is equivalent to J >= 0. A search in J instead of I
 therefore needs only bounds, see Traversaro et al., "Identification of fully physical consistent
 inertial parameters" (IROS 2016). A full body is possible if its pseudo-inertia is positive
-definite. The search then uses log-Cholesky coordinates of the body, which need no bounds (see
-`dynamics.pseudo_inertia`).
+definite. The search then uses log-Cholesky coordinates of the body (see `dynamics.pseudo_inertia`),
+with a bound that keeps it from becoming so flat that the logarithms have no effect.
 
 The covariance of an estimate is computed without bounds. Active bounds move all parameters away
 from the estimate without bounds, the unheld estimate. Linearised about the bounded estimate, it is
 
     unheld = estimate - W^-1 g,
 
-with the information W and the part g of the cost's gradient that the active bounds balance. A
-search in log-Cholesky coordinates ends at a flat body if only an impossible body would explain the
-record better. There g is the gradient with respect to the ten numbers of the body, which is zero
-where the search ends inside. The
+with the information W and the part g of the cost's gradient that the active bounds balance. At a
+flat body, all of the gradient with respect to its ten numbers is balanced. The
 interval of the unheld estimate, truncated at the bounds, has the stated coverage. But it can be
 empty, or not contain the estimate. The returned interval is the union of the intervals of both
 estimates and the range between them, truncated at the smallest allowed value. It is never empty,
@@ -34,7 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.special import log_ndtr, ndtri
 
 from dynamics.inertia import SMALLEST, physical_inertias
 from dynamics.parameters import ParameterLayout
@@ -70,12 +68,8 @@ INSIDE = 1e-3
 The logarithms of a flat body are infinite.
 """
 
-FLAT_STDS = 0.1
-"""Distance of the unheld estimate from a full body, in standard deviations, by which the body is
-flat.
-
-The search ends that close to the best body that is not flat.
-"""
+FLATTEST = 1e-4
+"""Smallest second moment of a full body, as a share of the sum of those of the initial guess."""
 
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 """Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
@@ -126,7 +120,7 @@ class ParameterBounds:
 
         All moments of such a body are marked, because each of them can be the cause.
         """
-        beyond = self.linear_coordinates(parameters) < self.lower
+        beyond = self.linear_coordinates(parameters) < self.linear_lower
         marked = np.asarray((self.matrix != 0) | np.eye(len(beyond), dtype=bool)) @ beyond
         for own in self.log_cholesky:
             marked[own] = bool(body_fault(parameters[own]))
@@ -167,6 +161,14 @@ class ParameterBounds:
         return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
 
     @property
+    def linear_lower(self) -> Array:
+        """Lower bounds (p,) of the linear coordinates, -inf for full bodies."""
+        found = self.lower.copy()
+        for own in self.log_cholesky:
+            found[own] = -np.inf
+        return found
+
+    @property
     def log_cholesky(self) -> tuple[slice, ...]:
         """Slices of the full bodies that have log-Cholesky coordinates."""
         pairs = zip(self.layout.body_slices, self.layout.full, strict=True)
@@ -176,9 +178,10 @@ class ParameterBounds:
         """Return the smallest allowed values (n,) of rows (n, p) @ parameters, or -inf."""
         weights = rows @ self.matrix
         # With a negative weight the value has no lower limit, because there are no upper bounds.
-        bounded = np.isfinite(self.lower)
+        lower = self.linear_lower
+        bounded = np.isfinite(lower)
         free = (weights < 0) | ((weights != 0) & ~bounded)
-        least = weights[:, bounded] @ self.lower[bounded]
+        least = weights[:, bounded] @ lower[bounded]
         return np.where(free.any(axis=1), -np.inf, least)
 
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
@@ -189,7 +192,7 @@ class ParameterBounds:
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         found = np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
         for own in self.log_cholesky:
-            found[own] = gradient[own]
+            found[own] = gradient[own] if at_bound[own].any() else 0.0
         return found
 
 
@@ -212,7 +215,11 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
     for body, own, full in zip(layout.bodies, layout.body_slices, layout.full, strict=True):
         if full and physical:
-            statements[own.start] = f"pseudo-inertia of {body} > 0"
+            flat = slice(own.start + 1, own.start + 4)
+            second = guess.values[own][4:7].sum() / 2
+            # With the mass m, m exp(2 d) is the second moment along an axis of the Cholesky factor.
+            lower[flat] = np.log(max(FLATTEST * second / guess.values[own.start], SMALLEST)) / 2
+            statements[flat] = 3 * [f"pseudo-inertia of {body} > 0"]
     centred = [body for body, full in zip(layout.bodies, layout.full, strict=True) if not full]
     for body in centred if physical else ():
         first = names.index(f"{body}.Ixx")
@@ -260,32 +267,37 @@ class BoundedEstimate:
         """
         std = combined_std(rows, self.covariance)
         centre = rows @ self.unheld
-        # Upper tails keep their digits where the unheld estimate is far below the bound.
-        above = ndtr((centre - values) / std) / ndtr((centre - self.bounds.least(rows)) / std)
-        return np.asarray(np.clip(1.0 - above, 0.0, 1.0))
+        # Logarithms of upper tails keep their digits far below a bound.
+        tail = log_ndtr((centre - values) / std)
+        whole = log_ndtr((centre - self.bounds.least(rows)) / std)
+        return np.asarray(np.clip(-np.expm1(tail - whole), 0.0, 1.0))
 
     @property
     def active_bounds(self) -> tuple[str, ...]:
         """Statements of the active bounds, such as "platform.Izz <= Ixx + Iyy"."""
-        return tuple(self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
+        held = (self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
+        return tuple(dict.fromkeys(held))
 
     def warnings(self) -> tuple[str, ...]:
         """Return a warning if bounds are active, with the distance of the unheld estimate."""
         if not self.at_bound.any():
             return ()
-        beyond = self.bounds.lower - self.bounds.linear_coordinates(self.unheld)
+        beyond = self.bounds.linear_lower - self.bounds.linear_coordinates(self.unheld)
         to_coordinates = np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float)
         distances = beyond / combined_std(to_coordinates, self.covariance)
         moved = self.unheld - self.estimate
         for own in self.bounds.log_cholesky:
-            distances[own.start] = distance_in_std(moved[own], self.covariance[own, own])
+            to_body = np.linalg.solve(self.covariance[own, own], moved[own])
+            distances[own] = np.sqrt(moved[own] @ to_body)
         said = ", ".join(
-            f"{self.bounds.statements[k]} ({max(distances[k], 0):.2g})"
-            for k in np.flatnonzero(self.at_bound)
+            dict.fromkeys(
+                f"{self.bounds.statements[k]} ({max(distances[k], 0):.2g})"
+                for k in np.flatnonzero(self.at_bound)
+            )
         )
         return (
-            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot exists: "
-            f"{said}; in brackets the distance of the unbounded estimate beyond the bound, in "
+            f"the estimate is held at {len(self.active_bounds)} bounds, beyond which no robot "
+            f"exists: {said}; in brackets the distance of the unbounded estimate beyond the bound, in "
             "standard deviations; the intervals take it into account",
         )
 
@@ -303,14 +315,5 @@ def bounded_estimate(
     gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
     `BoundedEstimate`.
     """
-    balanced = bounds.balanced(gradient, at_bound)
-    moved = -np.asarray(np.linalg.solve(information, balanced), dtype=float)
-    held = at_bound.copy()
-    for own in bounds.log_cholesky:
-        held[own.start] = distance_in_std(moved[own], covariance[own, own]) > FLAT_STDS
-    return BoundedEstimate(estimate, held, estimate + moved, covariance, bounds)
-
-
-def distance_in_std(change: Array, covariance: Array) -> float:
-    """Return the Mahalanobis distance of a change (n,) with a covariance (n, n)."""
-    return float(np.sqrt(change @ np.linalg.solve(covariance, change)))
+    unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)

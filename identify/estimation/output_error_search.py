@@ -14,12 +14,12 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.bounded_least_squares import Problem, Solution, minimise
-from identify.estimation.bounds import ParameterBounds
+from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.common_error_estimates import errors_in_models
 from identify.estimation.joint_search import with_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.search_in_coordinates import minimise_in_coordinates
 from identify.estimation.warm_start import linear_warm_start
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
@@ -58,6 +58,12 @@ class Search:
     problem: OutputErrorProblem
     solution: Solution
 
+    @property
+    def missed(self) -> bool:
+        """Whether the cost is so much above that of noise that the search may have gone wrong."""
+        frames = sum(int(run.ok.sum()) for run in self.problem.runs)
+        return self.solution.costs[-1] > MISSED * 6 * frames
+
     def linearised(self) -> OutputErrorProblem:
         """Return the problem with the modes of the common errors at the optimum.
 
@@ -95,6 +101,9 @@ def output_error_searches(
             )
             start = _closed_loop_start(problem, searched.solution.parameters)
             found["closed_loop"] = search_with_common_errors(problem, [start], advance)
+            ended = found["closed_loop"].solution.parameters
+            if searched.missed and searched.problem.cost(ended) < searched.solution.costs[-1]:
+                found["command_driven"] = search_with_common_errors(driven, [ended], advance)
     return found
 
 
@@ -112,7 +121,7 @@ def search_with_common_errors(
     if bent:
         problem, start = with_likely_errors(problem, start)
     solution = search(problem, start, advance)
-    if bent and solution.costs[-1] > MISSED * 6 * sum(run.ok.sum() for run in problem.runs):
+    if bent and Search(problem, solution).missed:
         # Far from the right errors, the parameters can have gone to a wrong minimum.
         warm = problem.bounds.nearest(linear_warm_start(problem))
         other, start = with_likely_errors(problem, warm)
@@ -146,25 +155,6 @@ def _bends_far(run: LoopModel) -> bool:
     return run.begins_in_motion or (run.driven and rubs)
 
 
-@dataclass(frozen=True)
-class InCoordinates:
-    """Least-squares problem in coordinates of bounds, see `bounded_least_squares.Problem`."""
-
-    problem: Problem
-    bounds: ParameterBounds
-
-    def cost(self, parameters: Array) -> float:
-        """Return the cost at coordinates (p,)."""
-        return self.problem.cost(self.bounds.parameters(parameters))
-
-    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
-        """Return cost and linearisation at coordinates (p,)."""
-        # far steps in logarithms of a body can make it larger than any number
-        with np.errstate(over="ignore"):
-            cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
-        return cost, factor @ self.bounds.slope(parameters), residual
-
-
 def search(
     problem: OutputErrorProblem,
     start: Array,
@@ -178,10 +168,10 @@ def search(
     """
     bounds = problem.bounds
     coordinates = bounds.coordinates(start)
-    found = minimise(
-        InCoordinates(shooting or problem, bounds),
+    found = minimise_in_coordinates(
+        shooting or problem,
+        bounds,
         coordinates,
-        bounds.lower,
         bounds.spread(coordinates, problem.guess.std),
         problem.stop,
         lambda i, cost: advance(),

@@ -333,7 +333,9 @@ def tables_by_name() -> Iterator[tuple[str, Any]]:
             for name, entry in field.annotation.model_fields.items():
                 for form in (entry.annotation, *get_args(entry.annotation)):
                     # Entries that are sections have paths of their own.
-                    if get_origin(form) is dict and not isinstance(get_args(form)[1], type(Section)):
+                    if get_origin(form) is dict and not isinstance(
+                        get_args(form)[1], type(Section)
+                    ):
                         yield f"{section}.{name}", get_args(form)[1]
 
 

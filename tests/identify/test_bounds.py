@@ -20,8 +20,8 @@ from identify.estimation.bounds import (
     parameter_bounds,
 )
 from identify.estimation.identification import identify
-from identify.estimation.output_error_search import InCoordinates
 from identify.estimation.prior import StartingGuess
+from identify.estimation.search_in_coordinates import minimise_in_coordinates
 from identify.scenario import load_scenario
 from tests.identify.synthetic import (
     LAYOUT,
@@ -130,9 +130,8 @@ INERTIAS = slice(1, 4)
 
 
 def fitted(matrix, data, bounds, start) -> BoundedEstimate:
-    problem = InCoordinates(linear(matrix, data), bounds)
-    found = minimise(
-        problem, bounds.coordinates(start), bounds.lower, np.ones(len(start)), CRITERIA
+    found = minimise_in_coordinates(
+        linear(matrix, data), bounds, bounds.coordinates(start), np.ones(len(start)), CRITERIA
     )
     estimate, information = bounds.parameters(found.parameters), matrix.T @ matrix
     gradient = matrix.T @ (matrix @ estimate - data)
