@@ -129,6 +129,23 @@ def test_the_stop_reason_names_the_criterion():
 INERTIAS = slice(1, 4)
 
 
+def test_a_step_follows_the_curve_of_possible_bodies_to_the_optimum_of_linear_data():
+    """Without a curve, the first step of a linear problem ends at its optimum. Here it also does,
+    and a second run of the problem confirms it."""
+    layout = rss6().with_full_bodies(["platform"]).layout
+    seen = np.ones(len(layout.names))
+    seen[layout.body_slices[0]] = 25.0, 0.4, -0.3, 0.2, 0.18, 0.17, 0.34, 0.02, 0.0, -0.01
+    bounds = parameter_bounds(StartingGuess(layout, seen, 0.3 * seen), physical=True)
+    start = seen * np.random.default_rng(1).uniform(0.8, 1.2, len(seen))
+    matrix = np.diag(1e3 / seen.clip(0.01))
+    coordinates = bounds.coordinates(bounds.nearest(start))
+    found = minimise_in_coordinates(
+        linear(matrix, matrix @ seen), bounds, coordinates, np.ones(len(seen)), CRITERIA
+    )
+    assert found.evaluations <= 3
+    assert np.allclose(bounds.parameters(found.parameters), seen, rtol=1e-6, atol=1e-6)
+
+
 def fitted(matrix, data, bounds, start) -> BoundedEstimate:
     found = minimise_in_coordinates(
         linear(matrix, data), bounds, bounds.coordinates(start), np.ones(len(start)), CRITERIA
@@ -198,7 +215,20 @@ def test_a_full_body_that_the_data_refuse_is_flat_and_keeps_the_estimate_without
     start[own.start + 6] = 0.3
     found = fitted(matrix, matrix @ seen, bounds, bounds.nearest(start))
     assert np.allclose(found.unheld, seen, atol=1e-4 * np.abs(seen).max())
-    assert np.linalg.eigvalsh(pseudo_inertia(found.estimate[own])).min() > -1e-9
+    # Among bodies that can exist the optimum is the one whose gradient a positive semidefinite
+    # matrix Z balances, with Z L = 0 for the pseudo-inertia L.
+    body = pseudo_inertia(found.estimate[own])
+    units = pseudo_inertia(np.eye(10))
+    pairs = np.triu_indices(4)
+    weights = np.where(pairs[0] == pairs[1], 1.0, 2.0)
+    gradient = (matrix.T @ matrix @ (found.estimate - seen))[own]
+    balance = np.zeros((4, 4))
+    balance[pairs] = np.linalg.solve(units[:, pairs[0], pairs[1]] * weights, gradient)
+    balance += np.triu(balance, 1).T
+    largest = np.abs(balance).max() + 1e-300
+    assert np.linalg.eigvalsh(body).min() > 0
+    assert np.linalg.eigvalsh(balance).min() > -1e-3 * max(largest, 1.0)
+    assert np.abs(balance @ body).max() < 1e-3 * max(largest, 1.0)
     assert found.active_bounds == (("pseudo-inertia of platform > 0",) if refused else ())
     away = np.linalg.norm(matrix @ (found.estimate - seen))
     said = f"pseudo-inertia of platform > 0 ({away:.2g})"
