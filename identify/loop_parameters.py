@@ -28,8 +28,9 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Timing
+from identify.scenario.loop_sections import Control, Servo
 from identify.scenario.payload import Payload
-from identify.scenario.plant_sections import FILTERED, Control, Servo
+from identify.scenario.plant_sections import FILTERED
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
 NOMINAL = "guess"

@@ -31,6 +31,7 @@ from identify.experiment.plant import (
     RunSettings,
     with_command_errors,
     with_springs,
+    with_uneven_friction,
 )
 from identify.experiment.run import excitation_run
 from identify.experiment.sensor_in_loop import SensorPlan, teach
@@ -142,10 +143,11 @@ class Setup:
         switches = scenario.plant
         timing = scenario.timing
         control = scenario.control
-        settings = loop_settings(self.nominal, scenario.servo, timing, control, switches)
         identification = scenario.identification
         robot = true_robot(self.nominal, switches, scenario.geometry, self.known, self.seed)
         robot = with_true_bodies(robot, self.in_file, switches)
+        settings = loop_settings(self.nominal, scenario.servo, timing, control, switches)
+        settings = with_uneven_friction(settings, robot, switches)
         return Plant(
             nominal=self.robot,
             settings=with_command_errors(

@@ -50,6 +50,8 @@ class MujocoPlant:
             np.array([getattr(one, name)[0] for one in joints]) for name in ("qposadr", "dofadr")
         )
         self.dry = model.dof_frictionloss[self.speed]
+        self.uneven = np.zeros(len(self.speed))
+        """By how much dry friction is more in the positive direction, and less in the negative."""
         self.others = np.setdiff1d(np.arange(model.nv), self.speed)
         self.balls = [
             j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL
@@ -117,7 +119,7 @@ class MujocoPlant:
         lp, li, ld = self.gains
         error = command - angles
         torque = lp * error + li * integral + ld * (command_rate - speeds)
-        left = torque - bias - modes * self.dry
+        left = torque - bias - modes * self.dry - np.abs(modes) * self.uneven
         free = modes != 0
         gain = np.zeros(count)
         gain[free] = np.linalg.solve(mass[np.ix_(free, free)], left[free])
@@ -147,7 +149,7 @@ class MujocoPlant:
         if modes.all():
             return back
         held = self._pushed(state, modes, *given)[1]
-        return np.where(modes != 0, back, np.abs(held) - self.dry)
+        return np.where(modes != 0, back, np.abs(held - self.uneven) - self.dry)
 
     def _settled(self, state, modes, *given):
         """The state and its modes after all joints that break theirs have changed."""
@@ -162,7 +164,8 @@ class MujocoPlant:
                 state, modes[joint] = state.copy(), 0.0
                 state[-2 * count + joint] = 0.0
             else:
-                modes[joint] = np.sign(self._pushed(state, modes, *given)[1][joint])
+                held = self._pushed(state, modes, *given)[1] - self.uneven
+                modes[joint] = np.sign(held[joint])
         return state, modes
 
     def _frame(self, state, modes, period, *given):

@@ -155,12 +155,17 @@ class Drives:
         no error.
     command_step : float, optional
         Step q of the received commands, rad or m. The default is no steps.
+    friction_offset : tuple of float
+        Half the difference of the Coulomb friction of each joint in its positive and its negative
+        direction, N m or N. It is a constant torque against the joint, which the integral of the
+        drive balances. Torques of a run are net of it. The default is none.
 
     Raises
     ------
     SimulationError
-        If a limit, a time constant, a scale or a step is not > 0, if a zero is not finite, if the
-        law is unknown, or if a filter is missing or belongs to another law.
+        If a limit, a time constant, a scale or a step is not > 0, if a zero or an offset is not
+        finite, if the law is unknown, if a filter is missing or belongs to another law, or if a law
+        without an integral has an offset of friction.
 
     Examples
     --------
@@ -175,6 +180,7 @@ class Drives:
     command_scale: float = 1.0
     joint_zeros: tuple[float, ...] = ()
     command_step: float | None = None
+    friction_offset: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         flag("torques", self.torques, SimulationError)
@@ -200,17 +206,28 @@ class Drives:
             real(f"zero of joint {joint}", zero, SimulationError, unit=" rad or m")
         if self.command_step is not None:
             real("step of the commands", self.command_step, SimulationError, above=0)
+        check_type("friction_offset", self.friction_offset, tuple, SimulationError)
+        for joint, offset in enumerate(self.friction_offset, 1):
+            real(f"friction_offset of joint {joint}", offset, SimulationError, unit=" N m or N")
+        if any(self.friction_offset) and (self.torques or "li" not in READS[self.law]):
+            raise SimulationError(
+                "friction_offset needs drives with an integral, which balances it: under the law "
+                "pd it is an error of the joint's zero, and drives that take torques have no law"
+            )
 
     def zeros(self, joints: int) -> np.ndarray:
         """Zero error of each joint (n,), rad or m.
 
         Raises SimulationError if the drives have zeros of another number of joints.
         """
-        if self.joint_zeros and len(self.joint_zeros) != joints:
-            raise SimulationError(
-                f"there are zeros of {len(self.joint_zeros)} joints, the robot has {joints}"
-            )
-        return np.array(self.joint_zeros) if self.joint_zeros else np.zeros(joints)
+        return _of_joints("zeros", self.joint_zeros, joints)
+
+    def offsets(self, joints: int) -> np.ndarray:
+        """Offset of the friction of each joint (n,), N m or N.
+
+        Raises SimulationError if the drives have offsets of another number of joints.
+        """
+        return _of_joints("friction offsets", self.friction_offset, joints)
 
     def interface(self, joints: int) -> dict[str, float | np.ndarray]:
         """Scale, step (0: none) and zeros (n,) of the received commands, for kernels.
@@ -231,6 +248,13 @@ class Drives:
     def joint_law(self, gains: np.ndarray) -> JointLaw:
         """Law with the gains lp, li, ld of each joint (n, 3), or of all joints (3,)."""
         return joint_law(self.law, gains, self.filter_time)
+
+
+def _of_joints(what: str, values: tuple[float, ...], joints: int) -> np.ndarray:
+    """Values (n,) of all joints, zero without any. Raises SimulationError for a wrong number."""
+    if values and len(values) != joints:
+        raise SimulationError(f"there are {what} of {len(values)} joints, the robot has {joints}")
+    return np.array(values) if values else np.zeros(joints)
 
 
 PID = Drives()

@@ -149,7 +149,8 @@ def equilibrium(
 ) -> StartState:
     """State of rest at a pose, without friction torques.
 
-    The state includes its derivatives with respect to the parameters.
+    The state includes its derivatives with respect to the parameters. If friction has an offset,
+    the integrals hold the robot without it, as friction of a joint at rest can be zero.
 
     Parameters
     ----------
@@ -207,10 +208,13 @@ def equilibrium(
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
-    received, integral = law.held(torque, angles)
+    # With friction (c + o) and -(c - o) in both directions, a joint moves as with c and -c under a
+    # torque that is less by o.
+    net = torque - drives.offsets(len(angles))
+    received, integral = law.held(net, angles)
     command = drives.sent(received)
     by_command, by_integral = law.held_by_parameters(
-        torque, angles, torque_map, robot.layout.own_gains
+        net, angles, torque_map, robot.layout.own_gains
     )
     kinematics = servo_robot or robot
     servo_integral = np.zeros(len(chart.freedoms))

@@ -14,12 +14,13 @@ import numpy as np
 
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
+from dynamics.closed_loop.drives import READS
 from dynamics.geometry import RobotGeometry
 from dynamics.parameter_units import of_all_legs
 from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, Change, InList, OnTorques
+from identify.diagnosis.cause import Cause, Change, InList, OnTorques, prior_std
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.body_torques import (
     RunMotion,
@@ -28,12 +29,17 @@ from identify.model.body_torques import (
     passive_columns,
     run_motion,
 )
+from identify.model.loop_model import LoopModel
+from identify.record.stored_common_errors import FRICTION_OFFSET
 
 PASSIVE_GROUP = "friction of passive joints"
 """Group of the friction of passive joints."""
 
 MOVING = 0.01
 """Velocity above which a joint moves, as a share of its RMS velocity."""
+
+LEAST_OFFSET = 0.01
+"""Least standard deviation, N m or N, of an offset of friction that a remedy states."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class Needed:
     unit: str
     group: str
     torques: tuple[Array, ...]
-    remedy: str | InList
+    remedy: str | InList | Callable[[float], str]
     least: float = -np.inf
     along: Callable[[Sequence[RunMotion]], tuple[Array, ...]] | None = None
 
@@ -64,7 +70,7 @@ def body_causes(
     needed = [
         *_uneven_bodies(problem.runs[0].robot, parameters, motions),
         *_passive_friction(problem.runs[0].robot, motions),
-        *_uneven_friction(problem.runs[0].robot, motions),
+        *_uneven_friction(problem.runs[0], motions),
     ]
 
     return tuple(_cause(one) for one in needed)
@@ -91,9 +97,11 @@ def _cause(one: Needed) -> Cause:
     )
 
 
-def _remedy(remedy: str | InList) -> Callable[[float], str] | InList:
-    """Return the remedy of a cause, which does not depend on its size."""
-    return remedy if isinstance(remedy, InList) else lambda size: remedy
+def _remedy(
+    remedy: str | InList | Callable[[float], str],
+) -> Callable[[float], str] | InList:
+    """Return the remedy of a cause. A text does not depend on its size."""
+    return (lambda size: remedy) if isinstance(remedy, str) else remedy
 
 
 def _added(one: Needed) -> Change:
@@ -198,20 +206,33 @@ def passive_words(name: str) -> str:
     return f"{kind} friction of the {joint.replace('_', ' ')}s"
 
 
-def _uneven_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
-    """Return the half differences of the dry friction of each joint between its two directions."""
-    layout = robot.layout
+def _uneven_friction(run: LoopModel, motions: Sequence[RunMotion]) -> list[Needed]:
+    """Return the half differences of the dry friction of each joint between its two directions.
+
+    They are left out where the model estimates them.
+    """
+    layout = run.robot.layout
+    if any(name.startswith(FRICTION_OFFSET) for name in run.common.loop_std):
+        return []
+    unit = layout.unit("joint1.coulomb")
+    key = f"model.friction_offset_std_{unit.replace(' ', '_')}"
+    integrates = "li" in READS[run.settings.drives.law]
+
+    def remedy(size: float) -> str:
+        if integrates:
+            return f"--set {key}={prior_std(size, LEAST_OFFSET):g}"
+        return "state how well the zeros of the joints are known, as an offset of friction is one"
+
     rates = [one.joint_rates for one in motions]
     typical = np.sqrt(np.mean(np.concatenate(rates) ** 2, axis=0))
     moving = [np.abs(rate) > MOVING * typical for rate in rates]
     return [
         Needed(
             f"dry friction of joint {joint + 1} that differs with direction",
-            layout.unit("joint1.coulomb"),
+            unit,
             "friction that differs with direction",
             tuple(np.where(one, np.eye(layout.joints)[joint], 0.0) for one in moving),
-            "no model here has friction that differs with direction: look for a load on one side, "
-            "or a drive that is worn",
+            remedy,
         )
         for joint in range(layout.joints)
     ]

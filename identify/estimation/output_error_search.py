@@ -100,9 +100,13 @@ def output_error_searches(
                 errors_in_models(searched.problem, searched.solution.parameters)
             )
             start = _closed_loop_start(problem, searched.solution.parameters)
-            found["closed_loop"] = search_with_common_errors(problem, [start], advance)
-            ended = found["closed_loop"].solution.parameters
-            if searched.missed and searched.problem.cost(ended) < searched.solution.costs[-1]:
+            found["closed_loop"] = last = search_with_common_errors(problem, [start], advance)
+            ended = last.solution.parameters
+            cost = searched.solution.costs[-1]
+            if searched.missed and any(_bends_far(run) for run in driven.runs):
+                driven = driven.having(errors_in_models(last.problem, ended))
+                found["command_driven"] = search_with_common_errors(driven, [ended], advance)
+            elif searched.missed and searched.problem.cost(ended) < cost:
                 found["command_driven"] = search_with_common_errors(driven, [ended], advance)
     return found
 

@@ -18,7 +18,8 @@ from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.own_parts import LAWS, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Timing
-from identify.scenario.plant_sections import FILTERED, Control
+from identify.scenario.loop_sections import Control
+from identify.scenario.plant_sections import FILTERED
 
 FASTEST = 1.0
 """Default bandwidth of computed_torque with an observer, times the frame period.

@@ -29,15 +29,15 @@ from dynamics.control.law_interface import LawInLoop
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import ScenarioError
-from identify.experiment.true_robot import true_zeros
+from identify.experiment.true_robot import true_friction_offsets, true_zeros
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import of_actuators
 from identify.model.model_side import ModelSide
 from identify.record.load import load_errors, load_parameters
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import PriorValue, Timing
+from identify.scenario.loop_sections import Control
 from identify.scenario.payload import Payload
-from identify.scenario.plant_sections import Control
 from identify.scenario.sections import Rig
 
 
@@ -301,6 +301,21 @@ def with_command_errors(
         command_scale=switches.command_scale,
         command_step=of_actuators(nominal, switches, "command_quantum"),
     )
+    return replace(settings, drives=drives)
+
+
+def with_uneven_friction(
+    settings: LoopSettings, robot: Robot, switches: PlantSwitches
+) -> LoopSettings:
+    """Return the settings of a loop with the offsets of the friction of a plant's robot.
+
+    Raises the ScenarioErrors of `true_friction_offsets`, and dynamics.SimulationError for a law of
+    the drives that balances no offset.
+    """
+    offsets = true_friction_offsets(robot, switches)
+    if not offsets.any():
+        return settings
+    drives = replace(settings.drives, friction_offset=tuple(offsets.tolist()))
     return replace(settings, drives=drives)
 
 

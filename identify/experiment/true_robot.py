@@ -129,6 +129,29 @@ def true_zeros(robot: Robot, switches: PlantSwitches) -> Array:
     return np.asarray(error * rng.standard_normal(joints))
 
 
+def true_friction_offsets(robot: Robot, switches: PlantSwitches) -> Array:
+    """Return the offset of the friction of each joint (n,) of a plant, N m or N.
+
+    Raises ScenarioError for a list of a wrong length, and for an offset beyond the Coulomb
+    friction, with which a joint would move by itself.
+    """
+    offset = of_actuators(robot, switches, "friction_offset")
+    joints = robot.layout.joints
+    unit = robot.layout.unit("joint1.coulomb")
+    key = f"plant.friction_offset_{unit.replace(' ', '_')}"
+    if isinstance(offset, list) and len(offset) != joints:
+        raise ScenarioError(f"{key} has {len(offset)} values, but {robot.name} has {joints} joints")
+    found = np.broadcast_to(np.array(offset, dtype=float), joints).copy()
+    coulomb = true_parameters(robot, switches)[robot.layout.coulomb]
+    if (beyond := np.abs(found) > coulomb).any():
+        joint = int(np.argmax(beyond))
+        raise ScenarioError(
+            f"{key} of joint {joint + 1} is {found[joint]:g} {unit}, beyond its Coulomb friction "
+            f"of {coulomb[joint]:g} {unit}: one direction would have less than none"
+        )
+    return found
+
+
 def true_robot(
     nominal: Robot, switches: PlantSwitches, calibration: Geometry, known: KnownGeometry, seed: int
 ) -> Robot:

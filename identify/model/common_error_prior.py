@@ -17,7 +17,7 @@ import xarray as xr
 from dynamics import Robot
 from dynamics.closed_loop import FrictionLaw, LoopSettings
 from identify.arrays import Array
-from identify.errors import ScenarioError
+from identify.errors import EstimationError, ScenarioError
 from identify.loop_parameters import of_actuators
 from identify.model.body_errors import body_error_stds
 from identify.model.model_side import ModelSide
@@ -25,6 +25,7 @@ from identify.record.conditions import takes_torques
 from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.stored_common_errors import (
     FRICTION,
+    FRICTION_OFFSET,
     LATENCY,
     SCALE,
     STATIC_RATIO,
@@ -33,6 +34,7 @@ from identify.record.stored_common_errors import (
     read_common_errors,
 )
 from identify.scenario import Model
+from identify.scenario.plant_sections import DRIVE_GAINS
 
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
@@ -69,6 +71,8 @@ def with_recorded_errors(
     ------
     RecordError
         The record states errors that are not valid.
+    EstimationError
+        Constants of friction are to be estimated under torques.
     """
     kinds = side.nuisances
     geometry = None
@@ -77,6 +81,12 @@ def with_recorded_errors(
         geometry = GeometryErrors(run.robot, covariance, motion, run.whitener)
     stds = loop_error_stds(run.robot, side.model, side.timing.latency_std_s, kinds)
     if takes_torques(record):
+        if any(name.startswith(FRICTION) for name in stds):
+            raise EstimationError(
+                "the commands of the record are torques, under which no constant of the law of "
+                "friction is estimated: leave model.static_ratio_std, stribeck_velocity_std and "
+                "friction_offset_std out"
+            )
         # no zero and no scale of joint commands acts under torques
         stds = {name: std for name, std in stds.items() if name == LATENCY}
     common = replace(
@@ -113,9 +123,10 @@ def zero_name(joint: int, unit: str) -> str:
 
 
 def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
-    """Return the standard deviations of the constants of the law of friction, by name.
+    """Return the standard deviations of what the law of friction leaves open, by name.
 
-    Raises ScenarioError for those of a law that the model does not have.
+    These are its constants, and the offset of the friction of each joint. Raises ScenarioError for
+    a law of friction or of the drives that does not have them.
     """
     velocity = f"{STRIBECK_VELOCITY}_{robot.layout.joint_unit}/s"
     stds: dict[str, float] = {
@@ -127,7 +138,17 @@ def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
             f"model.friction = {model.friction!r}, but static_ratio_std or stribeck_velocity_std "
             "is stated: only the law stribeck has these constants"
         )
-    return stds
+    offset = of_actuators(robot, model, "friction_offset_std") or 0.0
+    if offset and "li" not in DRIVE_GAINS.get(model.drive, ()):
+        raise ScenarioError(
+            f"model.friction_offset_std with model.drive = {model.drive!r}: it needs a law with an "
+            "integral; under the law pd, an offset of friction is an error of the joint's zero"
+        )
+    unit = robot.layout.unit("joint1.coulomb")
+    offsets = {
+        f"{FRICTION_OFFSET}{joint}_{unit}": offset for joint in range(1, robot.layout.joints + 1)
+    }
+    return stds | offsets
 
 
 def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: FrictionLaw) -> Array:
@@ -146,9 +167,14 @@ def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: Fric
 
 
 def settings_with_errors(settings: LoopSettings, errors: Mapping[str, float]) -> LoopSettings:
-    """Return the settings of a loop with errors of zeros, scale and constants of friction."""
+    """Return the settings of a loop with errors of zeros, scale and friction."""
     if any(name.startswith(FRICTION) for name in errors):
-        settings = replace(settings, friction=_friction_with(settings.friction, errors))
+        offsets = tuple(value for name, value in errors.items() if name.startswith(FRICTION_OFFSET))
+        settings = replace(
+            settings,
+            friction=_friction_with(settings.friction, errors),
+            drives=replace(settings.drives, friction_offset=offsets),
+        )
     zeros = tuple(value for name, value in errors.items() if name.startswith(ZERO))
     scale = 1.0 + errors.get(SCALE, 0.0)
     if scale == 1.0 and not any(zeros):

@@ -1,14 +1,10 @@
-"""Sections of a scenario about the robot in its loop.
-
-They are the servo, the control law, the true plant and the model of it.
-"""
+"""Sections of a scenario about the robot: the true plant, and the model of it."""
 
 from typing import Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
 from dynamics.checks import Gain, check_inertia_forms, within
-from identify.own_parts import LAWS, check_choice
 from identify.scenario.section import Section, quantity
 
 FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -66,50 +62,6 @@ DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "pid_filtered": ("lp", "li", "ld"),
 }
 """Gains that each law of the drives uses."""
-
-
-class Servo(Section):
-    """Gains of the outer visual servo (eq. 30)."""
-
-    kp: float = quantity(0.3, "1", "proportional gain", ge=0, le=1e6)
-    kd: float = quantity(0.001, "s", "derivative gain", ge=0)
-    ki: float = quantity(2.4, "1/s", "integral gain", ge=0)
-
-
-class Control(Section):
-    """Law by which `cmmsim track` makes the robot follow a motion.
-
-    All other runs use the law pid, except the excitation, which has its own key. The torque limit
-    applies to all runs, and the model includes it.
-    """
-
-    law: str = Field("pid", description=f"control law: {', '.join(LAWS)}, or module:function")
-    observer: bool = Field(
-        True,
-        description="whether an observer predicts the pose for laws with a model",
-    )
-    torque_access: bool = Field(
-        True, description="whether the drives take torques; otherwise only joint commands"
-    )
-    torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
-    torque_limit_N: float | None = quantity(None, "N", "the same for actuators that slide", gt=0)
-    bandwidth_rad_s: float | None = quantity(
-        None,
-        "rad/s",
-        "bandwidth of the law computed_torque; by default as fast as frame rate and latency allow",
-        gt=0,
-    )
-    damping: float = quantity(1.0, "1", "damping of the law computed_torque", gt=0, le=10)
-    servo_bandwidth_rad_s: float | None = quantity(
-        None, "rad/s", "bandwidth for which `cmmsim check` designs gains of the visual servo", gt=0
-    )
-    servo_damping: float = quantity(0.1, "1", "least damping of that design", ge=0, lt=1)
-
-    @field_validator("law")
-    @classmethod
-    def _can_be_found(cls, law: str) -> str:
-        check_choice(law, "law", LAWS, ValueError)
-        return law
 
 
 class _Side(Section):
@@ -210,6 +162,17 @@ class Plant(_Side):
         0.0,
         description="the same for actuators that slide, m",
         json_schema_extra={"unit": "m"},
+    )
+    friction_offset_N_m: float | list[float] = Field(
+        0.0,
+        description="half the difference of the Coulomb friction of each joint in its positive and "
+        "its negative direction, N m: one value, or a list with one per joint",
+        json_schema_extra={"unit": "N m"},
+    )
+    friction_offset_N: float | list[float] = Field(
+        0.0,
+        description="the same for actuators that slide, N",
+        json_schema_extra={"unit": "N"},
     )
     command_scale: float = quantity(
         1.0, "1", "ratio of the commands that the drives receive to those sent", ge=0.5, le=2
@@ -330,6 +293,16 @@ class Model(_Side):
         "which is estimated beside the parameters",
         ge=0,
         le=0.1,
+    )
+    friction_offset_std_N_m: float | None = quantity(
+        None,
+        "N m",
+        "standard deviation of half the difference of the Coulomb friction of each joint in both "
+        "directions, which is estimated beside the parameters",
+        gt=0,
+    )
+    friction_offset_std_N: float | None = quantity(
+        None, "N", "the same for actuators that slide", gt=0
     )
     static_ratio_std: float = quantity(
         0.0, "1", "standard deviation of static_ratio, estimated beside the parameters", ge=0, le=9

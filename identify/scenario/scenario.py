@@ -13,9 +13,10 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from dynamics.files import Name
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
+from identify.scenario.loop_sections import Control, Servo
 from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.payload import Payload
-from identify.scenario.plant_sections import Control, DriveName, Model, Plant, Servo
+from identify.scenario.plant_sections import DriveName, Model, Plant
 from identify.scenario.section import Section
 from identify.scenario.sections import (
     GEOMETRY_KNOWN,

@@ -21,6 +21,8 @@ from dynamics.checks import (
 ACTUATOR_KEYS = {
     "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
     "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
+    "friction_offset": ("friction_offset_N_m", "friction_offset_N"),
+    "friction_offset_std": ("friction_offset_std_N_m", "friction_offset_std_N"),
     "stribeck_velocity_std": ("stribeck_velocity_std_rad_s", "stribeck_velocity_std_m_s"),
     "joint_stiffness": ("joint_stiffness_N_m_rad", "joint_stiffness_N_m"),
     "joint_damping": ("joint_damping_N_m_s_rad", "joint_damping_N_s_m"),

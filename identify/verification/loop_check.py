@@ -21,7 +21,7 @@ from dynamics.errors import DynamicsError, SimulationError
 from identify.arrays import Array
 from identify.loop_parameters import steps_needed
 from identify.scenario import Excitation
-from identify.scenario.plant_sections import Control
+from identify.scenario.loop_sections import Control
 from identify.verification.finding import Finding
 
 

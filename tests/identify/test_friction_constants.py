@@ -1,13 +1,22 @@
-"""Constants of the law of friction, which are estimated beside the parameters when asked for."""
+"""What the law of friction leaves open: it is estimated beside the parameters when asked for."""
 
 import numpy as np
 import pytest
 
-from identify.errors import ScenarioError
+from dynamics.closed_loop import Drives
+from dynamics.errors import SimulationError
+from identify.errors import EstimationError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.model.error_modes import error_modes
-from tests.identify.synthetic import problem_of, quick, rss6, run_plant, truth
+from tests.identify.synthetic import (
+    build_plant,
+    problem_of,
+    quick,
+    rss6,
+    run_plant,
+    truth,
+)
 
 TRUE = {"friction": "stribeck", "static_ratio": 1.3, "stribeck_velocity_rad_s": 0.05}
 GUESSED = {"friction": "stribeck", "static_ratio": 1.15, "stribeck_velocity_rad_s": 0.03}
@@ -19,6 +28,23 @@ def scenario_with(plant, model):
     keys = {f"plant.{key}": value for key, value in plant.items()}
     keys |= {f"model.{key}": value for key, value in model.items()}
     return quick(**{"identification.method": "command_driven"} | keys)
+
+
+@pytest.mark.slow
+def test_the_friction_of_both_directions_is_found_with_its_deviations():
+    offsets = 0.6 * truth()[rss6().layout.coulomb] * [1, -1, 1, -1, -1, 0]
+    plant = {"friction_offset_N_m": offsets.tolist()}
+    record, _ = run_plant(scenario_with(plant, {}), 0)
+    store_anchor(record, ScaleAnchor("platform_mass", truth()[0], 1e-3))
+    found = identify(record, rss6(), scenario_with(plant, {"friction_offset_std_N_m": 0.1}))
+    assert found.explained
+    errors = found.common_errors
+    assert errors.names == tuple(f"friction.offset_joint{joint}_N m" for joint in range(1, 7))
+    assert (np.abs(errors.estimate - offsets) < 4 * errors.std).all()
+    assert (errors.std < 2e-3).all()
+    z = ((found.estimate - truth()) / found.std)[found.identifiable]
+    assert len(z) >= 20
+    assert np.sqrt(np.mean(z**2)) < 1.5
 
 
 @pytest.mark.slow
@@ -62,3 +88,26 @@ def test_constants_of_another_law_are_refused():
     record, _ = run_plant(quick(), 0, duration_s=2.2)
     with pytest.raises(ScenarioError, match=r"model.friction = 'coulomb_viscous', but static_rat"):
         problem_of([record], scenario_with({}, {"static_ratio_std": 0.1}))
+
+
+def test_offsets_of_friction_are_within_it_and_need_an_integral():
+    def plant(value, **more):
+        return build_plant(scenario_with({"friction_offset_N_m": value} | more, {}), rss6())
+
+    with pytest.raises(ScenarioError, match=r"_N_m has 2 values, but rss6 has 6 joints"):
+        plant([0.1, 0.1])
+    with pytest.raises(ScenarioError, match=r"joint 3 is 0.05 N m, beyond its Coulomb friction of"):
+        plant(0.05)
+    with pytest.raises(SimulationError, match="under the law pd it is an error of the joint's"):
+        plant(0.01, drive="pd")
+    with pytest.raises(SimulationError, match=r"offsets of 1 joints, the robot has 6"):
+        Drives(friction_offset=(0.1,)).offsets(6)
+    record, _ = run_plant(quick(), 0, duration_s=2.2)
+    for drive in ("pd", "auto"):
+        with pytest.raises(ScenarioError, match="needs a law with an integral"):
+            problem_of(
+                [record], scenario_with({}, {"friction_offset_std_N_m": 0.1, "drive": drive})
+            )
+    torques = record.assign_attrs(law="computed_torque", torque_commands=1)
+    with pytest.raises(EstimationError, match="no constant of the law of friction is estimated"):
+        problem_of([torques], scenario_with({}, {"friction_offset_std_N_m": 0.1}))
