@@ -12,12 +12,12 @@ from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
-from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.stereo_rig import StereoRig, radius_at
 from cmmsim.measuring.layout_search import SMALLEST_STEP
 from cmmsim.measuring.observation import DetectionSettings
 from cmmsim.measuring.print_allowance import print_allowance
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.teaching import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.teaching import WindowSizes, largest_radius, window_sizes
 from cmmsim.uncertainty.known_rig import KnownRig
 
 

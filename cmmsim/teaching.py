@@ -317,20 +317,6 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
     return WindowSizes(2 * int(0.5 * WINDOW_SHARE * fit), fit, fit / smallest)
 
 
-def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
-    """Return the image radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
-
-    The sticker faces the camera that shows it larger.
-    """
-    distances = [
-        float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera
-    ]
-    return max(
-        radius * float(camera.focal_lengths.max()) / distance
-        for camera, distance in zip(rig.cameras, distances, strict=True)
-    )
-
-
 def largest_radius(
     rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
 ) -> float:

@@ -19,6 +19,7 @@ from cmmsim.files.rig_and_bodies import MarkedBody, lens_from_file, rig_from_fil
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
+from cmmsim.geometry.stereo_rig import radius_at
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.painted_stickers import painter_of
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
@@ -32,13 +33,14 @@ from cmmsim.imaging.scene_bodies import (
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.uncertainty.known_rig import rig_changes
+from cmmsim.without_images.centre_errors import CentreErrors
 from cmmsim.without_images.drawn_stickers import (
     STATISTICAL,
     Light,
     StatisticalStereoCamera,
-    require_proved,
 )
 from cmmsim.without_images.sticker_scene import StickerScene
+from cmmsim.without_images.verified import require_proved
 
 # Renderers to which a body is the convex hull of its mesh.
 SEE_HULLS = ("analytic", "statistical")
@@ -201,7 +203,17 @@ class TrueCameras:
             list(self.obstacles),
             self._file.timing.exposure,
             self.right_later,
+            self._centre_errors(),
         )
+
+    def _centre_errors(self) -> CentreErrors | None:
+        """Return the errors of centres without images by uneven print and outlines, or None."""
+        file = self._file
+        if file.print.unevenness == 0.0 and file.print.outline == 0.0:
+            return None
+        target = np.array(file.rig.target)
+        size = radius_at(self.rig, self.camera_from_base, target, file.stickers.radius)
+        return CentreErrors.of(file, size, sum(len(body.sticker_places) for body in self.scene))
 
     def _drawing(self) -> VirtualStereoCamera:
         """Return cameras that draw images.

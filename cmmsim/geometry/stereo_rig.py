@@ -291,3 +291,17 @@ def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
         np.ascontiguousarray(right.T, dtype=np.float64),
     )
     return (homogeneous[:3] / homogeneous[3]).T
+
+
+def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
+    """Return the image radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
+
+    The sticker faces the camera that shows it larger.
+    """
+    distances = [
+        float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera
+    ]
+    return max(
+        radius * float(camera.focal_lengths.max()) / distance
+        for camera, distance in zip(rig.cameras, distances, strict=True)
+    )

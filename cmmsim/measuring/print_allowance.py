@@ -63,6 +63,18 @@ class PrintAllowance:
         return np.asarray(self.constant_px**2 * np.linalg.inv(known))
 
 
+def centre_errors_px(file: SensorFile, radius_px: float) -> tuple[float, float]:
+    """Return the rms of constant and of changing errors of centres by print, px.
+
+    ``radius_px`` is the radius of a sticker in the image. The errors are those of a fit that allows
+    for light that rises.
+    """
+    sizes = print_sizes(file)
+    both = np.array([sizes.unevenness, sizes.outline * radius_px])
+    changing = CHANGING_BLURRED if file.lens.psf_px > 0.0 else CHANGING
+    return float(np.linalg.norm(CONSTANT * both)), float(np.linalg.norm(changing * both))
+
+
 def print_allowance(
     file: SensorFile, noise: CameraNoise, radius_px: float, fit_size: int
 ) -> PrintAllowance:
@@ -82,8 +94,7 @@ def print_allowance(
     misfit = share * (both[0] ** 2 + 2.0 / radius_px * (both[1] ** 2 + rim**2))
     misfit *= (bright - noise.black_level) ** 2 / float(noise.variance(np.array(bright)))
     return PrintAllowance(
-        float(np.linalg.norm(CONSTANT * both)),
-        float(np.linalg.norm((CHANGING_BLURRED if file.lens.psf_px > 0.0 else CHANGING) * both)),
+        *centre_errors_px(file, radius_px),
         float(np.linalg.norm(np.multiply(SHAPE, [*both, rim]))),
         FitLimits.largest_misfit + MISFIT_SPREAD * misfit,
         0.0 if both.any() else LARGEST_LIGHT,

@@ -19,6 +19,7 @@ from cmmsim.detection.fit_kernels import (
     light_of_moving,
     mask_ring,
 )
+from cmmsim.detection.light_kernels import LIT_UNKNOWNS, accumulate_lit
 from cmmsim.geometry.camera_kernels import length_of
 from cmmsim.geometry.matrix_kernels import factorise, invert_factored
 
@@ -88,6 +89,41 @@ def fit_covariances(
         )
         for k in range(UNKNOWNS):
             normal[k, k] += 1e-9  # as in fit_window
+        factorise(normal)
+        invert_factored(normal, covariances[n])
+
+
+@compiled
+def lit_covariances(
+    centres: Array,
+    shapes: Array,
+    smears: Array,
+    contrasts: Array,
+    grounds: Array,
+    size: int,
+    settings: FitSettings,
+    covariances: Array,
+) -> None:
+    """Fill the covariances as ``fit_covariances`` does, if light that rises is fitted as well."""
+    mask = np.empty((size, size), np.bool_)
+    window = np.empty((size, size))
+    shares = np.empty((size, size))
+    derivatives = np.empty((size, size, 5))
+    normal = np.empty((LIT_UNKNOWNS, LIT_UNKNOWNS))
+    right = np.empty(LIT_UNKNOWNS)
+    parameters = np.zeros(LIT_UNKNOWNS)
+    for n in range(len(centres)):
+        parameters[:2] = centres[n]
+        parameters[5] = contrasts[n]
+        parameters[6] = grounds[n]
+        mask_ring(parameters, shapes[n], settings.ring_reach, mask)
+        light_of_moving(parameters, shapes[n], smears[n], settings, shares, derivatives)
+        for i in range(size):
+            for j in range(size):
+                window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
+        accumulate_lit(
+            window, mask, shares, derivatives, parameters, centres[n], settings, normal, right
+        )
         factorise(normal)
         invert_factored(normal, covariances[n])
 

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.allowed_plugins import DEFAULT_DETECTOR, RENDERERS
+from cmmsim.allowed_plugins import RENDERERS
 from cmmsim.detection.detector import DetectedCentres
-from cmmsim.detection.ellipse_fit import RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, fit_settings
+from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, EllipseFits, fit_settings
 from cmmsim.errors import CmmError
-from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import curvature_shift, distort_outlines, project_discs
 from cmmsim.geometry.pose import IDENTITY, Array, frozen, rigid, transforms_of
@@ -31,17 +30,15 @@ from cmmsim.imaging.renderer import Renderer
 from cmmsim.imaging.scene_bodies import PlacedBodies
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.observation import Observer
-from cmmsim.radiometry.noise import NO_SWING, CameraNoise
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.without_images.centre_errors import CentreErrors
 from cmmsim.without_images.sticker_scene import StickerScene
+from cmmsim.without_images.verified import NAME, require_short
 
 if TYPE_CHECKING:
-    from cmmsim.without_images.drawn_fit_kernels import Ellipses, Windows
+    from cmmsim.detection.fit_kernels import FitSettings
+    from cmmsim.without_images.drawn_fit_kernels import Ellipses, Fits, Windows
 
-NAME = "statistical"
-WIDEST_PSF_PX = 1.0
-LONGEST_STREAK_PX = 4.0
-# Grey values must be this many standard deviations of noise away from black and white.
-CLIPPED = 3.0
 THIN_PX = 0.885
 """Half width of an ellipse at which half of the fits end at the smallest allowed ellipse.
 
@@ -66,65 +63,6 @@ class Light:
     print: PrintSizes
 
 
-def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
-    """Raise CmmError, with the key and its limit, for a sensor outside the verified conditions."""
-    ring, bright = (
-        float(noise.mean_grey(np.array(level))) for level in (light.ring, light.sticker)
-    )
-    low, high = (float(np.sqrt(noise.variance(np.array(grey)))) for grey in (ring, bright))
-    stickers = file.stickers
-    detector = file.detection.detector
-    others = {
-        "print.unevenness": file.print.unevenness,
-        "print.outline": file.print.outline,
-        "light.lamps": len(file.light.lamps),
-        "light.fall_off": file.light.fall_off,
-        "light.clutter": file.light.clutter,
-        "lens.aperture": file.lens.aperture,
-        "lens.ghost": file.lens.ghost,
-        "timing.row_time": file.timing.row_time,
-    }
-    wrong = [
-        (detector != DEFAULT_DETECTOR, f"detection.detector {detector!r}", DEFAULT_DETECTOR),
-        (stickers.dark, "dark stickers", "bright ones in dark rings"),
-        (not noise.enabled, "camera.noise false", "true: without noise, rounding alone decides"),
-        (noise.prnu > 0.0 or noise.dsnu > 0.0, f"camera.prnu {noise.prnu:g}, dsnu {noise.dsnu:g}",
-         "0: a fixed pattern is the same in each frame"),
-        (low**2 < NO_SWING, f"noise of {low:.2g} grey values in the dark", "at least "
-                                                                           f"{NO_SWING**0.5:.2g}"),
-        (ring < CLIPPED * low or bright > noise.white_level - CLIPPED * high,
-         f"rings and stickers of {ring:.0f} and {bright:.0f} grey values",
-         f"{CLIPPED:g} standard deviations of noise within 0 to {noise.white_level}"),
-        (file.lens.psf_px > WIDEST_PSF_PX, f"lens.psf_px {file.lens.psf_px:g}", "at most "
-                                                                                f"{WIDEST_PSF_PX:g}"),
-        (stickers.ring_radius < RING_REACH * stickers.radius, "stickers.ring_radius "
-                                                              f"{stickers.ring_radius:g} m",
-         f"at least {RING_REACH:g} times radius {stickers.radius:g} m"),
-        *((value != 0, f"{key} {value:g}", "0") for key, value in others.items()),
-    ]  # fmt: skip
-    for refused, what, needed in wrong:
-        if refused:
-            raise CmmError(_not_proved(what, needed))
-
-
-def require_short(longest_px: float) -> None:
-    """Raise CmmError if the motion blur of a sticker exceeds the verified length."""
-    if longest_px > LONGEST_STREAK_PX:
-        raise CmmError(
-            _not_proved(
-                f"stickers that move by {longest_px:.1f} px during the exposure",
-                f"at most {LONGEST_STREAK_PX:g} px",
-            )
-        )
-
-
-def _not_proved(what: str, needed: str) -> str:
-    return (
-        f"renderer {NAME!r} is not verified for {what}, only for {needed}; use the renderer "
-        "analytic or pyrender"
-    )
-
-
 def refuse_images(*_: object, **__: object) -> NoReturn:
     """Raise CmmError, with the names of the renderers that draw images."""
     drawing = ", ".join(name for name in RENDERERS if name != NAME)
@@ -144,7 +82,7 @@ class StatisticalStereoCamera:
     They correspond to `VirtualStereoCamera`, but draw no images. ``rig`` and ``camera_from_base``
     (4, 4) are the true values. ``exposure`` is the exposure time and ``right_later`` the delay of
     the right camera, s. ``obstacle_names`` are the names of the scene's solids after platform and
-    base.
+    base. ``print_errors`` has the errors of centres by uneven print and outlines, or None.
     """
 
     rig: StereoRig
@@ -154,6 +92,7 @@ class StatisticalStereoCamera:
     obstacle_names: Sequence[str] = ()
     exposure: float = 0.0
     right_later: float = 0.0
+    print_errors: CentreErrors | None = None
 
     def look(
         self,
@@ -310,6 +249,8 @@ class DrawnStickers:
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
         noise = self.rng.standard_normal((2, len(seen[0]), 6))
         at, shape, smear = (np.stack(values) for values in (centres, shapes, smears))
+        if camera.print_errors is not None:
+            at = camera.print_errors.added_to(at, self.rng)
         return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
@@ -369,6 +310,8 @@ class DrawnStickers:
             how,
             found,
         )
+        if settings.allowed.largest_light == 0.0:
+            found = self._lit(found, windows, how)
         return EllipseFits(
             found.centres,
             found.covariances[:, :2, :2],
@@ -380,6 +323,35 @@ class DrawnStickers:
             found.grounds,
             np.zeros((count, 5)),
         )
+
+    def _lit(self, even: "Fits", windows: "Windows", how: "FitSettings") -> "Fits":
+        """Return the simulated fits in windows, if light that rises is fitted in each of them.
+
+        ``even`` are the fits without such light.
+        """
+        from cmmsim.without_images.drawn_fit_kernels import lit_covariances
+
+        at = windows.sides, windows.stickers
+        ellipses = self._found
+        covariances = np.array(even.covariances)
+        own = np.flatnonzero(even.good)
+        found = np.empty((len(own), 5, 5))
+        lit_covariances(
+            (ellipses.centres[at] - windows.corners)[own],
+            ellipses.shapes[at][own],
+            ellipses.smears[at][own],
+            even.contrasts[own],
+            even.grounds[own],
+            windows.size,
+            how,
+            found,
+        )
+        covariances[own] = found
+        roots = np.linalg.cholesky(covariances)
+        off = np.einsum("kij,kj->ki", roots, ellipses.noise[at][:, :5])
+        shapes = ellipses.shapes[at] + off[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        centres = ellipses.centres[at] + off[:, :2]
+        return even._replace(centres=centres, shapes=shapes, covariances=covariances)
 
 
 def _empty_windows(count: int, observer: Observer) -> "Windows":

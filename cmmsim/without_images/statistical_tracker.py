@@ -44,9 +44,9 @@ from cmmsim.without_images.drawn_stickers import (
     THIN_STD_PX,
     DrawnStickers,
     StatisticalStereoCamera,
-    require_short,
 )
 from cmmsim.without_images.sticker_scene import CLEAR
+from cmmsim.without_images.verified import require_short
 
 # Tabulated values of p and of q.
 OVAL = np.linspace(-0.78, 0.78, 14)

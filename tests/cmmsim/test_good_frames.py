@@ -71,11 +71,11 @@ def test_good_frames_are_not_lost(taught, monkeypatch, record_property, frames):
     sensor = cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic")
     drawn, draw = {}, VirtualStereoCamera.radiances
 
-    def radiances(camera, moments, corners, size, supersampling):
+    def radiances(camera, moments, corners, size, supersampling, sweeps=None):
         key = corners[0].tobytes()
         if key not in drawn:
             drawn.clear()
-            drawn[key] = draw(camera, moments, corners, size, supersampling)
+            drawn[key] = draw(camera, moments, corners, size, supersampling, sweeps)
         return drawn[key]
 
     monkeypatch.setattr(VirtualStereoCamera, "radiances", radiances)

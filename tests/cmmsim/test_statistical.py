@@ -25,8 +25,9 @@ from cmmsim.without_images.drawn_frame_kernels import (
     observe,
     triangulate_stickers,
 )
-from cmmsim.without_images.drawn_stickers import LONGEST_STREAK_PX, THIN_PX, THIN_STD_PX
+from cmmsim.without_images.drawn_stickers import THIN_PX, THIN_STD_PX
 from cmmsim.without_images.statistical_tracker import StatisticalTracker
+from cmmsim.without_images.verified import LONGEST_STREAK_PX
 from tests.cmmsim import plain
 from tests.cmmsim.sensors import (
     LENSES,

@@ -11,7 +11,8 @@ import pytest
 import cmmsim
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, rotation_log
-from cmmsim.teaching import exactly_taught, radius_at, window_sizes
+from cmmsim.geometry.stereo_rig import radius_at
+from cmmsim.teaching import exactly_taught, window_sizes
 from tests.cmmsim.plain import rigid_start
 from tests.cmmsim.sensors import LEFT, refused, squares
 
