@@ -18,6 +18,7 @@ from identify.files.run_folder import RunFolder
 from identify.progress import Progress, SilentProgress
 from identify.reporting import paper
 from identify.reporting.figures.style import PALETTE, drawn, svg_text
+from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals
 from identify.reporting.number_format import typographic
 from identify.reporting.pictures import Picture, pictures
@@ -89,6 +90,7 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
     """
     judgement = verdict(data.result, data.cameras_consistent)
     goals = check_goals(data.result)
+    missed = [goal for goal in goals if not goal.passed]
     return (
         page_environment()
         .get_template("report.html.j2")
@@ -98,7 +100,8 @@ def render(data: RunData, shown: Mapping[str, Picture], drawings: Mapping[str, s
             verdict=judgement,
             numbers=key_numbers(data.result),
             goals=goals_table(data.result),
-            missed=sum(not goal.passed for goal in goals),
+            missed=len(missed),
+            advices=advices(missed, data.result, data.folder),
             goal_count=len(goals),
             **{
                 kind: [_sentence(text) for text in data.result["identification"].get(kind, [])]

@@ -6,6 +6,7 @@ A record of a real robot has less data than a simulated run.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ class RunData:
 
     Attributes
     ----------
+    folder
+        Folder of the run.
     result
         Content of `result.json`.
     experiment, truth
@@ -55,6 +58,7 @@ class RunData:
         Trajectories of excitation and validation.
     """
 
+    folder: Path
     result: dict[str, Any]
     experiment: xr.Dataset
     truth: xr.Dataset | None
@@ -194,6 +198,7 @@ def read_run(run: RunFolder) -> RunData:
     run.require(*(["validation.nc"] if simulated else []), "model.nc")
     result = _checked_result(run, files, simulated)
     data = RunData(
+        folder=run.path,
         result=result,
         experiment=files.experiment,
         truth=read_truth(run.experiment) if simulated else None,

@@ -13,7 +13,11 @@ from identify.experiment.truth import true_poses, true_values
 from identify.files.run_folder import rms_figures
 from identify.loop_parameters import parameter_column, parameter_entries, settled_drive
 from identify.record import recording
+from identify.record.stored_common_errors import read_common_errors
 from identify.validation.pose_prediction import PosePrediction
+
+SENSOR_KINDS = ("rig", "exposure", "teaching")
+"""Kinds of errors that all poses of a sensor have in common."""
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
@@ -57,7 +61,9 @@ def check_intervals(identification: dict[str, Any]) -> None:
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     """Compare the sensor with the truth over all pairs of record and truth.
 
-    The entry also has the speed of rendering and measuring in one process.
+    The entry also has the speed of rendering and measuring in one process, the noise that the
+    sensor states, the standard deviation of the errors that all its poses have in common, and why
+    the first frame was lost.
     """
     errors = np.vstack(
         [recording.poses(record, "measured") - true_poses(truth) for record, truth in runs]
@@ -65,12 +71,32 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     # A lost frame has no pose, and is only counted as lost.
     ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
     seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
+    covariances = np.concatenate([record["measured_covariance"].values for record, _ in runs])
+    common = np.concatenate([_common_variances(record) for record, _ in runs])
+    why = [text for record, _ in runs if (text := record.attrs.get("lost_frames"))]
     return {
         "frames": len(ok),
         "lost_frames": int(np.sum(~ok)),
+        **({"lost_because": str(why[0]).split("; ")[0]} if why else {}),
         "stereo_frames_per_second": len(ok) / seconds,
         **rms_figures(errors, ok),
+        **_stated("noise", np.diagonal(covariances[ok], axis1=1, axis2=2)),
+        **_stated("common", common[ok]),
     }
+
+
+def _common_variances(record: xr.Dataset) -> Array:
+    """Return the variances (N, 6) of the errors of the sensor that all poses have in common."""
+    errors = read_common_errors(record, SENSOR_KINDS)
+    if not errors.names:
+        return np.zeros((record.sizes["time"], 6))
+    return np.asarray(np.sum((errors.changes @ errors.factor) ** 2, axis=2))
+
+
+def _stated(what: str, variances: Array) -> dict[str, list[float]]:
+    """Return the root mean square of stated variances (N, 6) [m^2, rad^2], in um and urad."""
+    std = 1e6 * np.sqrt(variances.mean(axis=0)) if len(variances) else np.full(6, np.nan)
+    return {f"position_{what}_um": std[:3].tolist(), f"orientation_{what}_urad": std[3:].tolist()}
 
 
 def validation_entry(

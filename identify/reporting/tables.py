@@ -16,6 +16,7 @@ import typer
 from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_table
 from identify.reporting import paper
+from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals, explanation_goals
 from identify.reporting.number_format import number, with_deviation
 from identify.reporting.settings import changed_settings
@@ -301,16 +302,26 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
             "the model does NOT explain the record: the model is wrong, or the errors of the "
             "cameras exceed their stated noise"
         )
+    missed = [goal for goal in goals if not goal.passed]
+    for one, _ in advices(missed, result, path.parent):
+        typer.echo(f"likeliest cause: {one.cause}")
+        typer.echo(f"next: {one.command}")
     typer.echo(f"result: {path}")
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """Print the goals of a run with their values, the missed goals, and the path of the report."""
+    """Print the goals of a run with their values, and the path of the report.
+
+    Missed goals follow with their likeliest causes and the command to type next.
+    """
     table = goals_table(result)
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note
     )
-    for goal in check_goals(result):
-        if not goal.passed:
-            typer.echo(f"missed: {goal.name}: {goal.detail}")
+    missed = [goal for goal in check_goals(result) if not goal.passed]
+    for goal in missed:
+        typer.echo(f"missed: {goal.name}: {goal.detail}")
+    for one, names in advices(missed, result, report.parent):
+        typer.echo(f"likeliest cause ({', '.join(names)}): {one.cause}")
+        typer.echo(f"next: {one.command}")
     typer.echo(f"report: {report}")

@@ -95,7 +95,10 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
         headline = EXPLAINED if explained else _disagreement(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
     if not missed:
-        return Verdict(True, "The identified model moves as the true robot does.", tuple(sentences))
+        shifted = goals.unseen(result).with_cameras
+        words = "With the estimated errors of the cameras, the" if shifted else "The"
+        headline = f"{words} identified model moves as the true robot does."
+        return Verdict(True, headline, tuple(sentences))
     if not explained:
         return Verdict(False, _disagreement(consistent, result), tuple(sentences))
     counted = f"{len(missed)} of {len(judged)} goals {'is' if len(missed) == 1 else 'are'} not met."
@@ -131,11 +134,11 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
     )
     identified = KeyNumber(f"{known}", f"of {len(parameters)}", meaning)
     if validation:
-        rows = np.array([rms_row(run["true"])[:3] for run in validation])
+        found = goals.unseen(result)
         predicted = KeyNumber(
-            number(float(rows.max()), 2),
+            number(float(found.rows[:, :3].max()), 2),
             "µm",
-            "error of the identified model on validation trajectories, against the true robot.",
+            f"error of the {found.what} on validation trajectories, against the true robot.",
         )
         measured = max(rms_row(result["sensor"])[:3])
         measurement = KeyNumber(
@@ -158,10 +161,11 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     """State the errors of both models against the true robot on validation trajectories."""
     runs = result["validation"]
-    identified = np.array([rms_row(run.get("true")) for run in runs])
+    found = goals.unseen(result)
+    identified = found.rows
     initial = np.array([rms_row(run.get("initial_true")) for run in runs])
     turns = bool((identified[:, 3:] != 0).any())
-    text = f"On {len(runs)} validation trajectories, the identified model "
+    text = f"On {len(runs)} validation trajectories, the {found.what} "
     if np.isfinite(identified).all():
         text += (
             f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
