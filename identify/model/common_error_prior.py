@@ -105,15 +105,22 @@ def loop_error_stds(
     """Return the standard deviations of the errors in the loop by name, of some kinds.
 
     Errors that are assumed to be zero are left out. latency_std_s: of the mean latency. Raises
-    ScenarioError for standard deviations of another kind of actuators or law of friction.
+    ScenarioError for standard deviations of another kind of actuators or law of friction, and for
+    those of friction if this kind is left out.
     """
     found = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
     zero = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
     layout = robot.layout
     found |= {zero_name(joint, layout.joint_unit): zero for joint in range(layout.joints)}
     found[SCALE] = model.command_scale_std if "scale" in kinds else 0.0
-    if FRICTION in kinds:
-        found |= _friction_stds(robot, model)
+    friction = _friction_stds(robot, model)
+    stated = ", ".join(name for name, std in friction.items() if std)
+    if stated and FRICTION not in kinds:
+        raise ScenarioError(
+            f"the model states how well {stated} are known, but identification.nuisances leaves "
+            "'friction' out"
+        )
+    found |= friction
     return {name: std for name, std in found.items() if std}
 
 

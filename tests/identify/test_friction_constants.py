@@ -86,6 +86,11 @@ def test_their_modes_are_the_changes_of_the_poses():
 
 def test_constants_of_another_law_are_refused():
     record, _ = run_plant(quick(), 0, duration_s=2.2)
+    ours = {"model.friction_offset_std_N_m": 0.1, "identification.nuisances": ["zeros"]}
+    with pytest.raises(
+        ScenarioError, match=r"friction.offset_joint1_N m, .* leaves 'friction' out"
+    ):
+        problem_of([record], quick(**ours))
     with pytest.raises(ScenarioError, match=r"model.friction = 'coulomb_viscous', but static_rat"):
         problem_of([record], scenario_with({}, {"static_ratio_std": 0.1}))
 
