@@ -70,6 +70,12 @@ UNIFORM = {
 }
 """Figures of simulation-based calibration."""
 
+POSES = {
+    "poses_covered_percent": "coordinates of predicted poses within 95 % intervals, %",
+    "poses_inner_covered_percent": "within 68.3 % intervals, %",
+}
+"""Its figures of predicted poses, which older kept answers lack."""
+
 ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "friction_timing": (
         {
@@ -133,6 +139,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
     "answer_calibration_robots.md": kept_figures.answer(
         "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
     ),
+    "answer_calibration_full.md": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
     **{f"answer_{name}.md": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws.md": kept_figures.answers(
         at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED

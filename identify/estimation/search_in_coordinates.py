@@ -36,14 +36,18 @@ class InCoordinates:
 
     def cost(self, coordinates: Array) -> float:
         """Return the cost at coordinates (p,)."""
-        return self.problem.cost(self.bounds.parameters(coordinates))
+        return self.problem.cost(self.parameters(coordinates))
 
     def linearise(self, coordinates: Array) -> Linearisation:
         """Return cost and linearisation at coordinates (p,)."""
-        # far steps in logarithms of a body can make it larger than any number
-        with np.errstate(over="ignore"):
-            cost, factor, residual = self.problem.linearise(self.bounds.parameters(coordinates))
+        cost, factor, residual = self.problem.linearise(self.parameters(coordinates))
         return cost, factor @ self.bounds.slope(coordinates), residual
+
+    def parameters(self, coordinates: Array) -> Array:
+        """Return the parameters (p,) of coordinates (p,), infinite or NaN for far steps."""
+        # The exponentials of log-Cholesky coordinates can make a body larger than any number.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.bounds.parameters(coordinates)
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class _LinearInParameters(InCoordinates):
 
     def linearise(self, coordinates: Array) -> Linearisation:
         """Return the cost at coordinates (p,), and the linearisation at their parameters."""
-        return self.problem.linearise(self.bounds.parameters(coordinates))
+        return self.problem.linearise(self.parameters(coordinates))
 
 
 @dataclass(frozen=True)
