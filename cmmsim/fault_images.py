@@ -1,6 +1,6 @@
 """Images with a fault laid over them: marks painted into their grey values, or both images swapped.
 
-Marks are opaque discs and plates, added light, and whole images of one level. They are laid over
+Marks are opaque discs and plates, added light, and whole images of one radiance. They lie over
 grey values that already contain noise. If a mark hides the share s of a pixel, the pixel's new
 light is (1 - s) of its old light plus s of the mark's light. Noise is then added until the pixel's
 variance equals the camera's variance at the new mean.
@@ -161,9 +161,10 @@ class FillMark:
 def paint(
     grey: Array, corner: NDArray[np.int_], mark: Mark, noise: CameraNoise, rng: np.random.Generator
 ) -> None:
-    """Lay a mark over a part of an image: float grey values (h, w), which are changed in place.
+    """Lay a mark over a part of an image, in place.
 
-    The part begins at pixel ``corner`` (x, y) of the image.
+    ``grey`` (h, w) are the part's grey values as floats. The part begins at pixel ``corner`` (x, y)
+    of the image.
     """
     first_x, first_y, last_x, last_y = mark.box()
     height, width = grey.shape
@@ -279,16 +280,18 @@ class FaultyImages:
         )
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Return the grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n,
-        2) as (x, y).
+        """Return the grey values (2, n, size, size) of windows.
+
+        ``corners`` (2, n, 2) are the first pixels of the windows, as (x, y).
         """
         order = slice(None, None, -1) if self._fault.swapped else slice(None)
         windows = self._images.windows(corners[order], size)[order]
         return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
 
     def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Lay the marks over parts ``images`` (n, h, w) of one image that begin at ``corners`` (n,
-        2).
+        """Return parts ``images`` (n, h, w) of one image with the marks over them.
+
+        ``corners`` (n, 2) are the first pixels of the parts, as (x, y).
         """
         marks = [m for m in self._fault.marks if m.side == side]
         if not marks:

@@ -326,7 +326,7 @@ class Sensor(Instrument):
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
         """Measure a platform at rest in many frames, without dropouts.
 
-        The search in windows takes place even with the renderer "statistical".
+        Stickers are searched in windows even with the renderer "statistical".
 
         Parameters
         ----------
@@ -371,9 +371,9 @@ class Sensor(Instrument):
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """Return a tracker, which measures frame after frame."""
-        # The faster tracker knows each sticker of the scene, and teaching can lack some.
+        # The faster tracker needs every sticker of the platform in the scene,
         whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
-        # It knows no print either.
+        # and stickers whose print is perfect.
         perfect = self._file.print.is_perfect
         if (
             self.renderer != STATISTICAL.name

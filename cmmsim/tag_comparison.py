@@ -39,7 +39,7 @@ from cmmsim.geometry.pose import (
     transform_to_pose,
 )
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import triangulate
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.plates import plates_image
 from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, print_renderer

@@ -60,7 +60,7 @@ PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
 # a sticker's radius at the rig's target.
 ROOM = 1.35
-# px: smallest free margin around the largest sticker at teaching. Rounding can use up half a pixel.
+# Smallest free margin around the largest sticker at teaching, px. Rounding can use up half of one.
 SMALLEST_ROOM_PX = 0.7
 SMALLEST_FIT = 12
 SMALLEST_BLURRED_FIT = 14
@@ -163,7 +163,7 @@ class Teacher:
     def _warn_of_parted_rays(self, base: StickerObservation) -> None:
         """Warn if the two rays of the base's stickers are farther apart than noise explains.
 
-        Known errors of rig or print part them as well, so they are then not tested.
+        Known errors of the rig or of print also separate the rays, which are then not tested.
         """
         settings = self.observer.settings
         exact = settings.line_error_px == 0.0 and not settings.allowed.known
@@ -191,8 +191,9 @@ class Teacher:
         quality: Quality,
         window_size: int,
     ) -> StickerObservation:
-        """Observe all stickers of a body in averaged exposures. Raises LostError if a sticker is
-        missing.
+        """Observe all stickers of a body in averaged exposures.
+
+        Raises LostError if a sticker is missing.
         """
         usual = self.observer.settings
         # Averaged exposures have so little noise that errors of the model dominate the misfit, so

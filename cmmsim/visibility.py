@@ -64,7 +64,7 @@ class SightLines:
 def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
     """Return the sight lines of a built-in sensor or a sensor file, with changes to its entries.
 
-    Raises UnknownSensorError, SensorFileError.
+    Raises UnknownSensorError or SensorFileError.
     """
     file = read_sensor_file(name, changes)
     rig, camera_from_base = rig_from_file(file.rig)

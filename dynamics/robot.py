@@ -281,10 +281,11 @@ class Robot(RobotDynamics):
     def with_passive_friction(self, names: Sequence[str]) -> Robot:
         """Robot whose passive joints have friction, with one parameter for each name.
 
-        A passive joint is named by the body outwards from it. Joints at the same place of all legs
-        share a parameter, or each leg has its own, such as "link3_joint.viscous". The friction is
-        viscous or dry, see `rigid_body.passive_friction`. A leg's own parameter begins with the
-        value that all legs shared, and others with zero, so that the robot moves as before.
+        A passive joint has the name of the body that follows it on the way to the platform. A name
+        such as "link_joint.viscous" is a parameter that the joints at this place of all legs share,
+        and "link3_joint.viscous" is that of one leg. The friction is viscous or dry, see
+        `rigid_body.passive_friction`. The robot moves as before: a parameter of one leg begins with
+        the value that all legs shared, and a new parameter with zero.
 
         Parameters
         ----------
@@ -299,8 +300,8 @@ class Robot(RobotDynamics):
         Raises
         ------
         ParameterError
-            If there is no such parameter, or a joint has its own and that of all legs. The message
-            lists the valid names.
+            If there is no such parameter, or if a joint gets both its own parameter and that of all
+            legs. The message lists the valid names.
 
         Examples
         --------
@@ -310,7 +311,7 @@ class Robot(RobotDynamics):
         return self._in_form(passive_friction=tuple(names))
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
-        """Robot with another geometry, with the same kinds of legs, and functions of its own.
+        """Robot with another geometry that has the same kinds of legs. It gets its own functions.
 
         Parameters
         ----------

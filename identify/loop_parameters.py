@@ -67,14 +67,15 @@ LONGEST_STEP = 0.3
 def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:
     """Return the integration steps per frame of length `period`, s.
 
-    A model has as many as the fastest motion of the robot needs at home, with its initial guess.
+    A model has at least as many as the fastest motion of the robot needs at home, with its initial
+    guess.
     """
     if not isinstance(side, Model) or side.start_parameters not in robot.parameter_sets:
         return side.steps_per_frame
     try:
         needed = _steps_at_start(robot, side.start_parameters, drives_of(side, None), period)
     except DynamicsError:
-        # the same error is raised where the model is run, with all that is known there
+        # a run of the model raises the same error with more evidence
         return side.steps_per_frame
     return max(side.steps_per_frame, needed)
 
@@ -146,7 +147,7 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
 def in_form(robot: Robot, side: Plant | Model) -> Robot:
     """Return the robot with the bodies and the passive friction that plant or model state.
 
-    Bodies that it does not name stay as they are. Joints share their gains, or each has its own, as
+    Bodies without a statement stay as they are. Joints share their gains, or each has its own, as
     the plant or the model states. Raises ScenarioError, with the valid names, for a body or a
     passive joint that the robot does not have, and for shared gains that are unequal.
     """
@@ -181,7 +182,7 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
 def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
     """Return the robot with a full platform if it carries a load off the origin of its frame.
 
-    anchor: scale anchor. Only with the anchor payload there is a load.
+    anchor: scale anchor. There is a load only with the anchor payload.
     """
     full = robot.layout.full_bodies
     if anchor != "payload" or not load.off_origin or "platform" in full:
@@ -215,9 +216,9 @@ def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
 def known_value(values: Mapping[str, float], name: str) -> float | None:
     """Return the value of a parameter by name, also of a robot whose parameters have another form.
 
-    A first moment, product of inertia or passive friction without a value is zero. The gain of one
-    joint is the shared gain, and so is the friction of a passive joint. What is shared is the mean
-    over the joints. None: there is no value.
+    A first moment, product of inertia or passive friction without a value is zero. A gain or a
+    passive friction of one joint without a value is the shared one, and a shared one is the mean
+    over the joints. The result is None if there is no value.
     """
     if name in values:
         return float(values[name])

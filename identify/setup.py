@@ -111,7 +111,7 @@ class Setup:
 
     @cached_property
     def in_file(self) -> Robot:
-        """The robot as its file describes it, with a full platform where the load needs one."""
+        """The robot as its file describes it, with a full platform if the load needs one."""
         scenario = self.scenario
         robot = self.loaded or load_robot(scenario.robot)
         return carrying(robot, scenario.payload, scenario.identification.scale_anchor)
@@ -228,7 +228,7 @@ class Setup:
         progress : Progress, optional
             Display of the progress.
         payload : bool
-            Whether the platform carries the scenario's known load. A record with the load and a
+            True if the platform carries the scenario's known load. A record with the load and a
             record without it determine the scale. The record holds the stated load, and the truth
             holds the load that was drawn from the standard deviations.
 
@@ -366,9 +366,9 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
     Both run on the scenario's validation trajectories for this seed, each with its own friction law
-    and steps. An ideal sensor closes both loops, so the errors are caused only by the parameters
-    (p,) and by effects that the model lacks. They are NaN if, and only if, the model's loop is
-    unstable.
+    and integration steps. An ideal sensor closes both loops, so the errors are caused only by the
+    parameters (p,) and by effects that the model lacks. They are NaN if, and only if, the model's
+    loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
     range. Raises TrajectoryError if no validation trajectory is within the robot's limits.

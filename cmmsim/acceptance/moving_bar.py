@@ -59,8 +59,8 @@ SPEED_SAMPLES = 100
 STREAM = 101
 # Number of exposures of the bar at rest at the start of each run.
 STANDING_FRAMES = 15
-# Number of consecutive lost frames that ends a run. After each lost frame, the whole images are
-# searched, which takes time, and further frames would probably be lost as well.
+# Number of consecutive lost frames that ends a run. Further frames would probably be lost as well,
+# and the search of the whole images after each lost frame takes time.
 MOST_LOST_FRAMES = 5
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
@@ -108,7 +108,7 @@ class BarPath:
     def reach(self) -> Array:
         """Largest distances (3,), m, of the bar's middle from the middle of the volume.
 
-        The whole bar stays inside the volume.
+        At these distances, the whole bar is still inside the volume.
         """
         return 0.5 * self.volume.size - room_of_bar(self.along)
 
@@ -169,7 +169,7 @@ class BarRun:
 class BarTest:
     """Result of the bar test.
 
-    ``exposure`` is the exposure time, s, and ``largest_speed`` that of the bar, m/s.
+    ``exposure`` is the exposure time, s. ``largest_speed`` is the largest speed of the bar, m/s.
     """
 
     volume: MeasuringVolume

@@ -21,7 +21,8 @@ from cmmsim.calibration.sightings import SIDES, PairView
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import StereoPoints, StereoRig, triangulate
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.triangulation import StereoPoints, triangulate
 
 # Number of rounds in which the eccentricities of dots are corrected.
 ROUNDS = 3

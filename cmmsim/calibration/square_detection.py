@@ -1,4 +1,4 @@
-"""Detection of the corners of squares, of chessboards and of ChArUco boards, by OpenCV."""
+"""Detection of the inner corners of chessboards and ChArUco boards, by OpenCV."""
 
 import cv2
 import numpy as np
@@ -7,17 +7,17 @@ from numpy.typing import NDArray
 from cmmsim.calibration.board import Board
 from cmmsim.geometry.pose import Array
 
-# Half the width of cornerSubPix's window, over the distance between neighbouring corners.
+# Half the width of cornerSubPix's window, as a share of the distance between neighbouring corners.
 FINE_WINDOW_RATIO = 0.3
 # Fewest corners of a ChArUco board that determine its place.
 FEWEST_CORNERS = 4
-# Markers are painted over up to this fraction of the gap between marker and square, with this
-# percentile of the grey values of the square.
+# Share of the gap between marker and square that is painted over together with the marker.
 PAINTED = 0.5
+# Percentile of the grey values of the square that gives the grey value of the paint.
 PAPER_PERCENTILE = 90.0
 # Binary digits behind the point in the corners of painted polygons.
 SHIFT = 4
-# Distance of a corner from the plane's perspective image from which on it is left out of it.
+# A corner farther than this from its place by the homography of the board is an outlier.
 OUTLIER_PX = 2.0
 
 
@@ -62,9 +62,9 @@ def _refined(
 ) -> Array:
     """Return refined corners (n, 2) px of a ChArUco board.
 
-    OpenCV refines corners in windows that exclude the markers, which are small. Here the markers
-    with ``outlines`` (m, 4, 2) px are painted over, so that the windows can be as large as those of
-    a chessboard.
+    OpenCV refines corners in windows so small that they exclude the markers. Here the markers with
+    ``outlines`` (m, 4, 2) px are painted over, so that the windows can be as large as those of a
+    chessboard.
     """
     growth = board.spacing / (board.marker or board.spacing)
     painted = grey.copy()

@@ -20,7 +20,8 @@ from cmmsim.files.schema import (
     StickerPlane,
     unit,
 )
-from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
+from cmmsim.geometry.camera import Optics, PinholeCamera
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig

@@ -2,9 +2,9 @@
 
 **Ellipse.** Through a perfect lens the image of a disc is exactly an ellipse. Let C be the centre,
 n the unit normal and R the radius of the disc, in camera axes. Then D = C C' - R² (I - n n') is the
-dual conic of the rim. Transformed to pixels by the camera matrix, its last column gives the centre
-of the ellipse, and its upper left part gives the shape: a symmetric matrix A (2, 2) that maps the
-unit disc onto the ellipse.
+dual conic of the rim. The camera matrix transforms D to pixels. The last column then gives the
+centre of the ellipse, and the upper left part gives its shape: a symmetric matrix A (2, 2) that
+maps the unit disc onto the ellipse.
 
 **Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
 perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
@@ -21,14 +21,15 @@ For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 
 **Coverage.** By Green's theorem the area of the ellipse within a pixel is a sum of two parts. The
 first is the integral of (x - left) dy over the arcs of the rim inside the pixel, where left is the
 pixel's left side. The second is the integral of dy over the arcs that lie in the same row to the
-right of the pixel. An arc x = c + A u, u = (cos t, sin t), extends from one crossing of a line
-between pixels to the next. The integrals of u_i du_j along it follow from its ends and its angle. A
-change of c or A moves the rim by v = dc + dA u. It changes the share by the flux of v through the
-arcs inside the pixel, whose outward normal is (dy, -dx). This flux consists of the same integrals.
+right of the pixel. An arc x = c + A u, u = (cos t, sin t), ends where the rim crosses a side of a
+pixel. The integrals of u_i du_j along an arc follow from its ends and its angle. A change of c or A
+moves the rim by v = dc + dA u. It changes the area by the flux of v through the arcs inside the
+pixel, whose outward normal is (dy, -dx). This flux consists of the same integrals.
 
-**Blurred coverage.** Let g_i(x) be the share of light that a Gaussian point spread moves from a
-point x into pixel i. The share of light in a pixel is then the integral of g_i(x) g_j(y) over the
-ellipse. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t, sin t),
+**Blurred coverage.** Let g_i(x) be the share of light that a Gaussian point spread moves from the
+coordinate x into column i of the pixels, and g_j(y) that from y into row j. The share of light in a
+pixel is then the integral of g_i(x) g_j(y) over the ellipse. By the divergence theorem it is an
+integral along the rim x(t) = c + A (cos t, sin t),
 
     share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i.
 
@@ -62,8 +63,8 @@ def project_discs(
     """Return the ellipses of n discs through a perfect lens.
 
     Discs have centres (n, 3) m and unit normals (n, 3) in camera axes, and radii (n,) m. They must
-    lie wholly in front of the camera. Ellipses have centres (n, 2) px and symmetric shapes A (n, 2,
-    2) px: they are the images of the unit disc under x -> centre + A x.
+    lie wholly in front of the camera. An ellipse is the image of the unit disc under
+    x -> centre + A x. Centres are (n, 2) px, and shapes A, which are symmetric, (n, 2, 2) px.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import project_all
@@ -148,11 +149,10 @@ def curvature_shift(camera: PinholeCamera, middles: Array, shapes: Array) -> Arr
 def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
     """Return the share of light (n, size, size), 0 to 1, in each pixel, and its derivatives.
 
-    The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy, A_yy]. Centres (n,
-    2) px are relative to the middle of the window's first pixel. Shapes (n, 2, 2) px are symmetric
-    and positive definite. ``psf_px`` is the standard deviation of the point spread; 0 gives the
-    fraction that the ellipse covers. Raises CmmError for a point spread that is not 0 but narrower
-    than NARROWEST_PX.
+    The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy, A_yy]. ``centres``
+    (n, 2) px are relative to the middle of the window's first pixel. ``shapes`` (n, 2, 2) px are
+    symmetric and positive definite. ``psf_px`` is the standard deviation of the point spread; 0
+    gives the fraction that the ellipse covers. Raises the CmmError of `require_psf`.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import blur_windows

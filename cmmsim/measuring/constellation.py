@@ -19,7 +19,8 @@ def platform_frame(
     """Return sticker places (n, 3) on the platform with their covariances (n, 3, 3).
 
     The third result is the covariance (6, 6) of the platform frame. Each view must contain all
-    stickers. ``constant`` (n, 3, 3) are the covariances of what all views have in common.
+    stickers. ``constant`` (n, 3, 3) are the covariances of the errors that all views have in
+    common.
     """
     views = np.stack([one.points for one in seen]), np.stack([one.covariances for one in seen])
     mean, covariances = mean_constellation(*views)
@@ -39,8 +40,8 @@ def platform_frame(
 def platform_places(platform: MarkedBody, points: Array, covariances: Array) -> Array:
     """Return the sticker places (c, n, 3) of c teachings; ``platform_frame`` does so for one.
 
-    Each teaching has v views of the stickers, at points (c, v, n, 3) with covariances (c, v, n, 3,
-    3).
+    Each teaching has v views of the stickers. ``points`` is (c, v, n, 3), and ``covariances`` is
+    (c, v, n, 3, 3).
     """
     mean, covariances = mean_constellation(points, covariances)
     rough_normals = plane_normals(
@@ -58,11 +59,11 @@ def plane_normals(body: MarkedBody, camera_from_body: Array) -> Array:
 
 
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the weighted mean (..., n, 3) of v views of the same stickers, laid onto each other.
+    """Return the weighted mean (..., n, 3) of v views of the same stickers, moved onto each other.
 
     The mean has about the place and orientation of the first view. The second result contains the
-    covariances (..., n, 3, 3) of the mean. Views are points (..., v, n, 3) with covariances (...,
-    v, n, 3, 3).
+    covariances (..., n, 3, 3) of the mean. ``points`` of the views is (..., v, n, 3), and
+    ``covariances`` is (..., v, n, 3, 3).
     """
     weights = np.linalg.inv(covariances)
     mean = points[..., 0, :, :]

@@ -1,7 +1,7 @@
 """Movement of a body from a single frame whose rows of pixels are exposed one after another.
 
-A sticker in a later row is seen later. Its place in the image therefore tells of the pose of the
-body, and of its movement in the meantime. Both are fitted to all stickers together, to first order.
+A sticker in a later row is seen later. Its place in the image therefore depends on the pose of the
+body, and on its movement in the meantime. Both are fitted to all stickers together, to first order.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def frame_ends_of(read: StickerWindows) -> tuple[tuple[Array, Array] | None, flo
     flat = columns.reshape(-1, 12)
     found = np.linalg.lstsq(flat, away.ravel(), rcond=None)[0]
     known = flat.T @ flat
-    # Mean over the directions of a pose of its variance with and without the movement.
+    # Ratio of the variance of a pose with the movement to that without it, as a mean over the
+    # directions of the pose.
     factor = float(np.trace(known[:6, :6] @ np.linalg.pinv(known)[:6, :6])) / 6.0
     ends = []
     for share in (-0.5, 0.5):

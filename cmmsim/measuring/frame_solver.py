@@ -12,15 +12,15 @@ one first, in two cases:
 
 Undetected errors of both kinds are then of the size of the noise. At least five stickers must
 remain, and more than were rejected. If three or more of the rejected stickers agree with each other
-on another pose, a group of stickers has moved. Nothing tells which group it was, so the frame is
-lost.
+on another pose, a group of stickers has moved. The images do not show which group it was, so the
+frame is lost.
 
 All residuals can be larger than noise, for example if a camera has drifted since its calibration,
 or several stickers are slightly misplaced. Each place is then compared with the size of the other
 stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
 their noise (squared Birge ratio), up to a limit, and by a factor, because such errors are not
-independent. A warp of the whole pattern enlarges them as well, see ``warp_kernels``, and so does a
-pose from less than half of the stickers that were searched.
+independent. The covariances are also enlarged for a warp of the whole pattern (``warp_kernels``),
+and for a pose from less than half of the stickers that were searched.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -66,10 +66,10 @@ LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # Errors that are larger than noise are not independent: a pose errs as if each were shared by this
 # number of stickers.
 EXCESS_SHARE = 4.0
-# Probability at which a pose from few stickers has the quantile of a normal one, see ``_tails``.
+# Probability of the quantile that ``_tails`` makes right for a pose from few stickers.
 TAIL = 0.999
-# A pose errs in six shapes that are as smooth as those of a warp. What of the mean square of the
-# warp's shapes exceeds its limit, times this number, is added to the factor on the covariance.
+# The excess of the mean square of the warp's shapes over its limit, times this number, is added to
+# the factor on the covariance. A pose errs in six shapes that are as smooth as those of a warp.
 WARP_SHARE = 8.0
 # Rejected stickers that agree with each other are as likely to be right as the others.
 FEWEST_RIVALS = 3
@@ -260,18 +260,20 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
 
 @lru_cache(maxsize=16)
 def _largest_totals(freedom: int) -> Array:
-    """Return the largest sum of squared residuals that noise explains, for 0 to ``freedom`` degrees
-    of freedom.
+    """Return the largest sums of squared residuals that noise explains.
+
+    They are for 0 to ``freedom`` degrees of freedom.
     """
     return np.asarray(chdtri(np.maximum(np.arange(freedom + 1), 1), EXCESS_CHANCE))
 
 
 @lru_cache(maxsize=16)
 def _tails(freedom: int) -> Array:
-    """Return the factor on a covariance whose scale is known with 0 to ``freedom`` degrees.
+    """Return factors on a covariance whose scale is estimated.
 
-    A pose then has Student's distribution. Its squared error has the quantile TAIL of a normal one
-    with the larger covariance.
+    They are for 0 to ``freedom`` degrees of freedom of the scale. The pose has Student's
+    distribution. Its squared error has the same quantile TAIL as that of a normal distribution with
+    the enlarged covariance.
     """
     known = np.maximum(np.arange(freedom + 1), 1)
     return np.asarray(6.0 * fdtri(6, known, TAIL) / chdtri(6, 1.0 - TAIL))

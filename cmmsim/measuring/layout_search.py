@@ -21,7 +21,8 @@ from cmmsim.detection.ellipse_fit import EllipseFits, fit_ellipses
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.registration import rigid_starts
-from cmmsim.geometry.stereo_rig import StereoRig, linear_triangulation
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.triangulation import linear_triangulation
 from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.radiometry.noise import GreyImage, cut_windows
 from cmmsim.radiometry.stereo_images import StereoImages
@@ -145,10 +146,9 @@ def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
 
 
 def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Return the distances (n, m) of right pixels (m, 2) from the epipolar lines of left pixels (n,
-    2).
+    """Return the distances (n, m) of right pixels from the epipolar lines of left pixels.
 
-    All pixels are ideal.
+    ``left`` (n, 2) and ``right`` (m, 2) are ideal pixels.
     """
     lines = np.column_stack([left, np.ones(len(left))]) @ rig.fundamental.T
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
@@ -158,12 +158,11 @@ def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
 def candidate_pairs(
     rig: StereoRig, left: Array, right: Array, off_line: float = LINE_TOLERANCE_PX
 ) -> tuple[NDArray[np.int_], Array]:
-    """Return pairs (m, 2) of left and right spots that are possibly one point, and the points (m,
-    3).
+    """Return pairs (m, 2) of spots in both images that are possibly one point, and these points.
 
-    Spots (k, 2) and (l, 2) are in ideal px. The spots of a pair are at most ``off_line`` px from
-    each other's epipolar lines. A spot can belong to several pairs: the known layout decides later
-    which pair is true.
+    The pairs are indices of ``left`` (k, 2) and ``right`` (l, 2), which are in ideal px. The points
+    are (m, 3). The spots of a pair are at most ``off_line`` px from each other's epipolar lines. A
+    spot can belong to several pairs: the known layout decides later which pair is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])

@@ -49,7 +49,7 @@ class DetectionSettings:
     line_error_px    standard deviation of an image's distance from its epipolar line that errors of
                      the rig cause; it increases the allowed distance between two rays
     dark             True for dark stickers in bright rings
-    allowed          what is allowed for by the print of the stickers
+    allowed          allowance for print that is not perfect
     """
 
     window_size: int = 16
@@ -109,7 +109,7 @@ class Observer:
 
         The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``exposure_ends``
         are the expected camera_from_body at the beginning and at the end of the exposure, or None.
-        ``frame_ends`` are the same half a frame period before and after its middle.
+        ``frame_ends`` are those half a frame period before and after the middle of the frame.
         """
         read = self.read(images, camera_from_body, places, normals)
         return read.observed(exposure_ends, frame_ends)
@@ -175,8 +175,7 @@ class Observer:
         return self.evenly_lit(windows, corners)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Return windows (2, n, size, size) in which vignetting has the same value as in the
-        middle.
+        """Return windows (2, n, size, size) in which vignetting has its value of their middle.
 
         Vignetting would move the centre of a sticker because it varies across the sticker. The
         correction changes the noise by a few per mille only.

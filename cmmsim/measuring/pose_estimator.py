@@ -93,9 +93,10 @@ def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
 
 
 METHODS: tuple[str, ...] = ("registration", "planes")
-# m: stickers lie within about a millimetre of their nominal places.
+# Tolerance of the search for nominal places, m. Stickers lie within about a millimetre of them.
 NOMINAL_TOLERANCE = 0.003
-# m: taught places are accurate to micrometres, points from whole images to tenths of a millimetre.
+# Tolerance of the search for taught places, m. They are accurate to micrometres, and points from
+# whole images to tenths of a millimetre.
 TAUGHT_TOLERANCE = 0.0005
 # Fewest recognised stickers of a body with nominal places.
 FEWEST_NOMINAL = 6
@@ -190,8 +191,9 @@ class PoseEstimator(Observer):
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """Measure as ``measure`` does, and estimate the movement from this frame alone.
 
-        Streaks tell of the movement during the exposure, and rows that are not exposed at once of
-        that between them. Raises LostError, which states the length of streaks if there are any.
+        Streaks show the movement during the exposure. Rows that are not exposed at once show the
+        movement between their exposures. Raises LostError, which states the length of streaks if
+        there are any.
         """
         settings = self.settings
         if settings.exposed_share == 0.0 and settings.row_share == 0.0:

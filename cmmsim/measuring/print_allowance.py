@@ -1,4 +1,4 @@
-"""What a fit of stickers allows for if their print is not perfect.
+"""Allowance of the fit of stickers for print that is not perfect.
 
 Uneven print and outlines that are not round move a sticker's centre. Most of this is the same in
 all frames, and in the taught places of the stickers as well. The rest changes with the place of the
@@ -20,16 +20,16 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.radiometry.noise import CameraNoise
 
-# Probability that light across the stickers is fitted in an evenly lit frame, and the squared
-# movement of its pose, in units of noise, that this allows.
+# Probability that light that rises across the stickers is fitted in a frame with even light, and
+# the squared movement of the pose, in units of noise, that noise exceeds with this probability.
 LIGHT_CHANCE = 1e-4
 LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
-# px of errors of a centre for an unevenness of 1, and for an outline that is off by 1 px. Those
-# that change within a pixel are smaller with a point spread.
+# Errors of a centre, px, for an unevenness of 1, and for an outline that is off by 1 px. Errors
+# that change with the place in a pixel are smaller with a point spread.
 CONSTANT = (0.04, 0.08)
 CHANGING = (0.12, 0.10)
 CHANGING_BLURRED = (0.04, 0.03)
-# px of errors of the entries of an ellipse's matrix for an unevenness of 1, an outline that is off
+# Errors of the entries of an ellipse's matrix, px, for an unevenness of 1, an outline that is off
 # by 1 px, and a rim of 1 px.
 SHAPE = (0.5, 0.8, 0.7)
 # Ratio of the largest misfit that print causes to the mean one.
@@ -81,7 +81,7 @@ def print_allowance(
     """Return the allowance of an estimator that knows the sizes of its stickers' print.
 
     ``radius_px`` is the radius of a sticker in the image, and ``fit_size`` the side of the fitted
-    part of a window, px. Uneven print is fitted as light that rises.
+    part of a window, px. Uneven print is fitted like light that rises across a sticker.
     """
     if file.print.is_perfect or not file.print.known:
         return PrintAllowance()

@@ -263,8 +263,7 @@ def few_excess(
     """Return the factor on the covariance of a pose from few stickers.
 
     It is the mean square of the residuals of all stickers that were seen, even of the ``rejected``
-    (n,) ones. A pose from few stickers has a wider distribution than a normal one, which the
-    factor allows for.
+    (n,) ones, times ``limits.tails``, because the pose has a wider distribution than a normal one.
     """
     half = np.empty((3, 6))
     left = np.empty(6)
@@ -292,7 +291,7 @@ def solve(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
     covariance: Array, searched: int, verdict: Array,
 ) -> None:  # fmt: skip
-    """Solve one frame, in which this number of stickers was ``searched``.
+    """Solve one frame, in which ``searched`` is the number of stickers that were searched.
 
     ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
     ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
@@ -314,7 +313,7 @@ def solve(
         return
     verdict[WARP] = warp(seen.used, seen.arms, seen.gaps, seen.informations, seen.rays, covariance)
     excess = verdict[EXCESS]
-    # A warp counts from its limit on, so that good frames that just exceed it lose little.
+    # Only the excess over the limit counts, so that good frames that just exceed it lose little.
     beyond = verdict[WARP] - excess * limits.largest_warp
     warped = excess + limits.warp_share * max(beyond, 0.0) / SHAPES
     if excess > 1.0:
@@ -337,11 +336,12 @@ def solve_frames(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, starts: Array,
     searched: Array, camera_from_body: Array, covariances: Array, verdicts: Array,
 ) -> None:  # fmt: skip
-    """Call ``solve`` for several frames. Frame j has the stickers ``starts[j]`` to ``starts[j +
-    1]``, of ``searched`` (f,) ones.
+    """Call ``solve`` for several frames.
 
-    ``camera_from_body`` (f,4,4) contains first guesses on entry, and the results at the end.
-    Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS) are filled.
+    Frame j has the stickers ``starts[j]`` to ``starts[j + 1]``, and ``searched`` (f,) is the number
+    of stickers that were searched in each. ``camera_from_body`` (f,4,4) contains first guesses on
+    entry, and the results at the end. Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS)
+    are filled.
     """
     for f in range(len(camera_from_body)):
         first = starts[f]

@@ -21,7 +21,7 @@ from cmmsim.detection.ellipse_fit import (
 )
 from cmmsim.geometry.disc_image import NARROWEST_PX
 from cmmsim.geometry.pose import Array, apply, apply_each
-from cmmsim.geometry.stereo_rig import triangulate
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.radiometry.stereo_images import Windows
 
 if TYPE_CHECKING:
@@ -229,10 +229,10 @@ class StickerWindows:
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
     def _lit(self, even: EllipseFits, smears: Array) -> DetectedCentres:
-        """Fit rising light with each sticker in the exposures in which it moves the pose.
+        """Fit light that rises across each sticker, in the exposures in which it moves the pose.
 
-        Without such light, a fit of it would only widen the covariance. ``even`` are the fits
-        without, for stickers that move by ``smears`` (2, k, 2) px during the exposure.
+        In other exposures, this would only widen the covariance. ``even`` are the fits with even
+        light, for stickers that move by ``smears`` (2, k, 2) px during the exposure.
         """
         # Imported late, because importing numba takes time.
         from cmmsim.measuring.warp_kernels import light_sizes
@@ -310,8 +310,8 @@ class StickerWindows:
         return np.asarray(last - first)
 
     def _swept(self, frame_ends: tuple[Array, Array]) -> Array:
-        """Return the stickers' movements (2, k, 2) px from the exposure of the middle row to that
-        of their own.
+        """Return the movements (2, k, 2) px of stickers between the exposures of the middle row and
+        of their own rows.
         """
         return np.asarray(self.late()[..., None] * self._moved(frame_ends))
 

@@ -8,10 +8,10 @@ sticker at rest shows an ellipse A_0, an ellipse A fitted to the streak therefor
 
 The stickers of a rigid body share one small movement w (6,). With the derivative P of a sticker's
 pixels by the movement, d = P w. Least squares over both images give w. An ellipse fits a streak
-only roughly. The fit is therefore repeated with an ellipse that moves by the current d. A A - A_0
-A_0 is then only the remaining part of the streak. A new d is found from A A - A_0 A_0 + d d' / 3,
-until d no longer changes. Streaks do not show the sign of the movement. The pose refers to the
-middle of the exposure, which is the same for both signs.
+only roughly. The fit is therefore repeated with an ellipse that moves by the current d. The
+difference A A - A_0 A_0 is then only the remaining part of the streak. A new d is found from
+A A - A_0 A_0 + d d' / 3, until d no longer changes. Streaks do not show the sign of the movement.
+The pose refers to the middle of the exposure, and is the same for both signs.
 """
 
 from collections.abc import Callable

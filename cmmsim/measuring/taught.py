@@ -174,7 +174,7 @@ def setup_of(file: SensorFile) -> str:
     }
     stickers = file.stickers.model_dump(include={"placement", "placement_seed"})
     entries = {"rig": rig, "stickers": stickers, **bodies}
-    # Print moves the taught places. Earlier results have no print.
+    # Print moves the taught places. Results for perfect print have no entry for it.
     if not file.print.is_perfect:
         entries["print"] = file.print.model_dump(exclude={"known"})
     return json.dumps(entries, sort_keys=True)

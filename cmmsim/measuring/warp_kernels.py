@@ -20,9 +20,9 @@ from cmmsim.geometry.matrix_kernels import factorise, solve_factored
 STRAINS = 6
 RAY_SHAPES = 4
 SHAPES = STRAINS + RAY_SHAPES
-# Inverse squares of the largest strain, and of the largest change of the rays' distance in
-# deviations a metre. They keep the matrices regular where stickers do not show a shape, as those on
-# one plane do not.
+# Inverse squares of the largest strain, and of the largest change of the rays' distance, in
+# deviations a metre. They keep the matrices regular if the stickers do not show a shape. For
+# example, stickers on one plane do not show all shapes.
 KNOWN_STRAIN = 1e6
 KNOWN_PARTING = 1e-6
 REGULAR = 1e-9
@@ -100,12 +100,13 @@ def light_sizes(
     cameras: Cameras, points: Array, arms: Array, spreads: Array, lights: Array, starts: Array,
     sizes: Array,
 ) -> None:  # fmt: skip
-    """Fill the squared movements (f,) of f poses by light across stickers, in units of its noise.
+    """Fill the squared movements (f,) of f poses due to light that rises across stickers.
 
-    A movement is that of the pose if rising light is fitted with each sticker, from the pose
-    without. Frame j has the stickers ``starts[j]`` to ``starts[j + 1]`` at ``points`` (k, 3), with
+    A pose moves if rising light is fitted with each sticker in place of even light. Its squared
+    movement is in units of its noise. Noise alone gives chi-square numbers with six degrees of
+    freedom. Frame j has the stickers ``starts[j]`` to ``starts[j + 1]`` at ``points`` (k, 3), with
     ``arms`` (k, 3). The centres have covariances ``spreads`` (2, k, 2, 2). ``lights`` (2, k, 5) are
-    those of ``EllipseFits``. Noise alone gives chi-square numbers with six degrees of freedom.
+    those of ``EllipseFits``.
     """
     slope = np.zeros((2, 6))
     pushed = np.empty((6, 2))

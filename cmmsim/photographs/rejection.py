@@ -19,7 +19,8 @@ from scipy.special import chdtri
 
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, apply, invert
-from cmmsim.geometry.stereo_rig import StereoRig, triangulate
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
 
 # Probability that a good observation is left out.

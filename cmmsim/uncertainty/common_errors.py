@@ -35,7 +35,8 @@ from cmmsim.geometry.pose import (
     skew,
     transforms_of,
 )
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig, triangulate
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.constellation import platform_places
 from cmmsim.measuring.observation import faces_camera
 from cmmsim.measuring.pose_estimator import frames_by_planes

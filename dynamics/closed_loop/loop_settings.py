@@ -121,7 +121,7 @@ class ServoGains:
         """Demand (n,) of the servo in the coordinates of the platform, eq. 30.
 
         It follows from the error (n,) of the pose, its rate and its integral. The compiled loop has
-        the same law in `frame_kernels.serve`.
+        the same law in `visual_servo_kernels.serve`.
         """
         return self.kp * error + self.kd * rate_error + self.ki * integral
 

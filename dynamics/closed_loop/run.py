@@ -96,7 +96,8 @@ class ClosedLoopRun:
     def state_at(self, frame: int) -> StartState:
         """State at a frame, from which a new run repeats the remaining frames of this run.
 
-        If each frame has its own latency, the new run also needs those of the earlier commands.
+        If each frame has its own latency, the new run also needs the latencies of the earlier
+        commands.
         Raises SimulationError for a frame that the run does not have, or that follows a lost
         measurement.
         """

@@ -127,8 +127,8 @@ def simulate_commands(
         Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
         of NaN issues no command.
     times : ndarray, shape (frames,), optional
-        Increasing times of the frames, s. The default is equal periods from zero on. The drives
-        take the change from the command before, over one period of the timing, as the rate.
+        Increasing times of the frames, s. The default is equal periods from zero on. In the drives,
+        the rate of a command is its change from the one before, over one period of the timing.
 
     Returns
     -------
@@ -184,7 +184,7 @@ def simulate_controller(
     Raises
     ------
     LoopFailure
-        Also if the controller raises a DynamicsError.
+        As for `simulate_servo`, and if the controller raises a DynamicsError.
     UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
         As for `simulate_servo`.
 

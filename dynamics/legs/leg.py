@@ -4,7 +4,7 @@ The motion of A determines the motion of the bodies of a leg (eq. 5-16). Each le
 force F at A. The wrench on the robot is the wrench of the platform itself plus the sum of [F; a x
 F] over the legs, with the vector a from the platform's origin to A. This is the virtual-work model
 of eq. 23, with Jacobians with respect to the velocity of A (3 columns) instead of the twist (6
-columns). It needs a fraction of the operations.
+columns). This form needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
 work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
@@ -49,7 +49,7 @@ ROUNDED = 1e-4
 Directions can thus be written with four decimals or more.
 """
 EXACT = 1e-12
-"""Largest such error that is not corrected."""
+"""Largest error of a length or of a right angle that counts as rounding and is not corrected."""
 
 
 def _direction(value: object) -> np.ndarray:
@@ -74,7 +74,7 @@ Direction = Annotated[np.ndarray, PlainValidator(_direction), WithJsonSchema(_NU
 
 @dataclass(frozen=True)
 class Body:
-    """Kind of a body of a leg.
+    """Body of a kind of leg, such as the crank.
 
     `moments` are the moments of inertia that do work when the body moves. `driven` is the inertial
     parameter that includes the inertia of the motor, if an actuator drives this body alone, or
@@ -104,9 +104,9 @@ class Segment(NamedTuple):
     (3,) is in the axes of the body before. `origin` (3,) is the vector from the joint of the body
     before to this joint, in the same axes.
 
-    The frame of the body is at its joint, with the axes of its `Placement`. In this frame are
-    `centre` (3,), the centre of mass; `rod` (2, 3), the ends of the rod that draws the body, m,
-    with its radius; and `end`, which is A on the last body.
+    The frame of the body is at its joint, with the axes of its `Placement`. Three places are in
+    this frame, m: `centre` (3,) is the centre of mass, `rod` (2, 3) are the ends of the rod of
+    `radius` that draws the body, and `end` (3,) is A on the last body.
 
     `actuated` is True if the coordinate of this joint is the coordinate of the leg. `copies` are
     the offsets (bars, 3) of the joints of several equal bars from `origin`, in the same axes. The
@@ -166,8 +166,8 @@ class Leg(BaseModel, ABC):
         """Leg whose branch is selected for the position (3,) of A at home.
 
         Raises RobotFileError, with the number of the leg, reach and lengths, if the leg cannot
-        reach A. Raises it also for a body that is parallel to the axis from which its rotation is
-        measured, such as the axis of a universal joint.
+        reach A, or if a body is parallel to the axis from which its rotation is measured, such as
+        the axis of a universal joint.
         """
         margin = float(self.reach(ca.SX(joint)))
         if not margin > 0:

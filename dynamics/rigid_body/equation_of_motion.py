@@ -35,7 +35,8 @@ from dynamics.rigid_body.accelerations import (
 )
 from dynamics.rigid_body.jacobians import platform_arms, pose_basis
 from dynamics.rigid_body.passive_friction import passive_friction_columns
-from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
+from dynamics.rigid_body.regressor import platform_columns
+from dynamics.rigid_body.virtual_work import platform_mass
 
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:

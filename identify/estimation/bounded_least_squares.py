@@ -112,7 +112,7 @@ def minimise(
     on_iteration : callable
         Function (number of the iteration, cost) that is called after each iteration.
     ahead : bool
-        Whether the problem can be linearised at a trial step before the step is accepted. This
+        True if the problem can be linearised at a trial step before the step is accepted. This
         must be False for a problem with a state that follows the accepted steps.
     upper : ndarray, shape (p,), optional
         Upper bounds.

@@ -14,7 +14,8 @@ definite. The search then uses log-Cholesky coordinates of the body (see `dynami
 with a bound that keeps it from becoming so flat that the logarithms have no effect.
 
 The covariance of an estimate is computed without bounds. Active bounds move all parameters away
-from the estimate without bounds, the unheld estimate. Linearised about the bounded estimate, it is
+from the unheld estimate, which is the estimate without bounds. Linearised about the bounded
+estimate, the unheld estimate is
 
     unheld = estimate - W^-1 g,
 
@@ -116,9 +117,9 @@ class ParameterBounds:
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
     def outside(self, parameters: Array) -> NDArray[np.bool_]:
-        """Return which parameters (p,) are beyond a bound, or moments of a body that cannot exist.
+        """Return a mask (p,) of the parameters that are beyond a bound.
 
-        All moments of such a body are marked, because each of them can be the cause.
+        All moments of a body that cannot exist are marked, because each of them can be the cause.
         """
         beyond = self.linear_coordinates(parameters) < self.linear_lower
         marked = np.asarray((self.matrix != 0) | np.eye(len(beyond), dtype=bool)) @ beyond

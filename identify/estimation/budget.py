@@ -1,10 +1,10 @@
 """Error budget: what each source of uncertainty adds to a standard deviation.
 
 The form is that of the Guide to the Expression of Uncertainty in Measurement (GUM, JCGM 100:2008).
-A source has a standard uncertainty, and a sensitivity with respect to it. Their product is what the
-source adds to the standard uncertainty of a quantity. The squares of these products sum up to the
-square of the combined standard uncertainty. If sources are correlated beforehand, their covariances
-have a separate row, whose square can be negative (GUM, section 5.2).
+A source has a standard uncertainty, and a quantity has a sensitivity to the source. Their product
+is what the source adds to the standard uncertainty of the quantity. The squares of the products sum
+up to the square of the combined standard uncertainty. If sources are correlated beforehand, their
+covariances have a separate row, whose square can be negative (GUM, section 5.2).
 
 The parts come from the matrices of the covariance itself, see `covariance`.
 """
@@ -148,8 +148,8 @@ def budget_of(
 ) -> Budget:
     """Return the budget of q quantities from the parts (q,) of their variances, by source.
 
-    total (q,): variances of the quantities. What they exceed the sum of the parts by is the effect
-    of covariances between sources.
+    total (q,): variances of the quantities. Their excess over the sum of the parts is the effect of
+    covariances between sources.
     """
     rest = total - np.asarray(sum(parts.values()))
     if np.any(np.abs(rest) > ROUNDING * total):

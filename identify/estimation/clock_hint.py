@@ -1,6 +1,6 @@
 """Hint at a separate clock of the commands, which a record needs but does not state.
 
-If the model misses a record at any times, the record is identified again with such a clock.
+If the model misses a timed record, the record is identified again with such a clock.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ EXPLAINS = 0.3
 
 
 def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tuple[str, ...]:
-    """Return a hint for each record at any times that a separate clock of its commands explains.
+    """Return a hint for each timed record that a separate clock of its commands explains.
 
     warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
     """
@@ -62,7 +62,7 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
 
 
 def _lacks_clock(run: LoopModel) -> bool:
-    """Return whether a run at any times states no clock of its commands."""
+    """Return whether a run is timed, and states no clock of its commands."""
     return isinstance(run, TimedModel) and CLOCK_OFFSET not in run.common.loop_std
 
 

@@ -36,10 +36,10 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(ndtri(0.999))
-"""Standard deviations above the expected residual from which the model has an error."""
+"""Excess of the residual, in standard deviations, from which on the model has an error."""
 
 MISFIT_STDS = 5.0
-"""Standard deviations below the expected residual from which the stated covariance is wrong."""
+"""Deficit of the residual, in standard deviations, from which on the stated covariance is wrong."""
 
 NOISE_DECIDES = 3.0
 """Ratio of the residual to its expected value above which the model's error dominates."""
@@ -281,8 +281,8 @@ def by_frames(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return residuals (N, 6) of several records one after the other, and the good frames (N,).
 
-    residuals: those (n, 6) of each record at its good frames. frames: marks of these frames. In the
-    result, residuals of lost poses are NaN. Between two records there is a gap as long as the
+    residuals: residuals (n, 6) of each record at its good frames. frames: marks of these frames. In
+    the result, residuals of lost poses are NaN. Between two records there is a gap as long as the
     largest lag of the test for whiteness.
     """
     gap = np.full((LAGS, 6), np.nan)

@@ -9,9 +9,9 @@ The size follows from the initial guess and not from the noisy estimate. A crite
 estimate would select quantities whose estimates are large by chance, and their intervals would miss
 the truth too often. The size of a parameter is its initial guess. For friction with a guess of
 zero, the size is a tenth of the torque that the joints hold at home. For a first moment or a
-product of inertia with a guess of zero, it is a tenth of what a very uneven body has. The size of a
-group is the root of the sum of squares of the contributions of its members. A difference of large
-masses thus has the size of these masses, even if the guess of the difference is zero.
+product of inertia with a guess of zero, it is a tenth of `asymmetry`. The size of a group is the
+root of the sum of squares of the contributions of its members. A difference of large masses thus
+has the size of these masses, even if the guess of the difference is zero.
 
 Groups are the base parameters, the combinations that a record can identify. The uncertainty of a
 group follows from its members by linear propagation. A group is often known well although none of
@@ -58,9 +58,9 @@ from identify.estimation.prior import (
 from identify.estimation.scale_anchor import ScaleAnchor
 
 IDENTIFIABLE_SHARE = 0.5
-"""Largest standard deviation of an identified quantity, as a share of its prior and of its size.
+"""Share of the prior standard deviation and of the size of a quantity.
 
-The standard deviation must be below this share of both the prior standard deviation and the size.
+The standard deviation of an identified quantity is below this share of both.
 """
 
 RESTS_ON_PRIOR = 0.5
@@ -196,9 +196,9 @@ def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
 
 
 SCALE_KNOWN = 0.015
-"""Relative standard deviation of the common factor due to the initial guess that needs no warning.
+"""Largest relative standard deviation of the common factor without a warning.
 
-The warning is given only if an instrument was used to fix the factor.
+Only the part due to the initial guess counts, and only if an instrument was used to fix the factor.
 """
 
 

@@ -85,7 +85,10 @@ class JointRun:
         return np.asarray(seen.reshape(self.modes.shape))
 
     def whiten(self, rows: Array) -> Array:
-        """Return rows (m,) or (m, k), in standard deviations of the noise, without the others."""
+        """Return rows (m,) or (m, k) that are whitened for the other errors, too.
+
+        The given rows are in standard deviations of the noise.
+        """
         return rows if self.others is None else self.others.whiten(rows)
 
 
@@ -139,7 +142,7 @@ class JointProblem:
         first = size
         for one, run in zip(self.parts, runs, strict=True):
             errors = run.errors_had[run.contained]
-            # Modes come first, because their run also shows the residuals.
+            # Modes come first, because their run is cached and also gives the residuals.
             modes = one.modes_at(run, parameters)
             missed, shown = run.shown_residuals(parameters)
             left = one.whiten(missed.ravel())

@@ -119,7 +119,7 @@ class OutputErrorProblem:
         for run in self.runs:
             residual, shown = run.shown_residuals(parameters)
             cost += float(np.sum(residual**2))
-            # Factoring uses the few columns of the groups. Then all parameters get their columns.
+            # Factoring costs less with the few columns of the groups than with all parameters.
             rows = triangular_factor(shown.reshape(residual.size, -1), residual.ravel())
             rows = np.column_stack([run.of_all(rows[:, :-1]), rows[:, -1]])
             triangle = triangular_factor(np.vstack([triangle, rows]))
@@ -131,9 +131,9 @@ class OutputErrorProblem:
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Return residuals (k,) of the initial guess and the scale anchor, and their rows (k, p).
+        """Return residuals (k,) of the initial guess and the scale anchor, and their Jacobian.
 
-        They are in standard deviations.
+        The Jacobian is (k, p). Both are in standard deviations.
         """
         guess = self.guess
         place, measured = self.anchor.row(guess.layout)

@@ -40,8 +40,9 @@ MISSED = 1.2
 NEAR = 1.0
 """Change of common errors with a wide prior at which they count as near their optimum.
 
-It is in the standard deviations of `LoopModel.in_deciding_stds`, for which the parameters are
-known. Parameters and errors move together by a small part of their own standard deviations there.
+It is in the standard deviations of `LoopModel.in_deciding_stds`, which are those of the errors for
+known parameters. For unknown parameters they are far larger, and the change is a small part of
+them.
 """
 
 CLOSE_ENOUGH = 1e-2
@@ -60,7 +61,7 @@ class Search:
 
     @property
     def missed(self) -> bool:
-        """Whether the cost is so much above that of noise that the search may have gone wrong."""
+        """True if the cost is so far above that of noise that the search may have gone wrong."""
         frames = sum(int(run.ok.sum()) for run in self.problem.runs)
         return self.solution.costs[-1] > MISSED * 6 * frames
 
@@ -152,8 +153,8 @@ def search_with_common_errors(
 def _bends_far(run: LoopModel) -> bool:
     """Return whether a run has common errors in which its motion is far from linear.
 
-    These are a start in motion and constants of friction. Parameters that were found with wrong
-    values of them would be far from the optimum.
+    These are a start in motion and constants of friction. With wrong values of these errors, a
+    search would find parameters far from the optimum.
     """
     rubs = any(kind_of(name) == FRICTION for name in run.common.loop_std)
     return run.begins_in_motion or (run.driven and rubs)

@@ -1,7 +1,7 @@
 """Initial guess: knowledge of the parameters before the experiment.
 
-Each parameter has a value with a standard deviation. It is wide, except for parameters in the
-scenario's `[identification.prior]`.
+Each parameter has a value with a standard deviation. The standard deviation is large, except for
+parameters in the scenario's `[identification.prior]`.
 """
 
 from collections.abc import Collection, Mapping
@@ -152,16 +152,19 @@ def typical_sizes(robot: Robot, values: Array, torque: float) -> Array:
 
 
 def passive_torque(robot: Robot, torque: float) -> float:
-    """Return a torque, N m, of the size that actuators hold with a torque, N m, or a force, N."""
+    """Return the typical torque, N m, of passive joints.
+
+    torque: holding torque of the actuators, N m, or force, N, for sliding actuators.
+    """
     return torque * robot.geometry.characteristic_length if robot.layout.prismatic else torque
 
 
 def asymmetry(robot: Robot, values: Array) -> Array:
     """Return sizes (i,) of the first moments and products of inertia of a robot's bodies.
 
-    A first moment is that of the mass of the body at half its length. A product is the mean of the
-    moments of inertia. The sizes of all other inertial parameters are zero. values (p,): parameters
-    of the robot.
+    The size of a first moment is the mass of the body times half its length. The size of a product
+    is the mean of the moments of inertia. The sizes of all other inertial parameters are zero.
+    values (p,): parameters of the robot.
     """
     layout = robot.layout
     bodies = layout.bodies_of(values)

@@ -1,10 +1,10 @@
-"""Searches in coordinates of which the parameters of a problem are a function.
+"""Searches in the coordinates of `bounds` in place of the parameters.
 
-A problem in coordinates is linearised like any other if the function is linear. Coordinates of
-bodies that can exist are curved, see `bounds`. There the problem is linearised in the parameters
-only, and a step follows the curved function to the least linearised cost, which needs no run of the
-model. If the function were linearised too, steps would be short where the data determine the
-parameters well.
+The parameters are a function of the coordinates. A linear function is linearised together with the
+problem. The function of log-Cholesky coordinates is curved. The problem is then linearised in the
+parameters only, and a step follows the curved function to the least linearised cost, which needs no
+run of the model. If the curved function were linearised too, steps would be short where the data
+determine the parameters well.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class InCoordinates:
 
 @dataclass(frozen=True)
 class _LinearInParameters(InCoordinates):
-    """Problem in coordinates whose linearisation is one in the parameters."""
+    """Problem in coordinates that is linearised in the parameters."""
 
     def linearise(self, coordinates: Array) -> Linearisation:
         """Return the cost at coordinates (p,), and the linearisation at their parameters."""

@@ -23,7 +23,7 @@ from scipy.linalg import null_space
 from dynamics import Robot
 from dynamics.kinematics.platform import Chart, pose_rate_to_twist, twist_bias
 from dynamics.rigid_body.jacobians import joint_jacobian, pose_basis
-from dynamics.rigid_body.virtual_work import rigid_body_regressor
+from dynamics.rigid_body.regressor import rigid_body_regressor
 from identify.arrays import Array, agreed
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of, from_home

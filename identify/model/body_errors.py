@@ -1,11 +1,11 @@
 """Errors of the bodies and passive joints that a model has in a simpler form.
 
 A model with centred bodies takes centres of mass to be in their places and products of inertia to
-be zero. A model without friction of passive joints lets them turn freely. Most of what a real robot
-has beside this leaves no residual, because the parameters take it up, with wrong values. Its
-standard deviations are therefore stated, in the robot file or in the scenario. It is estimated
-beside the parameters, as errors that all poses of a record have in common, and widens their
-intervals.
+be zero. A model without friction of passive joints lets them turn freely. Most deviations of a real
+robot from such a model leave no residual, because wrong values of the parameters compensate them.
+Their standard deviations are therefore stated, in the robot file or in the scenario. The deviations
+are estimated as errors that all poses of a record have in common, and widen the intervals of the
+parameters.
 
 All bodies of a kind have the same error, each in its own axes, and so have the passive joints at
 one place of all legs, because they are made alike. The errors act as torques at the joints
@@ -88,9 +88,9 @@ def body_error_stds(robot: Robot, model: Model, kinds: tuple[str, ...]) -> dict[
 def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
     """Return the changes (k, N, n) of commands with the effect of each error of a run's bodies.
 
-    They are those for one standard deviation of each error, along the motion with parameters (p,):
-    rad or m, or N m or N if the drives take torques. None: there are no such errors. Raises
-    LoopFailure if the model is unstable.
+    The changes are for one standard deviation of each error, along the motion with parameters (p,).
+    They are in rad or m, or in N m or N if the drives take torques. Without such errors, the result
+    is None. Raises LoopFailure if the model is unstable.
     """
     if not run.common.body_std:
         return None
@@ -102,11 +102,11 @@ def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
 
 
 def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
-    """Return the changes (N, 6) of a run's poses by its errors of bodies, by their places.
+    """Return the changes (N, 6) of a run's poses due to its errors of bodies, by their places.
 
-    One run is differentiated along the changes of the commands. Under torques, only errors that
-    need none are returned. parameters (p,): those of the run. Raises LoopFailure if the model is
-    unstable.
+    One run is differentiated along the changes of the commands. If the drives take torques, only
+    errors that need no torque are returned. parameters (p,): those of the run. Raises LoopFailure
+    if the model is unstable.
     """
     if run.bodies is None:
         return {}
@@ -125,10 +125,10 @@ def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
 def fed_forward(
     run: "LoopModel", robot: Robot, parameters: Array, reference: Reference, loop: LoopSettings
 ) -> dict[str, Any]:
-    """Return the arguments by which a servo's commands get the effect of a run's errors of bodies.
+    """Return further arguments of `simulate_servo` that add the effect of a run's errors of bodies.
 
-    They are arguments of `dynamics.closed_loop.simulate_servo` beside those that are given. The
-    servo begins at rest as without the errors. Without errors there are no arguments.
+    The effect is added to the servo's commands. The servo begins at rest, as without the errors.
+    Without errors there are no arguments.
     """
     change = run.body_commands
     if change is None:
@@ -140,8 +140,8 @@ def fed_forward(
 def _torques(run: "LoopModel", parameters: Array, found: ClosedLoopRun) -> Array:
     """Return the torques (k, N, n) that the joints need for one standard deviation of each error.
 
-    found: run of the model at parameters (p,). Drives with an integral already hold what the robot
-    needs at rest before the motion.
+    found: run of the model at parameters (p,). Before the motion, drives with an integral already
+    hold the torques that the robot needs at rest.
     """
     geometry = run.robot.geometry
     stds = run.common.body_std

@@ -1,8 +1,8 @@
-"""Torques that bodies and passive joints need along a motion, per unit of what a model lacks.
+"""Torques along a motion for a unit of each parameter of full bodies and of passive friction.
 
-The torques of bodies are columns of the regressor of full bodies, and those of passive joints are
-the columns of `dynamics.rigid_body.passive_friction`. Both are evaluated without compiling them, so
-that a robot in another form costs no time.
+A model can lack these parameters. The torques of bodies are columns of the regressor of full
+bodies, and those of passive joints are the columns of `dynamics.rigid_body.passive_friction`. Both
+are evaluated without compiling them, so that a robot in another form costs no time.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from dynamics.expressions import function
 from dynamics.geometry import RobotGeometry
 from dynamics.parameters import passive_parameters
 from dynamics.rigid_body.passive_friction import passive_friction_columns
-from dynamics.rigid_body.virtual_work import rigid_body_regressor
+from dynamics.rigid_body.regressor import rigid_body_regressor
 from identify.arrays import Array
 from identify.filtering import SPLINE_DEGREE
 

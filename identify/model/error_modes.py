@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
 FRICTION_STEP = 1e-4
-"""Difference of a constant of the law of friction, in standard deviations. Others have one.
+"""Step of the differences in a constant of the law of friction, in standard deviations.
 
-The motion is far from linear in these constants.
+The step in other errors is one standard deviation. The motion is far from linear in constants of
+friction.
 """
 
 

@@ -1,4 +1,4 @@
-"""Model of a record whose poses and commands have times of their own."""
+"""Model of a timed record, in which poses and commands have times of their own."""
 
 from dataclasses import replace
 from math import ceil
@@ -31,11 +31,11 @@ REACH = 4.0
 """Largest offset of a clock that is tried, in its standard deviations."""
 
 SAME_RATE = 0.05
-"""Largest relative difference of the rate of commands from the frame rate, if they are the same."""
+"""Relative difference up to which the rate of commands counts as equal to the frame rate."""
 
 
 def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
-    """Return the model of a record at any times, which the commands drive.
+    """Return the model of a timed record, which the commands drive.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
     try:
         model = run.simulate(guess).pose
     except DynamicsError:
-        # the search reports an unstable model with all that is known there
+        # the search raises an error for an unstable model, with more evidence
         return run
     offset = likely_delay(
         run.times[run.ok], model[run.ok], run.measured[run.ok], REACH * stds[CLOCK_OFFSET]

@@ -89,7 +89,7 @@ class LoopModel:
     bodies: Array | None = None
     groups: RigidGroups | None = None
 
-    begins_in_motion: ClassVar[bool] = False  # whether the start is estimated, and not at rest
+    begins_in_motion: ClassVar[bool] = False  # True if the start is estimated, and not at rest
 
     def driven_by_commands(self) -> "LoopModel":
         """Return a copy of the model with joints driven by the logged commands."""
@@ -140,7 +140,7 @@ class LoopModel:
         return error_modes(self, parameters, lambda run: run.pose, given)
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return shifts (N, 6) that need no run of each error, by the places of the errors."""
+        """Return the shifts (N, 6) by errors that need no runs of their own, by their places."""
         return body_modes(self, parameters)
 
     @property
@@ -186,15 +186,15 @@ class LoopModel:
 
     @property
     def contained(self) -> slice:
-        """Places of the common errors that move the model: without a servo, not those of poses."""
+        """Places of the common errors that move the model. Errors of poses move it by a servo."""
         return slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
 
     def in_deciding_stds(self, change: Array) -> Array:
-        """Return a change (k,) of the common errors in the standard deviations that decide."""
+        """Return a change (k,) of the common errors in prior standard deviations."""
         return change
 
     def on_grid(self) -> "LoopModel":
-        """Return about this run with frames one period apart, for linear fits."""
+        """Return this run, approximately, with frames one period apart, for linear fits."""
         return self
 
     def simulate(
@@ -210,7 +210,7 @@ class LoopModel:
         parameters : ndarray, shape (p,)
             Parameters without the known load. The load is added.
         sensitivities : bool
-            Whether derivatives with respect to the parameters are also computed.
+            True to compute derivatives with respect to the parameters as well.
         robot : Robot, optional
             Robot that moves, without sensitivities. The default is the robot that the servo knows.
 
@@ -233,7 +233,7 @@ class LoopModel:
     def along(self, parameters: Array, directions: Array | None = None) -> ClosedLoopRun:
         """Simulate the model with sensitivities, also along directions (N, n, k) of its commands.
 
-        These are directions of what is added to the commands of a servo, if one acts.
+        With a servo, they are directions of the feedforward that is added to its commands.
         """
         given = *self.moving(parameters, self.robot), self.reference, self._loop
         more: dict[str, Any] = {"latencies": self.latencies, "groups": self.groups}
@@ -295,11 +295,11 @@ class LoopModel:
 
     @property
     def _sensor(self) -> IdealSensor:
-        """Sensor of the model, which loses the frames that were lost if a servo needs them."""
+        """Sensor of the model. If a servo acts, the sensor loses the frames that were lost."""
         return IdealSensor(None if self.driven else ~self.ok, self._sensed())
 
     def _sensed(self, noise: Array | None = None) -> Array | None:
-        """Return what is added to poses that the servo measures: errors, noise (..., N, 6)."""
+        """Return the errors and the noise (..., N, 6) of the poses that the servo measures."""
         if self.drawn is None or not self.common.names or self.driven:
             return noise
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]
@@ -330,7 +330,7 @@ class LoopModel:
         return {}
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `misses` (n, 6) of a model driven by commands, which are white if it is right.
+        """Return `misses` (n, 6) of a model driven by commands. If it is right, they are white.
 
         rng: generator for a subclass that fits states to the poses. Raises LoopFailure.
         """
@@ -342,7 +342,7 @@ class LoopModel:
         return self.without_common(missed), self.without_common(shown)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters, from those by pivots and others."""
+        """Return derivatives (..., p) by all parameters, from those by pivots and other ones."""
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)

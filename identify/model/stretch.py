@@ -28,7 +28,7 @@ DEGREE = 3
 """Degree of the polynomial through the first poses."""
 
 WIDE = 20.0
-"""Standard deviation of a start, in those of the polynomial through the first poses."""
+"""Ratio of the prior standard deviations of a start to those of the polynomial."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Stretch:
     coordinates, rates : ndarray, shape (m,)
         Coordinates of the platform at the start, and their rates.
     integral : ndarray, shape (n,)
-        Integrals of the drives beside those of rest at the coordinates, rad s or m s.
+        Integrals of the drives minus those at rest at the same coordinates, rad s or m s.
     std : ndarray, shape (2 m + n,)
         Standard deviations of coordinates, rates and integrals.
     """
@@ -96,7 +96,8 @@ class Stretch:
         errors : mapping of str to float
             Errors of the start by name, in their units. Others are zero.
         commands, since : ndarray, shapes (k, n) and (k,)
-            Commands that began to act before the start, and these times relative to the start, s.
+            Commands that began to act before the start, and the times at which they began, relative
+            to the start, s.
         """
         chart = robot.geometry.chart
         off = np.array([errors.get(name, 0.0) for name in self.error_names])
@@ -157,7 +158,7 @@ def begun_stretch(
     spread = np.linalg.norm(solver, axis=1)
     joints = robot.inverse_kinematics(chart.pose(chart.coordinates(measured)))
     error = commands - joints
-    # Without an integral in the law, none can be wrong.
+    # A law without an integral has no error of an integral.
     with np.errstate(divide="ignore"):
         per_torque = np.where(law.li > 0, 1.0 / law.li, 0.0)
     lag = law.lp * np.sqrt(np.mean(error**2, axis=0))

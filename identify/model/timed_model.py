@@ -1,4 +1,6 @@
-"""Model of a record whose poses and commands have times of their own, driven by its commands.
+"""Model of a timed record, in which poses and commands have times of their own.
+
+The logged commands drive the model.
 
 Between two events the model is an ordinary differential equation. Events are the times at which
 poses were seen and those at which commands began to act. A model of this kind needs neither a frame
@@ -39,18 +41,19 @@ from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATE
 from identify.runtime import in_threads
 
 CLOCK_STEPS = {CLOCK_OFFSET: 1e-4, CLOCK_DRIFT: 5e-6}
-"""Differences of the clock, s and s/s, by which the effect of its errors is computed.
+"""Steps of the clock's errors, s and s/s, for difference quotients of the poses.
 
-With them, the poses change by 2e-4 of a derivative more or less than linearly.
+At these steps, a quotient differs from the derivative by about 2e-4 of it.
 """
 
 ROUNDING = 9
-"""Decimals of the times of events, s, so that a command and a pose of one time are one event."""
+"""Decimals of the times of events, s. A command and a pose of the same rounded time are one event.
+"""
 
 
 @dataclass(frozen=True)
 class TimedModel(LoopModel):
-    """Model of a run at any times, driven by commands.
+    """Model of a timed run, driven by commands.
 
     Attributes
     ----------
@@ -111,9 +114,9 @@ class TimedModel(LoopModel):
         return _joined(self._simulated(parameters, True, directions=directions))
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return shifts (N, 6) that need no run of each error, by the places of the errors.
+        """Return the shifts (N, 6) by errors that need no runs of their own, by their places.
 
-        They are those by the start, by the clock and by errors of bodies.
+        These are errors of the starts, of the clock and of bodies.
         """
         of_bodies = super().derived_modes(parameters)
         return of_bodies | self._shown_starts(parameters) | self._shown_clock(parameters)
@@ -131,7 +134,7 @@ class TimedModel(LoopModel):
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
         """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n) at poses.
 
-        They follow from commands one period apart, and change little in a period.
+        They are interpolated between commands one period apart.
         """
         timing = self.settings.timing
         grid = grid_times(self.times, timing.frame_rate_hz)
@@ -140,7 +143,7 @@ class TimedModel(LoopModel):
         return interpolated(self.acting_now, grid, needed)
 
     def on_grid(self) -> LoopModel:
-        """Return about the same run with poses and commands a period apart, for linear fits."""
+        """Return this run, approximately, on a grid of one period, for linear fits."""
         grid = grid_times(self.times[self.ok], self.settings.timing.frame_rate_hz)
         measured = interpolated(grid, self.times[self.ok], self.measured[self.ok])
         taken = {one.name: getattr(self, one.name) for one in fields(LoopModel)}
@@ -205,7 +208,7 @@ class TimedModel(LoopModel):
             given = moved, values, still, settings, written
             more: dict[str, Any] = {"start": start, "times": events}
             if directions is not None:
-                # at each event that of the command that was written last
+                # each event has the direction of the command that was written last
                 last = np.maximum(np.searchsorted(acting, events, side="right") - 1, newest - 1)
                 more |= {"directions": directions[last], "start_directions": directions[newest - 1]}
             run = (
@@ -237,7 +240,7 @@ class TimedModel(LoopModel):
     def _shown_clock(self, parameters: Array) -> dict[int, Array]:
         """Return the changes (N, 6) of the poses by each error of the clock, by its place.
 
-        The run at the parameters (p,) without a difference is known already.
+        The run at the parameters (p,) without a step is cached already.
         """
         before = self._latest_run(parameters, sensitivities=True).pose
         stds = self.common.loop_std

@@ -161,8 +161,9 @@ class TorqueModel(LoopModel):
     ) -> Fit:
         """Return the fit of a span with its best start.
 
-        The search begins at the start of the previous fit, if there is one and the span runs from
-        there. Otherwise it begins at the best start of half of the span, or at the filtered start.
+        The search begins at the start of the previous fit, if there is one and the span can be
+        simulated from it. Otherwise it begins at the best start of half of the span, or at the
+        filtered start.
         Raises LoopFailure.
         """
         near = np.diag(1 / self._width)

@@ -39,7 +39,7 @@ class UnequalGains(LoopModel):
         return self.robot.layout.split(parameters)[3] + self.differences
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return shifts (N, 6) that need no run of each error, by the places of the errors."""
+        """Return the shifts (N, 6) by errors that need no runs of their own, by their places."""
         found = super().derived_modes(parameters)
         # the run that was kept has sensitivities by the gains of each joint
         self.known_runs.clear()
@@ -70,7 +70,7 @@ class UnequalGains(LoopModel):
 
 @dataclass(frozen=True)
 class TimedUnequalGains(UnequalGains, TimedModel):
-    """The same of a run at any times."""
+    """Model of a timed run in which the gains of each joint differ from the shared gains."""
 
 
 def with_unequal_gains(run: LoopModel, differences: Array) -> UnequalGains:

@@ -26,8 +26,9 @@ from cmmsim.calibration import (
 )
 from cmmsim.detection.start_kernels import isolate_dots
 from cmmsim.files.sensor_file import sensor_text
-from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
+from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.pose import apply, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
 from cmmsim.imaging.analytic import ANALYTIC

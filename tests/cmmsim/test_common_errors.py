@@ -13,7 +13,8 @@ from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, triangulate
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.measurement import lost_measurement
 from cmmsim.measuring.observation import faces_camera
 from cmmsim.uncertainty.common_errors import NAMES, MeasuringGeometry

@@ -16,8 +16,8 @@ import cmmsim
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.disc_image import sticker_outlines
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.pose import (
     apply,
     compose_covariance,
@@ -28,7 +28,8 @@ from cmmsim.geometry.pose import (
 )
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.rigid_kernels import residual_misfits
-from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
+from cmmsim.geometry.stereo_rig import toed_in_rig
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.frame_solver import (
     FEWEST,
     LARGEST_MISFIT,

@@ -11,13 +11,13 @@ from scipy.special import ndtr
 import cmmsim
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.disc_image import (
     SHAPE_BASIS,
     centre_offset,
     coverage,
     project_discs,
 )
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from cmmsim.measuring.observation import DetectionSettings, Observer
 from tests.cmmsim.plain import eccentricity

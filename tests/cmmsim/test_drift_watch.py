@@ -16,7 +16,8 @@ from scipy.stats import binom, multivariate_normal
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import PLACE_NAMES, triangulate
+from cmmsim.geometry.stereo_rig import PLACE_NAMES
+from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.observation import faces_camera
 from cmmsim.measuring.sticker_windows import StickerObservation

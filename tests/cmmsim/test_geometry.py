@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from cmmsim.errors import LostError, ShapeError
 from cmmsim.geometry import pose as p
-from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.plane_frame import (
     fit_plane,
     frame_from_planes,
@@ -20,7 +21,8 @@ from cmmsim.geometry.plane_frame import (
     frames_of_points,
 )
 from cmmsim.geometry.registration import register, register_sets
-from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
+from cmmsim.geometry.stereo_rig import toed_in_rig
+from cmmsim.geometry.triangulation import triangulate
 from tests.cmmsim.sensors import CAMERA
 
 ANGLE = st.floats(-1.4, 1.4)

@@ -10,7 +10,7 @@ import cmmsim
 from cmmsim.files.rig_and_bodies import rig_from_file
 from cmmsim.files.schema import RightFromLeft
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
-from cmmsim.geometry.camera import Distortion
+from cmmsim.geometry.lens_distortion import Distortion
 from cmmsim.geometry.pose import apply, rotation_exp
 from tests.cmmsim.sensors import LEFT, RIGHT, refused
 

@@ -1,0 +1,61 @@
+"""Visual servo (eq. 30), and its derivatives.
+
+The servo is U = J_theta [kp e + kd e_dot + ki integral(e)], with the error e at the time of
+exposure. The pose rate is the difference of the last two good measurements over the time between
+them. Before the first measurement, the start state provides the last one. The integral is the sum
+of the errors times the frame period. At a lost frame, the servo does not run: its last measurement,
+integral and command stay as they are.
+"""
+
+from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, dot
+from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
+from dynamics.compiled.kernel import Array, Record, call, kernel
+
+
+@kernel
+def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
+    """Compute the command of the servo at a good frame, and its derivatives.
+
+    The servo needs the Jacobian at the measured pose. If that is the true pose, the Jacobian of the
+    motion is used, which is already known.
+    """
+    size = len(measured)
+    known = now.known
+    same = known.valid and task.servo_knows
+    reference = plan.reference[k]
+    reference_rate = plan.reference_rate[k]
+    for i in range(size):
+        error = reference[i] - measured[i]
+        # the rate is over the time since the last good measurement, which may be several frames
+        rate = (measured[i] - now.last_measured[i]) / now.elapsed
+        now.servo_integral[i] += task.period * error
+        by_rate = task.kd * (reference_rate[i] - rate)
+        now.demand[i] = task.kp * error + by_rate + task.ki * now.servo_integral[i]
+        same = same and known.inputs[i] == measured[i]
+    jacobian = known.jacobian if same else now.served.jacobian
+    if not same:
+        copy(measured, now.served.inputs[:size])
+        call(task.servo_jacobian, now.served.inputs, now.served.jacobian)
+    for i in range(len(now.mode)):
+        now.last_command[i] = dot(jacobian[i], now.demand[:])
+    if task.sensitivities:
+        serve_tangent(task, now, d, measured, jacobian)
+    copy(measured, now.last_measured[:])
+    now.elapsed = 0.0
+
+
+@kernel
+def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobian: Array) -> None:
+    """Differentiate the command of the servo. The derivatives of the measured pose are in `d.x`."""
+    width = now.width
+    velocity_by_pose(task, now, measured, now.demand[:])
+    for i in range(len(now.demand)):
+        for k in range(width):
+            moved = d.x[i, k]
+            d_rate = (moved - d.last_measured[i, k]) / now.elapsed
+            d.integral[i, k] -= task.period * moved
+            d.demand[i, k] = -task.kp * moved - task.kd * d_rate + task.ki * d.integral[i, k]
+            d.last_measured[i, k] = moved
+    clear(d.last_command[:], width)
+    add_product(1.0, jacobian, d.demand[:], d.last_command[:], width)
+    add_product(1.0, now.rate_map, d.last_measured[:], d.last_command[:], width)
