@@ -131,7 +131,7 @@ def measure_exposures(
     """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
 
     ``exposure_ends`` are the expected camera_from_platform (N,4,4) at the beginning and at the end
-    of the exposures, and ``frame_ends`` half a frame period before and after their middles. The
+    of the exposures, and ``frame_ends`` those half a frame period from their middles. The
     results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places

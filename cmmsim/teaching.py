@@ -1,7 +1,7 @@
 """Teaching (paper section 4.2): the frames of base and platform from their sticker planes.
 
 The base stands still, and its stickers are averaged over many exposures. The platform follows a
-smooth path. Its stickers are observed at each pose, and registration lays all observations onto
+smooth path. Its stickers are observed at each pose, and registration moves all observations onto
 each other. The planes are fitted to the mean constellation. Because the stickers lie on different
 sub-pixel positions at different poses, errors of the image formation are averaged out as well.
 
@@ -49,12 +49,13 @@ Progress = Callable[[int, int], None]
 SHIFT = 0.008
 TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-# m: in averaged exposures, an unhidden sticker is seen within a few micrometres of its place.
+# Largest distance of a sticker from its place in averaged exposures, m. If the sticker is not
+# hidden, this is a few micrometres.
 LARGEST_GAP = 1e-4
 # Largest rms of the distances of two rays of the base's stickers, in deviations. It is 1.2 to 1.4
 # with cameras and stickers as stated.
 LARGEST_PARTING = 3.0
-# The same for errors by print, in standard deviations.
+# Allowance for errors by print in the distance of a sticker from its place, in their deviations.
 PRINT_REACH = 20.0
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to

@@ -82,7 +82,8 @@ class Tracker:
             try:
                 found = self._found(images)
             except LostError as error:
-                # Windows that show only one of two groups of stickers must not decide for it.
+                # If two groups of stickers contradict each other, windows that show only one of
+                # them must not decide for this group.
                 if best is None or isinstance(error, DividedError):
                     self.forget()
                     return lost_measurement(str(error))

@@ -33,9 +33,9 @@ class RobotGeometry:
     are the names of the bodies with ten inertial parameters instead of four (see
     `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
     if all joints share them. `passive_friction` are the names of the parameters of passive joints
-    (see `parameters.passive_parameters`). `unstated` has the
-    standard deviations of the differences between real bodies and joints and this model of them.
-    `meshes` are the meshes that draw bodies of the legs in place of rods.
+    (see `parameters.passive_parameters`). `unstated` has the standard deviations of the differences
+    between real bodies and joints and this model of them. `meshes` are the meshes that draw bodies
+    of the legs in place of rods.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -70,13 +70,13 @@ class RobotGeometry:
         object.__setattr__(
             self, "legs", tuple(leg.assembled(at, k + 1) for k, (leg, at) in enumerate(at_home))
         )
-        # raises ParameterError for a full body or passive joint that there is not
+        # raises ParameterError for a full body or a passive joint that does not exist
         self.layout  # noqa: B018
         if self.meshes:
             self._check_meshes()
 
     def _check_meshes(self) -> None:
-        """Raise RobotFileError for a mesh of a body that there is not."""
+        """Raise RobotFileError for a mesh of a body that does not exist."""
         rows = [row for rows in self.layout.of_leg for row in rows]
         kinds = dict.fromkeys(self.layout.kinds[row].name for row in rows)
         valid = [*kinds, *(self.layout.bodies[row] for row in rows)]

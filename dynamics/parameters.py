@@ -50,7 +50,7 @@ def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RigidGroups:
-    """Groups of inertial parameters through which alone they affect the motion.
+    """Groups of inertial parameters. The motion depends on the parameters only through the groups.
 
     `combinations` (k, r) has the coefficients of the r parameters in each of the k groups. `pivots`
     (k,) are the indices of one parameter of each group, in ascending order. This parameter has the
@@ -74,8 +74,7 @@ class RigidGroups:
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Parameters of a robot: of its bodies, of the friction of passive and actuated joints, and of
-    the joint PID.
+    """Layout of the parameters of a robot: of bodies, friction of all joints, and joint PID.
 
     `bodies` are the names of all bodies, the platform first, and `kinds` are their kinds. `of_leg`
     are the indices of the bodies of each leg. `prismatic` is True if the actuators slide. `full` is
@@ -223,8 +222,8 @@ class ParameterLayout:
     def converted(self, dynamic: np.ndarray, other: "ParameterLayout") -> np.ndarray:
         """Dynamic parameters (..., p) in the layout of the same robot in another form.
 
-        Parameters that this layout does not have are zero. Friction of passive joints that is
-        shared, and was not, is the mean over the legs.
+        Parameters that this layout does not have are zero. If friction of passive joints becomes
+        shared, it is the mean over the legs.
         """
         inertial = other.rigid_of(self.bodies_of(dynamic))
         passive = np.zeros((*dynamic.shape[:-1], len(other.passive_names)))
@@ -273,8 +272,9 @@ class ParameterLayout:
         return unit_of(name, self.prismatic)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Split parameters into those of the equation of motion, dry friction (n,), viscous
-        friction (n,), and lp, li, ld of each joint (n, 3).
+        """Parameters of the equation of motion, of dry and of viscous friction (n,), and gains.
+
+        The gains are lp, li, ld of each joint (n, 3).
         """
         return (
             values[self.rigid],
@@ -312,7 +312,7 @@ class ParameterLayout:
 def may_be_absent(name: str) -> bool:
     """Return True for a parameter that some layouts of a robot do not have, where it is zero.
 
-    Such are first moments and products of inertia, and the friction of passive joints.
+    These are first moments and products of inertia, and the friction of passive joints.
     """
     joint, _, entry = name.rpartition(".")
     return entry in SIGNED or joint.endswith(PASSIVE_JOINT.format(""))

@@ -198,8 +198,8 @@ class MeasuringGeometry:
     def _taught_by_print(self, print_errors: PrintErrors) -> tuple[Array, Array]:
         """Errors of teaching per standard deviation of the print's errors.
 
-        The results are as those of ``taught_by_rig``, (6, 2) and (2, n, 3). They are zero if the
-        sensor was not taught by images.
+        The results, (6, 2) and (2, n, 3), are of the kind of ``taught_by_rig``. They are zero if
+        the sensor was not taught by images.
         """
         if not self.taught.place_covariances.any():
             return np.zeros((6, 2)), np.zeros((2, *self.taught.platform_places.shape))
@@ -222,8 +222,10 @@ class MeasuringGeometry:
 
     @property
     def _teaching_points(self) -> tuple[Array, Array, Array]:
-        """Stickers of the base (b, 3), camera_from_platform (v, 4, 4) on the path of teaching, and
-        all points (m, 3) that teaching sees: those of the base, then those of each view.
+        """Stickers of the base, camera_from_platform on the path of teaching, and all points.
+
+        The shapes are (b, 3), (v, 4, 4) and (m, 3). All points that teaching sees are those of the
+        base, then those of each view.
         """
         path = self.camera_from_base @ transforms_of(teaching_path(self.home, TEACHING_POSES))
         base = apply(self.camera_from_base, self.taught.base_places)

@@ -27,7 +27,7 @@ PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
 The parameters are those of the base's movement in camera axes, with rotations about its origin.
 """
 
-# px: its square is added to the stated variance of a centre, which can be too small.
+# The square of this, px, is added to the stated variance of a centre, which can be too small.
 SMALLEST_STD_PX = 5e-4
 RIG = len(PARAMETER_NAMES)
 

@@ -88,8 +88,8 @@ class KnownRig:
     def line_std(self, points: Array) -> float:
         """Return the standard deviation, px, of distances of images from their epipolar lines.
 
-        Errors of the known rig cause these distances. The result is the largest one over points (n,
-        3) in the camera frame.
+        Errors of the known rig cause these distances. The result is the largest one over ``points``
+        (n, 3) in the camera frame.
         """
         std = np.sqrt(np.diag(self.covariance))
         moved = []

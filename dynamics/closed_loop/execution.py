@@ -385,9 +385,7 @@ def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any
 
 
 def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFailure:
-    """Error of a run that ended early, with the number of frames in which actuators were at the
-    limit.
-    """
+    """Error of a run that ended early. It counts the frames with actuators at the torque limit."""
     limit = problem.settings.drives.torque_limit
     unit = problem.robot.layout.unit("joint1.coulomb")
     saturated = saturated_frames(record.torque[:frame], limit)

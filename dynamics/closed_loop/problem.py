@@ -99,7 +99,7 @@ class LoopProblem:
 
     @property
     def further_columns(self) -> int:
-        """Number of columns of the start state or of directions, which follow the parameters'."""
+        """Number of columns after those of the parameters: of the start state, or of directions."""
         return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property

@@ -208,8 +208,8 @@ def equilibrium(
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
-    # With friction (c + o) and -(c - o) in both directions, a joint moves as with c and -c under a
-    # torque that is less by o.
+    # A joint with the friction c + o in one direction and -(c - o) in the other moves as with c and
+    # -c under a torque that is less by o.
     net = torque - drives.offsets(len(angles))
     received, integral = law.held(net, angles)
     command = drives.sent(received)

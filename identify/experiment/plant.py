@@ -126,7 +126,7 @@ class Plant:
         """Return the true parameters (p,) in the layout of a model.
 
         First moments and products of inertia that the plant has and the model lacks are left out.
-        If the model shares gains and the plant does not, they are the mean of those of all joints.
+        If the model shares gains and the plant does not, the gains are the mean over all joints.
         """
         own = self.robot.layout
         dynamic = own.converted(self.parameters[own.dynamic], layout)

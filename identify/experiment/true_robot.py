@@ -32,10 +32,10 @@ from identify.scenario.sections import Geometry
 def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> Robot:
     """Return the true robot with the full bodies, the passive friction and the gains of the plant.
 
-    Bodies and friction are those of the robot file, unless the plant states others, and those of
-    which the plant states a true value: a first moment, a product of inertia, or friction of a
-    passive joint. Raises ScenarioError, with the valid names, for a true value of a parameter that
-    the robot does not have.
+    Full bodies and passive friction are those of the robot file, unless the plant states others. A
+    body is also full if the plant states a true first moment or product of inertia of it, and a
+    passive joint has friction if the plant states its true value. Raises ScenarioError, with the
+    valid names, for a true value of a parameter that the robot does not have.
     """
     of_plant = in_form(in_file, switches)
     stated = of_plant.layout
@@ -112,7 +112,7 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
 
 
 def true_zeros(robot: Robot, switches: PlantSwitches) -> Array:
-    """Return how much less than its true coordinate each joint (n,) of a plant reads, rad or m.
+    """Return the true coordinate minus the reading of each joint (n,) of a plant, rad or m.
 
     Raises ScenarioError for a list of a wrong length.
     """

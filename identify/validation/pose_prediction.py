@@ -264,8 +264,7 @@ def predicted_variances(
     seed: int,
     learned: Mapping[str, float] | None = None,
 ) -> dict[str, Array]:
-    """Return the variances (N, 6) of a prediction by the sources of the uncertainty, whose sum is
-    its variance.
+    """Return the parts (N, 6) of the variance of a prediction by the sources of its uncertainty.
 
     `sources` (p + k, p + k) are the parts of the covariance by their names. The motion by the
     sensor's noise is another source, MOTION, and so are common errors of which the record of the

@@ -198,9 +198,10 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
 def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: int) -> Array:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
-    Both run on the validation trajectories of a seed, each with its own friction law and steps. An
-    ideal sensor closes both loops, so the errors are caused only by the parameters (p,) and by
-    effects that the model lacks. They are NaN if, and only if, the model's loop is unstable.
+    Both run on the validation trajectories of a seed, each with its own friction law and
+    integration steps. An ideal sensor closes both loops, so the errors are caused only by the
+    parameters (p,) and by effects that the model lacks. They are NaN if, and only if, the model's
+    loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
     range. Raises TrajectoryError if no validation trajectory is within the robot's limits.
