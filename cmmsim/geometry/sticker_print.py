@@ -88,12 +88,8 @@ class SeenStickers:
 
         Centres and normals are (k, 3) in camera axes, and ``focal_lengths`` (2,) in px.
         """
-        jacobians = np.zeros((len(centres), 2, 3))
-        for i, focal in enumerate(focal_lengths):
-            jacobians[:, i, i] = focal / centres[:, 2]
-            jacobians[:, i, 2] = -focal * centres[:, i] / centres[:, 2] ** 2
         axes = np.linalg.svd(normals[:, None])[2][:, 1:].swapaxes(1, 2)
-        return cls.of(centres, normals, axes, radius, jacobians)
+        return cls.of(centres, normals, axes, radius, pinhole_slopes(focal_lengths, centres))
 
     @property
     def retro_shifts(self) -> Array:
@@ -151,6 +147,15 @@ class SeenStickers:
     def rim_growth(self) -> Array:
         """Growth (k, RIM_POINTS) of the outlines per radius of thickness: the side of the rim."""
         return np.maximum(self.slopes @ CIRCLE, 0.0)
+
+
+def pinhole_slopes(focal_lengths: Array, points: Array) -> Array:
+    """Return the derivatives d(pixels) / d(point) (k, 2, 3) of points (k, 3) in camera axes."""
+    slopes = np.zeros((len(points), 2, 3))
+    for i, focal in enumerate(focal_lengths):
+        slopes[:, i, i] = focal / points[:, 2]
+        slopes[:, i, 2] = -focal * points[:, i] / points[:, 2] ** 2
+    return slopes
 
 
 def outline_modes(angle: Array) -> Array:

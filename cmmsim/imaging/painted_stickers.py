@@ -19,19 +19,113 @@ from cmmsim.files.light_and_print import Light
 from cmmsim.files.printed import drawn_print, print_sizes
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
-from cmmsim.geometry.sticker_print import RETRO_ANGLE
+from cmmsim.geometry.sticker_print import PrintSizes, SeenStickers, pinhole_slopes
 from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch, SceneBody
 
 if TYPE_CHECKING:
-    from cmmsim.imaging.paint_kernels import Paint
+    from cmmsim.imaging.paint_kernels import Painted
 
 # rad: largest angle between the line of sight and an object of the background, and the range of
 # the objects' radii.
 CLUTTERED = 0.5
 SMALLEST_OBJECT = 4e-4
 LARGEST_OBJECT = 8e-3
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Stickers with their print, in the axes of their bodies, and the light on them.
+
+    bodies, places    (n,) and (n, 3) m, body and place of each sticker
+    axes              (n, 3, 2), axes u and v of each sticker's plane
+    radius            radius of the stickers, m
+    ring_radius       radius of the rings, m
+    face, ring        levels of stickers and rings
+    sizes             sizes of what is wrong with the stickers
+    prints, outlines  (n, 5) and (n, 8), coefficients of the modes of brightness and outline
+    light             light of the sensor file
+    target            (3,), place at which lamps have their strength, in the base frame, m
+    """
+
+    bodies: NDArray[np.int_]
+    places: Array
+    axes: Array
+    radius: float
+    ring_radius: float
+    face: float
+    ring: float
+    sizes: PrintSizes
+    prints: Array
+    outlines: Array
+    light: Light
+    target: Array
+
+    def seen_by(self, camera: PinholeCamera, camera_from_bodies: Array) -> Painted:
+        """Return the stickers that face a camera with a perfect lens."""
+        # Imported late, because importing numba takes time.
+        from cmmsim.imaging.paint_kernels import Painted
+
+        moves = camera_from_bodies[self.bodies]
+        centres = np.einsum("nij,nj->ni", moves[:, :3, :3], self.places) + moves[:, :3, 3]
+        axes = moves[:, :3, :3] @ self.axes
+        normals = np.cross(axes[..., 0], axes[..., 1])
+        facing = np.einsum("ni,ni->n", centres, normals)
+        kept = (facing < 0.0) & (centres[:, 2] - self.ring_radius > NEAR)
+        centres, axes, normals, facing = (each[kept] for each in (centres, axes, normals, facing))
+        slopes = pinhole_slopes(camera.focal_lengths, centres)
+        seen = SeenStickers.of(centres, normals, axes, self.radius, slopes)
+        rays = np.concatenate([self.radius * axes, centres[..., None]], axis=2)
+        middles = camera.project(centres)[0]
+        # A ring beside the optical axis is stretched.
+        stretch = 1.0 + np.abs(middles - camera.centre) / camera.focal_lengths
+        near = centres[:, 2:] - self.ring_radius
+        reach = self.ring_radius * camera.focal_lengths * stretch / near + 1.0
+        cosines = -facing / np.linalg.norm(centres, axis=1)
+        return Painted(
+            np.linalg.inv(camera.matrix @ rays),
+            np.linalg.inv(seen.to_image),
+            np.hstack([middles - reach, middles + reach]),
+            self.sizes.thickness * seen.slopes,
+            self.sizes.retro_shift * seen.retro_shifts,
+            self._lights(camera_from_bodies[1], centres, normals, self.radius * axes),
+            self.face * cosines**self.light.fall_off,
+            self.ring,
+            self.ring + self.sizes.rim * (self.face - self.ring),
+            self.prints[kept],
+            self.outlines[kept],
+        )
+
+    def _lights(
+        self, camera_from_base: Array, centres: Array, normals: Array, steps: Array
+    ) -> Array:
+        """Return the light at centres (n, 3), and its changes along steps (n, 3, 2), as (n, 3).
+
+        All are in camera axes.
+        """
+
+        def at(points: Array) -> Array:
+            light = np.full(len(points), self.light.ambient if self.light.lamps else 1.0)
+            for lamp in self.light.lamps:
+                if lamp.direction is not None:
+                    towards = np.tile(turn @ lamp.direction, (len(points), 1))
+                    reach = np.ones(len(points))
+                elif lamp.place is not None:
+                    towards = turn @ lamp.place + camera_from_base[:3, 3] - points
+                    usual = np.sum((np.array(lamp.place) - self.target) ** 2)
+                    reach = usual / np.sum(towards**2, axis=1)
+                cosines = np.einsum("ni,ni->n", towards, normals)
+                cosines = cosines / np.linalg.norm(towards, axis=1)
+                light += lamp.strength * np.maximum(cosines, 0.0) * reach
+            return light
+
+        turn = camera_from_base[:3, :3]
+        changes = [
+            0.5 * (at(centres + steps[..., i]) - at(centres - steps[..., i])) for i in range(2)
+        ]
+        return np.column_stack([at(centres), *changes])
 
 
 @dataclass(frozen=True)
@@ -67,13 +161,13 @@ class StickerPainter:
             behind = renderer.draw(self.dark, views, supersampling, 1.0)
         for seen in views.exposures:
             camera = seen.camera
-            places = np.ascontiguousarray(seen.camera_from_bodies)
-            figures = camera.focal_lengths, camera.centre
+            places = seen.camera_from_bodies
             at = seen.windows, np.asarray(views.corners[seen.windows], dtype=float)
-            paint_view(images, shown, *at, self.paint, places, *figures, NEAR)
+            paint_view(images, shown, *at, self.paint.seen_by(camera, places))
             if len(self.objects):
                 turn = np.ascontiguousarray(places[1, :3, :3])
-                scatter_objects(images, behind, *at, self.objects, turn, *figures)
+                lens = camera.focal_lengths, camera.centre
+                scatter_objects(images, behind, *at, self.objects, turn, *lens)
         return images
 
 
@@ -117,46 +211,24 @@ def _with_levels(drawable: Drawable, ring: float, solid: float | None) -> Drawab
 
 def _paint(file: SensorFile, bodies: Sequence[SceneBody], marked: Sequence[MarkedBody]) -> Paint:
     """Return the stickers of platform and base with their print, and the lamps."""
-    # Imported late, because importing numba takes time.
-    from cmmsim.imaging.paint_kernels import Paint
-
-    stickers = file.stickers
-    sizes = print_sizes(file)
     counts = [len(body.sticker_places) for body in bodies]
     drawn = [drawn_print(file, n, k) for k, n in enumerate(counts)]
     prints, outlines = (np.concatenate(values) for values in zip(*drawn, strict=True))
     axes = np.concatenate([body.in_plane for body in marked])
-    face, ring = stickers.sticker_level / 255.0, stickers.ring_level / 255.0
+    levels = file.stickers.sticker_level / 255.0, file.stickers.ring_level / 255.0
     return Paint(
         np.repeat(np.arange(len(counts)), counts),
         np.concatenate([body.sticker_places for body in bodies]),
-        np.cross(axes[..., 0], axes[..., 1]),
-        np.ascontiguousarray(axes),
-        stickers.radius,
-        stickers.ring_radius,
-        face,
-        ring,
-        ring + sizes.rim * (face - ring),
-        sizes.thickness,
-        sizes.retro_shift,
-        RETRO_ANGLE,
+        axes,
+        file.stickers.radius,
+        file.stickers.ring_radius,
+        *levels,
+        print_sizes(file),
         prints,
         outlines,
-        file.light.fall_off,
-        *_lamps(file.light, np.array(file.rig.target)),
+        file.light,
+        np.array(file.rig.target),
     )
-
-
-def _lamps(light: Light, target: Array) -> tuple[float, Array, Array, Array]:
-    """Return the light without lamps, and the lamps (l, 4), strengths (l,) and distances (l,)."""
-    rows = [
-        [*lamp.direction, 0.0] if lamp.place is None else [*lamp.place, 1.0]  # type: ignore[misc]
-        for lamp in light.lamps
-    ]
-    lamps = np.array(rows, dtype=float).reshape(-1, 4)
-    strengths = np.array([lamp.strength for lamp in light.lamps], dtype=float)
-    distances = np.linalg.norm(lamps[:, :3] - target, axis=1)
-    return (light.ambient if light.lamps else 1.0), lamps, strengths, distances
 
 
 def _objects(file: SensorFile) -> Array:
