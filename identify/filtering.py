@@ -123,7 +123,7 @@ def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def interpolated(times: NDArray[Any], known: NDArray[Any], values: Array) -> Array:
-    """Return values (k, ...), which are known at times (k,), at other times (N,), linearly."""
+    """Interpolate values (k, ...) that are known at times (k,) linearly at other times (N,)."""
     columns = values.reshape(len(values), -1).T
     found = np.column_stack([np.interp(times, known, column) for column in columns])
     return found.reshape(len(times), *values.shape[1:])

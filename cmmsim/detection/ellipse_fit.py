@@ -90,8 +90,7 @@ def fit_ellipses(
     ``fit_size`` px around the bright spot is fitted. ``psf_px`` is the standard deviation of the
     Gaussian point spread. The spots move by ``smears`` (n, 2) px during the exposure, and the
     centres are those at its middle. If ``lit`` is True, light that rises across each sticker is
-    fitted too. Raises CmmError for a point spread that is too narrow to be
-    modelled.
+    fitted too. Raises CmmError for a point spread that is too narrow to be modelled.
     """
     require_psf(psf_px)
     from cmmsim.detection.fit_kernels import LIT_UNKNOWNS, UNKNOWNS, fit_windows

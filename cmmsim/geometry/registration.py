@@ -80,8 +80,8 @@ def register(source: Array, target: Array, covariances: Array) -> Registration:
 def register_sets(source: Array, targets: Array, covariances: Array) -> Registration:
     """Return the registrations of a ``source`` onto c ``targets`` (c, n, 3), see ``register``.
 
-    The source is (n, 3), or (c, n, 3) with one source per target. The result has transforms (c, 4,
-    4), covariances (c, 6, 6) and misfits (c n,). The spread of the points is not checked.
+    The source is (n, 3), or (c, n, 3) with one source per target. In the result, transforms are
+    (c, 4, 4), covariances (c, 6, 6) and misfits (c n,). The spread of the points is not checked.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.rigid_kernels import rigid_fits

@@ -5,8 +5,8 @@ varies over a sticker by the modes 2 u, 2 v, √24 u v, √6 (u² - v²) and √
 orthogonal, and have a mean square of 1 on the disc. The outline varies by the harmonics 2 to 5 of
 the angle.
 
-**Shift of a fitted centre.** What is wrong with a sticker moves its apparent rim by rho, px, along
-the normal n of the rim in the image. A fit to grey values minimises the squared distance between
+**Shift of a fitted centre.** Errors of a sticker move its apparent rim by rho, px, along the
+normal n of the rim in the image. A fit to grey values minimises the squared distance between
 ellipse and rim along the rim. The shape of the ellipse takes up the part of rho that is equal on
 opposite sides. The shift of the centre is therefore
 
@@ -29,14 +29,14 @@ from cmmsim.geometry.pose import Array
 PRINT_MODES = 5
 HARMONICS = (2, 3, 4, 5)
 OUTLINE_MODES = 2 * len(HARMONICS)
-# rad: angle of view at which the shift of a retro-reflective sticker is stated.
+# Angle of view at which the shift of a retro-reflective sticker is stated, rad.
 RETRO_ANGLE = np.radians(40.0)
 RIM_POINTS = 32
 
 
 @dataclass(frozen=True)
 class PrintSizes:
-    """Sizes of what is wrong with stickers.
+    """Sizes of the errors of stickers.
 
     ``thickness``, ``outline`` and ``retro_shift`` are in radii of a sticker, ``unevenness`` is
     relative, and ``rim`` is the brightness of the rim, 0 for that of the ring and 1 for that of the
@@ -93,7 +93,7 @@ class SeenStickers:
 
     @property
     def retro_shifts(self) -> Array:
-        """Directions (k, 2) away from the camera in (u, v), times the angle of view in 40 degrees.
+        """Directions (k, 2) away from the camera in (u, v), times angle of view over RETRO_ANGLE.
 
         The shift of a retro-reflective sticker is proportional to them.
         """

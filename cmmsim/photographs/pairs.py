@@ -43,7 +43,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Format:
-    """What images must be: their size from the rig, their grey values from the camera's noise.
+    """Required format of images. The rig states their size, and the noise their grey values.
 
     ``colour`` is a key of `COLOURS`, or None if images with colours are refused. ``frame_rate`` in
     Hz gives the times of images in folders and arrays.
@@ -119,7 +119,7 @@ class Photographs:
     left, right : str, Path, or iterable of ndarray
         Folders of images, videos, or arrays (height, width) of both cameras.
     format : Format
-        What the images must be.
+        Required format of the images.
 
     Raises
     ------

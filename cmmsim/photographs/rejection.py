@@ -143,7 +143,7 @@ def _left_out(
 
 
 def _movement(mine: Observations, state: BundleState, names: Sequence[str]) -> str:
-    """Return when one sticker has moved by how much, or an empty text."""
+    """Return a text that states when and how far a sticker has moved, or an empty text."""
     found = triangulate(state.rig, *mine.pixels, *mine.covariances).points
     poses = state.poses[mine.pair]
     places = np.array(

@@ -247,8 +247,8 @@ class JointElasticity:
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
     """Matrix (2 n, 2 n) of stiffnesses, or of dampings, of the coordinates of bodies and motors.
 
-    `spring` is that between each body and its motor, and `at_motor` (n,) are those between the
-    motors and the base.
+    `spring` is the value between each body and its motor, and `at_motor` (n,) are the values
+    between the motors and the base.
     """
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])
