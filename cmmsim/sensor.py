@@ -371,9 +371,9 @@ class Sensor(Instrument):
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """Return a tracker, which measures frame after frame."""
-        # The faster tracker needs every sticker of the platform in the scene,
+        # The faster tracker needs every sticker of the scene, and teaching can leave some out. It
+        # does not model print.
         whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
-        # and stickers whose print is perfect.
         perfect = self._file.print.is_perfect
         if (
             self.renderer != STATISTICAL.name

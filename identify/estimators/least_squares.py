@@ -38,7 +38,7 @@ UNKNOWN_TORQUE = 1e3
 """Prior standard deviation of the torques at the start, N m, so large that it has no effect."""
 
 UNKNOWN_FORCE = 1e6
-"""Prior standard deviation of the forces at the start, N, likewise for joints that slide."""
+"""Prior standard deviation of the forces at the start, N, of joints that slide, also so large."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TorqueEquations:
     matrix, right : ndarray, shapes (2 m, u) and (2 m,)
         Coefficients and right side.
     kind : ndarray of int, shape (2 m,)
-        Index of the joint. In rows of the controller the number of joints is added.
+        Index of the joint, plus the number of joints in rows of the controller.
     correlation : float
         Samples that count as one independent sample. After a low-pass filter with cutoff f there
         are 2 f independent samples per second.
@@ -115,9 +115,7 @@ def torque_equations(
 
 
 def lower_bounds(layout: ParameterLayout) -> Array:
-    """Return lower bounds (u,): `least_values` of the parameters, and -inf for the torques at the
-    start.
-    """
+    """Return the lower bounds (u,) of the unknowns, -inf for the torques at the start."""
     return np.concatenate([least_values(layout), np.full(layout.joints, -np.inf)])
 
 
