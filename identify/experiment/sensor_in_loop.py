@@ -26,6 +26,9 @@ from identify.scenario.sections import Rig
 OFF_PLATFORM_M = 0.05
 """Largest distance, m, of a leg's end from the platform in the sensor file, and of both homes."""
 
+OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE names it"
+"""Next step if the platform of the sensor is not that of the robot."""
+
 
 @dataclass(frozen=True)
 class SensorPlan:
@@ -158,12 +161,12 @@ def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
         raise ScenarioError(
             f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the "
             f"platform that sensor {sensor} sees, limit {OFF_PLATFORM_M:g} m: [platform] of the "
-            "sensor must describe the platform of the robot"
+            f"sensor must describe the platform of the robot; {OWN_SENSOR}"
         )
     if away > OFF_PLATFORM_M:
         raise ScenarioError(
             f"home of {robot.name} is {away:.3g} m from platform.home of sensor {sensor}, limit "
-            f"{OFF_PLATFORM_M:g} m: platform.home must be the home of the robot"
+            f"{OFF_PLATFORM_M:g} m: platform.home must be the home of the robot; {OWN_SENSOR}"
         )
 
 

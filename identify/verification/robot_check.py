@@ -17,7 +17,7 @@ from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.experiment.law_in_loop import feedback
-from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances
+from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, OWN_SENSOR, platform_distances
 from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
@@ -50,7 +50,7 @@ def check_robot(
         lambda: check_loop(robot, parameters, around.settings),
         lambda: check_steps(robot, parameters, around),
         lambda: check_gains(robot, parameters, around),
-        lambda: _seen(robot, around.sensor, around.sensor_file),
+        lambda: about_sensor(robot, around.sensor, around.sensor_file),
     ]
     findings = []
     with (progress or SilentProgress()).stage("check", len(questions)) as advance:
@@ -249,7 +249,7 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
     yield Finding("centres of mass", share <= 1.0, share, 1.0, "1", leg, text)
 
 
-def _seen(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
+def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
     """Check whether the platform in a sensor file is the robot's platform."""
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
@@ -258,6 +258,11 @@ def _seen(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
     text = f"leg {leg + 1} ends {most:.3g} m outside of the platform that sensor {sensor} sees"
     if most <= 0:
         text = f"all legs end on the platform that sensor {sensor} sees"
+    elif most > limit:
+        text += f": {OWN_SENSOR}"
     yield Finding("sensor's platform", most <= limit, most, limit, "m", leg + 1, text)
     text = f"at home that platform is {away:.3g} m from the robot's"
+    if away > limit:
+        home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
+        text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
     yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)

@@ -12,9 +12,10 @@ import pytest
 from dynamics import load_robot
 from identify.commands import run_stages
 from identify.commands.help import BEYOND_LIMIT
-from identify.errors import EstimationError
+from identify.errors import EstimationError, ScenarioError
+from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
-from identify.verification.robot_check import run_warning
+from identify.verification.robot_check import about_sensor, run_warning
 from tests.identify.commands import command, one_line
 
 
@@ -160,3 +161,18 @@ def test_a_report_that_cannot_be_written_and_an_unknown_set_are_named_in_one_lin
     assert "cannot write" in one_line(capfd.readouterr().err)
     assert command("check", "ups6", "--parameters", "best") != 0
     assert "it has guess, truth" in one_line(capfd.readouterr().err)
+
+
+def test_a_robot_that_the_sensor_does_not_see_is_told_how_to_get_a_sensor_of_its_own():
+    robot = load_robot("ups6")
+    seen = load_scenario("quick").sensor_file()
+    away = seen.model_copy(
+        update={"platform": seen.platform.model_copy(update={"home": (0.0, 0.0, 0.4, 0, 0, 0)})}
+    )
+    where = ", ".join(f"{value:.4g}" for value in robot.home_pose)
+    with pytest.raises(ScenarioError, match="cmmsim new sensor FILE writes one to change"):
+        check_platform(robot, away, "mine")
+    found = {one.check: one for one in about_sensor(robot, "mine", away)}
+    assert not found["sensor's home"].ok
+    assert f"must be near [{where}]; cmmsim new sensor FILE" in found["sensor's home"].text
+    assert "cmmsim new sensor" not in found["sensor's platform"].text
