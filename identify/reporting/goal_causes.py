@@ -29,6 +29,9 @@ MOSTLY_GUESS = 0.5
 ALIKE = 0.99
 """Correlation from which on two parameters act almost alike."""
 
+MOSTLY_MOVED = 0.9
+"""Share of a deviation of the stickers from which on movements of the cameras are its cause."""
+
 STOPPED = "stopped after max_iterations"
 """Beginning of the reason why a search stopped before it had converged."""
 
@@ -92,9 +95,18 @@ def advices(
 
 
 def _moved_cameras(run: _Run) -> Advice | None:
-    warning = (run.result.get("drift_watch") or {}).get("warning")
+    watch = run.result.get("drift_watch") or {}
+    warning = watch.get("warning")
     if not warning:
         return None
+    # Movements that explain little are fitted to an error of another kind.
+    if watch.get("explained", 1.0) < MOSTLY_MOVED:
+        return Advice(
+            "Stickers are not where the cameras should see them, and no movement of the cameras "
+            f"explains it ({100 * watch['explained']:.2g} % at most): their detection or their "
+            "places are wrong.",
+            f"cmmsim replay {run.folder}",
+        )
     return Advice(
         f"The cameras have lost their calibration: {warning}.",
         "cmmsim calibrate LEFT RIGHT --board board.toml",

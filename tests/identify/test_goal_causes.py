@@ -54,6 +54,14 @@ CASES = {
         "lost their calibration: the left camera moved.",
         "cmmsim calibrate LEFT RIGHT --board board.toml",
     ),
+    "stickers that are found at wrong places": (
+        lambda r: (
+            unexplained(r),
+            r.update(drift_watch={"warning": "the cameras moved", "explained": 0.32}),
+        ),
+        "no movement of the cameras explains it (32 % at most)",
+        "cmmsim replay runs/mine",
+    ),
     "a search cut short": (
         lambda r: unexplained(r, stop_reason="stopped after max_iterations = 30"),
         "did not converge in 30 iterations.",
