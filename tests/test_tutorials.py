@@ -12,8 +12,13 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "docs" / "tutorials"
-AFTER = {"own_record": "cmmsim run quick"}
-"""What the page before left in the folder, where a page begins with it."""
+COMMANDS = ",".join(["time_s", *(f"command_joint{leg}_rad" for leg in range(1, 7))])
+AFTER = {
+    "own_record": "cmmsim run quick",
+    "real_photographs": f"(echo {COMMANDS}; seq 0 23 | awk '{{print $1 / 60 \",0,0,0,0,0,0\"}}') "
+    ">commands.csv",
+}
+"""What the page before left in the folder, or what the reader has: commands of a robot."""
 
 SETTING_UP = ("sh .ci/setup", ". .venv/bin/activate")
 """Lines that make the environment in which this test runs."""
