@@ -362,6 +362,7 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
     assert np.allclose(found, positive[:size] - np.append(np.zeros(67), positive[size:]), atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_least_squares_finds_a_centre_of_mass_on_either_side():
     """The first moments, of a full platform, may be negative where masses and friction may not."""
     centre = {"platform.mcx": -0.3, "platform.mcy": 0.2}

@@ -104,6 +104,7 @@ def test_mujoco_moves_the_robot_as_our_loop_does():
     np.testing.assert_allclose(theirs[2], ours[2], rtol=0, atol=1e-8)
 
 
+@pytest.mark.thorough
 def test_friction_that_differs_with_direction_moves_the_robot_as_an_offset_does():
     """MuJoCo's joints have another dry friction in each direction, ours have the half difference.
 
