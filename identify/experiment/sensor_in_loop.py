@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -60,14 +61,11 @@ class SensorPlan:
     @property
     def sight(self) -> SightLines:
         """Stickers and cameras, for the decision which stickers are visible."""
-        return SightLines(
-            marked_body("platform", self.file.platform), *rig_from_file(self.file.rig)
-        )
+        return _sight(self.file)
 
     def covariance(self, pose: Array) -> Array:
         """Return the covariance (6, 6) [m, rad] that the sensor states for a pose (6,) at rest."""
-        sensor = cmmsim.Sensor(self.file, 0, self.method, renderer="analytic")
-        return stated_covariance(sensor, self.sight, pose)
+        return _covariance(self.file.model_dump_json(), self.method, tuple(pose)).copy()
 
     def make(
         self,
@@ -168,6 +166,19 @@ def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
             f"home of {robot.name} is {away:.3g} m from platform.home of sensor {sensor}, limit "
             f"{OFF_PLATFORM_M:g} m: platform.home must be the home of the robot; {OWN_SENSOR}"
         )
+
+
+def _sight(file: SensorFile) -> SightLines:
+    """Return the stickers of the platform and the cameras of a sensor file."""
+    return SightLines(marked_body("platform", file.platform), *rig_from_file(file.rig))
+
+
+@lru_cache(maxsize=16)
+def _covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
+    """Return the covariance that a sensor states for a pose, which rows of a study share."""
+    file = SensorFile.model_validate_json(file_json)
+    sensor = cmmsim.Sensor(file, 0, method, renderer="analytic")
+    return stated_covariance(sensor, _sight(file), np.array(pose))
 
 
 class PoseSensor(Protocol):

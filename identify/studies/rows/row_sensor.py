@@ -23,7 +23,6 @@ from identify.arrays import Array
 from identify.experiment.sensor_in_loop import DrawnFrames, PoseSensor, SensorPlan, teach
 from identify.progress import SilentProgress
 from identify.scenario.section import Section
-from identify.scenario.sections import Rig
 from identify.setup import Setup
 from identify.studies.rows.kind import Column, Row
 
@@ -86,15 +85,6 @@ def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
     """Return the exactly taught sensor for the content of a sensor file, from a cache."""
     file = SensorFile.model_validate_json(file_json)
     return _built(file, method, renderer, exactly_taught(file), 0)
-
-
-@lru_cache(maxsize=SENSORS_KEPT)
-def drawn_covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
-    """Return the covariance that a sensor states for a pose at rest, from a cache."""
-    file = SensorFile.model_validate_json(file_json)
-    covariance = SensorPlan("", file, "analytic", method, Rig(), 1).covariance(np.array(pose))
-    covariance.flags.writeable = False
-    return covariance
 
 
 def _built(
@@ -194,9 +184,7 @@ def pose_figures(errors: Array, covariances: Array) -> Row:
 def row_pose_sensor(setup: Setup, options: SensorOptions) -> PoseSensor:
     """Return the sensor of a row, taught if it has images. Raises the exceptions of the sensor."""
     if options.sensor == "drawn":
-        plan = setup.sensor_plan
-        home = setup.nominal.home_pose
-        covariance = drawn_covariance(plan.file.model_dump_json(), plan.method, tuple(home))
+        covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
         return DrawnSensor(covariance, setup.plant.runs.timing.dropout)
     teach(setup.sensor, SilentProgress())
     return setup.sensor
