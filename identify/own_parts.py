@@ -28,6 +28,7 @@ ESTIMATORS = {
     "warm_start": "identify.estimators.output_error_routes:warm_start_alone",
     "torque_ls": "identify.estimators.least_squares:least_squares",
     "torque_wls": "identify.estimators.least_squares:weighted_least_squares",
+    "torque_two_steps": "identify.estimators.least_squares:two_steps",
     "torque_iv": "identify.estimators.errors_in_variables:instrumental_variables",
     "torque_tls": "identify.estimators.errors_in_variables:total_least_squares",
     "encoders": "identify.estimators.least_squares:encoder_route",

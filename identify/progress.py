@@ -129,6 +129,15 @@ def print_warnings(warnings: Iterable[str], word: str = "warning") -> None:
         typer.echo(f"{word}: {' '.join(warning.split())}", err=True)
 
 
+def print_advice(cause: str, command: str, of: str = "") -> None:
+    """Print the likeliest cause of what was missed, and the command to type next.
+
+    ``of`` names what was missed, where it is not clear.
+    """
+    typer.echo(f"likeliest cause{f' ({of})' if of else ''}: {cause}")
+    typer.echo(f"next: {command}")
+
+
 def print_table(
     header: Sequence[str],
     rows: Iterable[Sequence[str]],

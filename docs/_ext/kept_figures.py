@@ -229,7 +229,7 @@ def answers(
 
 
 def leaderboard(folder: Path) -> str:
-    """Median errors of the nine estimators, rms over the kept experiments."""
+    """Median errors of the ten estimators, rms over the kept experiments."""
     rows = [
         (f"`{name}`", *(_text(found.get(end)) for end in ESTIMATED))
         for (name,), found in leaderboard_points(folder)

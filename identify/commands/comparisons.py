@@ -98,7 +98,7 @@ def estimators(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Compare nine estimators, and your own, on the record of a run.
+    """Compare ten estimators, and your own, on the record of a run.
 
     The estimators are the paper's output error, its variants, and estimators of the literature
     that use measured joint torques and encoders (inverse dynamics, with poses from the camera or

@@ -11,7 +11,7 @@ from identify.commands.options import JsonFile, Quiet, RobotArgument, new_folder
 from identify.errors import VerificationError
 from identify.files.atomic import write_text
 from identify.files.run_folder import new_run_folder, save_files
-from identify.progress import print_table, terminal_progress
+from identify.progress import print_advice, print_table, terminal_progress
 
 if TYPE_CHECKING:
     from dynamics import Robot, RobotModel
@@ -327,7 +327,7 @@ def verify_model(
         new_run_folder(out or Path("runs") / f"verify-{chosen.name}")
     ).path
     runs = verify(chosen, terminal_progress(quiet))
-    entry = verification_entry(chosen, runs)
+    entry = verification_entry(chosen, robot, runs)
     save_files(folder, {"verification.json": entry, "figure8.png": figure_8(runs)})
     tell(entry, json, quiet, lambda: _print_verdict(entry, folder))
     if not entry["met"]:
@@ -362,4 +362,6 @@ def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
         ("largest difference", "unit"),
         title,
     )
+    if advice := entry["advice"]:
+        print_advice(**advice)
     typer.echo(f"figure: {folder / 'figure8.png'}")

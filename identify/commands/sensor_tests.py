@@ -19,7 +19,7 @@ from identify.commands.options import (
 )
 from identify.errors import VerificationError
 from identify.files.run_folder import new_run_folder, save_files
-from identify.progress import print_table, terminal_progress
+from identify.progress import print_advice, print_table, terminal_progress
 
 if TYPE_CHECKING:
     from cmmsim.detector_leaderboard import Condition, Score
@@ -112,6 +112,8 @@ def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
             f"length error: largest {test['largest_error_um']:+.1f} um, limit ± "
             f"{test['limit_um']:g} um: {'met' if test['met'] else 'MISSED'}"
         )
+        if advice := test["advice"]:
+            print_advice(**advice)
     if (test := entry.get("astm_e3064")) is not None:
         for state in ("standing", "moving"):
             position = test[state]["position_um"]

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 
 from identify.files.run_folder import AXES, predicted_row, rms_row
-from identify.progress import print_table
+from identify.progress import print_advice, print_table
 from identify.reporting import paper
 from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals, explanation_goals
@@ -304,8 +304,7 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
         )
     missed = [goal for goal in goals if not goal.passed]
     for one, _ in advices(missed, result, path.parent):
-        typer.echo(f"likeliest cause: {one.cause}")
-        typer.echo(f"next: {one.command}")
+        print_advice(one.cause, one.command)
     typer.echo(f"result: {path}")
 
 
@@ -322,6 +321,5 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
     for goal in missed:
         typer.echo(f"missed: {goal.name}: {goal.detail}")
     for one, names in advices(missed, result, report.parent):
-        typer.echo(f"likeliest cause ({', '.join(names)}): {one.cause}")
-        typer.echo(f"next: {one.command}")
+        print_advice(one.cause, one.command, ", ".join(names))
     typer.echo(f"report: {report}")

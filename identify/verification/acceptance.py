@@ -34,6 +34,11 @@ from cmmsim.files.sensor_file import read_sensor_file
 from identify.files.versions import versions
 from identify.progress import Progress
 from identify.random_streams import RESAMPLING, mixed_generator
+from identify.reporting.goal_causes import Advice
+
+STDS = 3.5
+"""Number of standard deviations that the largest of 35 errors exceeds by chance in one of 60 tests.
+"""
 
 BLOCK = 10
 """Number of neighbouring frames of the bar that are resampled together."""
@@ -43,10 +48,11 @@ BLOCK = 10
 class AcceptanceRun:
     """Acceptance tests of a sensor and their results.
 
-    ``limit_um`` is the limit of the length error. ``found`` holds the results and ``seconds`` the
-    durations, by the name of the test.
+    ``sensor`` is the sensor's name or file as it was typed. ``limit_um`` is the limit of the length
+    error. ``found`` holds the results and ``seconds`` the durations, by the name of the test.
     """
 
+    sensor: str
     under_test: SensorUnderTest
     renderer: str
     volume: MeasuringVolume
@@ -129,7 +135,9 @@ def prepare(
     # Counting the steps refuses a volume without room for the test.
     for name in standards:
         STANDARDS[name].steps(found)
-    return AcceptanceRun(under_test, under_test.renderer_name(), found, standards, limit_um)
+    return AcceptanceRun(
+        str(sensor), under_test, under_test.renderer_name(), found, standards, limit_um
+    )
 
 
 def parse_volume(text: str) -> np.ndarray:
@@ -189,13 +197,15 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
     largest = test.largest
     errors = 1e6 * test.errors
     single = 1e6 * test.single_errors
+    met = bool(np.abs(errors).max() <= run.limit_um)
     # All lengths of a line begin at the same sticker, so only different lines are independent.
     line_means = 1e6 * np.array(
         [np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines]
     )
     return {
         "limit_um": run.limit_um,
-        "met": bool(np.abs(errors).max() <= run.limit_um),
+        "met": met,
+        "advice": None if met else asdict(_why_too_long(test, run)),
         "largest_error_um": 1e6 * largest.error,
         "largest_error_at": {"line": largest.line, "length_mm": 1e3 * largest.true},
         "mean_error_um": float(errors.mean()),
@@ -223,6 +233,26 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
             for line in test.lines
         ],
     }
+
+
+def _why_too_long(test: LengthTest, run: AcceptanceRun) -> Advice:
+    """Return the likeliest cause of the largest length error, and the command to type next."""
+    largest = test.largest
+    exposures = len(largest.measured)
+    std_um = 1e6 * largest.std / math.sqrt(exposures)
+    times = abs(1e6 * largest.error) / std_um
+    if times <= STDS:
+        half = "x".join(f"{side / 2:.3g}" for side in run.volume.size)
+        return Advice(
+            f"The images are this noisy: the mean of {exposures} exposures of this length has a "
+            f"stated standard deviation of {std_um:.2g} um. A smaller volume is nearer.",
+            f"cmmsim acceptance {run.sensor} --standard vdi --volume {half}",
+        )
+    return Advice(
+        f"The error is {times:.2g} times its stated standard deviation of {std_um:.2g} um: the "
+        "centres of the stickers are found with an error that no averaging removes.",
+        f"cmmsim detectors {run.sensor}",
+    )
 
 
 def _bar(test: BarTest, run: AcceptanceRun) -> dict[str, Any]:

@@ -70,9 +70,10 @@ def length_table(test: dict[str, Any]) -> Table:
         tuple(rows),
         f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, "
         f"{where['length_mm']:.0f} mm), limit ± {test['limit_um']:g} um: "
-        f"{'met' if test['met'] else 'MISSED'}. Mean error {test['mean_error_um']:+.2f} um, 95 % "
-        f"interval {low:+.2f} to {high:+.2f} um. A length is the mean of "
-        f"{test['exposures_a_length']} exposures; the RMS error of a single one is "
+        f"{'met' if test['met'] else 'MISSED'}. {_advice(test)}Mean error "
+        f"{test['mean_error_um']:+.2f} um, 95 % interval {low:+.2f} to {high:+.2f} um. A "
+        f"length is the mean of {test['exposures_a_length']} exposures; the RMS error of a single "
+        "one is "
         f"{number(test['single_exposure_rms_um'])} um, its mean square "
         f"{number(test['variance_ratio'])} times the stated variance.",
     )
@@ -169,6 +170,12 @@ def _our_figures(entry: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
     if test := entry.get("astm_e3124"):
         found["latency"] = [(f"{test['mean_ms']:.3f} ms", "mean; set by the sensor file")]
     return found
+
+
+def _advice(test: dict[str, Any]) -> str:
+    """Return the likeliest cause of a missed limit and the next command, or an empty text."""
+    advice = test["advice"]
+    return f"{advice['cause']} Next: `{advice['command']}`. " if advice else ""
 
 
 def _interval(bounds: Any) -> str:

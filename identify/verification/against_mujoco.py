@@ -20,14 +20,16 @@ from matplotlib.figure import Figure
 from dynamics import Robot, closed_loop
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
-from dynamics.inertia import grouped, physical_inertias
+from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.excitation.design import admissible_trajectories
 from identify.progress import Progress, SilentProgress
 from identify.reporting.figures import COMPONENTS
+from identify.reporting.goal_causes import Advice
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
+from identify.verification.robot_check import NEGLIGIBLE_CHANGE
 
 PARAMETER_SET = "guess"
 DURATION_S = 10.0
@@ -249,8 +251,8 @@ def _lengths(difference: Array) -> tuple[Array, Array]:
     return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
 
 
-def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
-    """Return the content of `verification.json`."""
+def verification_entry(robot: Robot, typed: str, runs: EngineRuns) -> dict[str, Any]:
+    """Return the content of `verification.json`, for a robot whose name or file was typed."""
     verdict = judge(runs)
     chosen = robot.parameter_sets[PARAMETER_SET]
     return {
@@ -270,8 +272,34 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "torque_unit": robot.layout.unit("joint1.coulomb"),
         "goal": {"position_steady_um": GOAL_UM, "angle_steady_urad": GOAL_URAD},
         "met": verdict.met,
+        "advice": None if verdict.met else asdict(_why_different(robot, typed, verdict)),
         "paper": PAPER,
     }
+
+
+def _why_different(robot: Robot, typed: str, verdict: Verdict) -> Advice:
+    """Return the likeliest cause of a missed goal, and the command to type next."""
+    dynamic = robot.parameter_sets[PARAMETER_SET].dynamic
+    inertias = physical_inertias(robot.layout, dynamic, allow_changes=True)
+    effects = acceleration_changes(robot, dynamic, inertias.values) if inertias.changes else {}
+    body = max(effects, key=lambda one: effects[one], default="")
+    if effects.get(body, 0.0) > NEGLIGIBLE_CHANGE:
+        return Advice(
+            f"No rigid body has the inertia of {body}. MuJoCo runs with the nearest possible one, "
+            f"which changes accelerations by up to {100 * effects[body]:.2g} %.",
+            f"cmmsim check {typed} --parameters {PARAMETER_SET}",
+        )
+    if verdict.closure_max_um > verdict.position_steady_um / 2:
+        return Advice(
+            f"The loops of legs open by {verdict.closure_max_um:.2g} um in MuJoCo, which holds "
+            "them by stiff springs: the robot is near a singularity.",
+            f"cmmsim workspace {typed}",
+        )
+    return Advice(
+        "The engines do not move the same robot: an export of its geometry, bodies or drives is "
+        "wrong.",
+        f"cmmsim export mjcf {typed} --allow-unphysical-inertia",
+    )
 
 
 def _gains_entry(robot: Robot, gains: Array) -> dict[str, float | list[float]]:

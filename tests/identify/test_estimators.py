@@ -29,6 +29,7 @@ from identify.estimators.least_squares import (
     lower_bounds,
     nearest_admissible,
     torque_equations,
+    two_steps,
     weighted_least_squares,
 )
 from identify.estimators.output_error_routes import known_pid
@@ -209,7 +210,7 @@ def test_known_gains_stay_and_anchor_the_rest(seen):
 
 @pytest.mark.slow
 def test_output_error_beats_the_linear_estimators_on_unseen_poses(seen, asked):
-    """All nine on one record: what is fitted in the loop's own output predicts it best, at the
+    """All ten on one record: what is fitted in the loop's own output predicts it best, at the
     price of time.
     """
     rows = {row.name: row for row in compare(seen, asked, find_estimators(), SilentProgress())}
@@ -222,7 +223,7 @@ def test_output_error_beats_the_linear_estimators_on_unseen_poses(seen, asked):
         for name in find_estimators()
         if name not in ("closed_loop", "command_driven", "known_pid")
     ]
-    assert len(linear) == 6
+    assert len(linear) == 7
     for name in linear:
         assert best.position_um < rows[name].position_um / 2, name
         assert best.orientation_urad < rows[name].orientation_urad / 2, name
@@ -231,6 +232,25 @@ def test_output_error_beats_the_linear_estimators_on_unseen_poses(seen, asked):
     assert all(
         row.position_um < rows[START].position_um / 5 for name, row in rows.items() if name != START
     )
+
+
+@pytest.mark.slow
+def test_two_steps_move_like_one_fit_only_where_friction_is_known_before(seen, asked):
+    """With true friction in the first step the two are as good as one fit of all. None, and three
+    times too much, bend the inertias, and the model errs more on unseen motions.
+    """
+    guess = seen.problem.guess
+    friction = slice(52, 64)
+    errors = {}
+    for times in (1.0, 0.0, 3.0):
+        values = guess.values.copy()
+        values[friction] = times * truth()[friction]
+        told = replace(seen, problem=replace(seen.problem, guess=replace(guess, values=values)))
+        errors[times] = score(seen, asked, two_steps(told).parameters).position_um
+    at_once = score(seen, asked, weighted_least_squares(seen).parameters).position_um
+    assert errors[1.0] == pytest.approx(at_once, rel=0.02)
+    assert errors[0.0] > 1.05 * at_once
+    assert errors[3.0] > 1.3 * at_once
 
 
 LD = NAMES.index("joint_pid.ld")

@@ -126,7 +126,11 @@ def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch
     assert command("verify-model", "--out", tmp_path / "new", "--quiet") == BEYOND_LIMIT
     said = one_line(capfd.readouterr().err)
     assert "model and MuJoCo differ by 174 um and 171 urad, more than 10 um and 20 urad" in said
-    assert json.loads((tmp_path / "new" / "verification.json").read_text())["met"] is False
+    entry = json.loads((tmp_path / "new" / "verification.json").read_text())
+    assert entry["met"] is False
+    # The paper's inertias that no body has do not change the motion, and the loops stay closed.
+    assert entry["advice"]["cause"].startswith("The engines do not move the same robot")
+    assert entry["advice"]["command"].startswith("cmmsim export mjcf rss6")
 
 
 def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(
