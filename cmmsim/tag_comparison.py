@@ -41,8 +41,7 @@ from cmmsim.geometry.pose import (
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.triangulation import triangulate
 from cmmsim.imaging.formation import ImageFormation
-from cmmsim.imaging.plates import plates_image
-from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, print_renderer
+from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, plates_image, print_renderer
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.measuring.pose_estimator import measure_frame
 from cmmsim.radiometry.stereo_images import StereoFrame

@@ -15,8 +15,7 @@ from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation
-from cmmsim.imaging.plates import plates_image
-from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, print_renderer
+from cmmsim.imaging.prints import PRINT_SUPERSAMPLING, Print, plates_image, print_renderer
 from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise

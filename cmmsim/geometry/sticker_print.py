@@ -138,11 +138,6 @@ class SeenStickers:
         retro = sizes.retro_shift * np.einsum("kij,kj->ki", self.to_image, self.retro_shifts)
         return np.stack([self.centre_shifts(rims), retro], axis=-1)
 
-    def shifts_of_outlines(self, outlines: Array) -> Array:
-        """Return the shifts (k, 2) px of the centres for coefficients (k, 8) of the outlines."""
-        modes = outline_modes(np.arctan2(CIRCLE[1], CIRCLE[0]))
-        return self.centre_shifts(self.rims_of_growth(outlines @ modes.T))
-
     @property
     def rim_growth(self) -> Array:
         """Growth (k, RIM_POINTS) of the outlines per radius of thickness: the side of the rim."""

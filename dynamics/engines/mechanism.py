@@ -236,6 +236,7 @@ def _leg(
             bar_offset = kinds[1][1] - kinds[0][1]
             if offset_before.any() and np.linalg.norm(bar_offset - offset_before) > SAME:
                 raise RobotFileError("its two bars are not parallel")
+            # Two equal bars move as one bar in their middle.
             point = (kinds[0][1] + kinds[1][1]) / 2
         joints.append(kind + "*" * sum(one.actuator is not None for one in steps[0][1].freedoms))
         points.append(point)

@@ -55,8 +55,10 @@ def urdf_texts(
         places[name] = home.origin[number], home.axes[number]
         axis = home.axes[number].T @ home.axes[part.before] @ segment.axis
         lines.append(_link(name, part.share * bodies[part.body], segment.centre))
+        # URDF has no ball joint: the YAML file names the hinges that stand for one.
         if segment.joint == "ball":
             spherical.append(name)
+        # URDF has no universal joint: two hinges with a body without mass between them are one.
         if segment.joint == "universal":
             hub = f"hub_{name}"
             lines.append(_link(hub))
@@ -75,6 +77,8 @@ def urdf_texts(
             more += f'<limit lower="{-limit!r}" upper="{limit!r}" effort="1" velocity="1"/>'
         lines.append(_joint(name, kind, before, part.name, places, axis, coordinate, more))
         if part.last:
+            # URDF is a tree: a leg ends at a link of its own, which the YAML file joins to one of
+            # the platform at the same place.
             end, seat = f"end_{part.name}", f"seat_{part.name}"
             place = home.origin[number] + home.axes[number] @ segment.end
             places |= {end: (place, home.axes[number]), seat: (place, turn)}

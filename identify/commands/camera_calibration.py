@@ -13,7 +13,14 @@ from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
 if TYPE_CHECKING:
-    from cmmsim.calibration import Board, Calibration, Halves, PairView, SensorTemplate
+    from cmmsim.calibration import (
+        Board,
+        Calibration,
+        CalibrationOptions,
+        Halves,
+        PairView,
+        SensorTemplate,
+    )
 
 
 def calibrate(
@@ -134,16 +141,7 @@ def calibrate(
       cmmsim calibrate pictures/left pictures/right \\
         --board pictures/board.toml --out mine
     """
-    import numpy as np
-
-    from cmmsim.calibration import (
-        CalibrationOptions,
-        as_dict,
-        compare_halves,
-        read_board,
-        sensor_template,
-    )
-    from cmmsim.calibration import calibrate as calibrate_from
+    from cmmsim.calibration import CalibrationOptions, as_dict, read_board, sensor_template
 
     folder = context.with_resource(new_run_folder(out)).path
     progress = terminal_progress(quiet)
@@ -176,15 +174,7 @@ def calibrate(
     template = None if sensor is None else sensor_template(sensor, folder)
     described = read_board(board)
     pairs, size = _view(left, right, described, template, progress)
-    with progress.stage("adjust", 1 + 2 * (halves or 0)) as advance:
-        found = calibrate_from(described, pairs, size, options)
-        advance()
-        rng = np.random.default_rng(seed or 0)
-        apart = (
-            compare_halves(described, pairs, size, options, halves, rng, advance)
-            if halves
-            else None
-        )
+    found, apart = _adjusted(described, pairs, size, options, halves or 0, seed or 0, progress)
     content = as_dict(found) | ({} if apart is None else {"halves": apart.to_dict()})
     refused = _write(folder, found, template, content)
     print_warnings(
@@ -206,6 +196,29 @@ def _view(
         template.require_size((width, height))
     with progress.stage("find the board", len(files)) as advance:
         return view_pairs(files, board, advance)
+
+
+def _adjusted(
+    board: "Board",
+    pairs: "list[PairView]",
+    size: tuple[int, int],
+    options: "CalibrationOptions",
+    halves: int,
+    seed: int,
+    progress: Progress,
+) -> "tuple[Calibration, Halves | None]":
+    """Return the calibration from board points, and the comparison of halves if there are any."""
+    import numpy as np
+
+    from cmmsim.calibration import calibrate, compare_halves
+
+    with progress.stage("adjust", 1 + 2 * halves) as advance:
+        found = calibrate(board, pairs, size, options)
+        advance()
+        if not halves:
+            return found, None
+        rng = np.random.default_rng(seed)
+        return found, compare_halves(board, pairs, size, options, halves, rng, advance)
 
 
 def _write(

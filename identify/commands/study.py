@@ -16,7 +16,7 @@ from identify.commands.options import (
     tell,
 )
 from identify.errors import StudyError, StudyInterrupted
-from identify.progress import print_table, terminal_progress
+from identify.progress import Progress, print_table, terminal_progress
 from identify.runtime import STOPPED, cores, interruptible_imports
 
 if TYPE_CHECKING:
@@ -180,31 +180,45 @@ def study(
             f"study {chosen.name!r} has {chosen.rows:,} rows; confirm more than {MANY_ROWS:,} rows "
             "by --yes"
         )
+    folder = out or Path("runs") / f"study-{chosen.name}"
+    count = cores() if workers is None else workers
+    outcome, summary = _run(
+        chosen, folder, count, scheduler, insecure, beside or [], terminal_progress(quiet, "rows/s")
+    )
+    tell(summary, json, quiet, lambda: _say(folder, outcome, summary["theory"]))
+    _judge(outcome, summary["theory"])
+
+
+def _run(
+    study: "Study",
+    folder: Path,
+    workers: int,
+    scheduler: str | None,
+    insecure: bool,
+    beside: list[Path],
+    progress: Progress,
+) -> "tuple[Outcome, dict[str, Any]]":
+    """Run a study in its folder, and return its rows and its summary."""
     with interruptible_imports():
         from identify.studies.memory import check_memory
         from identify.studies.runner import run_study
         from identify.studies.study_design import prepare
         from identify.studies.table import rows_beside
 
-    count = cores() if workers is None else workers
-    shared = prepare(chosen)
+    shared = prepare(study)
     # Only the memory of this machine is known.
     if scheduler is None:
-        check_memory(chosen, shared, max(count, 1))
-    others = rows_beside(chosen, beside or ())
-    folder = out or Path("runs") / f"study-{chosen.name}"
+        check_memory(study, shared, max(workers, 1))
+    others = rows_beside(study, beside)
+    # Figures are drawn at the end only, because drawing takes seconds.
+    so_far = partial(_summary, study, folder, figures=False)
     try:
-        progress = terminal_progress(quiet, rate="rows/s")
-        # Figures are drawn at the end only, because drawing takes seconds.
-        so_far = partial(_summary, chosen, folder, figures=False)
-        workers_there = workers_of(scheduler, count, insecure)
-        outcome = run_study(chosen, folder, progress, workers_there, so_far, shared)
+        executor = workers_of(scheduler, workers, insecure)
+        outcome = run_study(study, folder, progress, executor, so_far, shared)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None
-    summary = _summary(chosen, folder, outcome.frame, others=others)
-    tell(summary, json, quiet, lambda: _say(folder, outcome, summary["theory"]))
-    _judge(outcome, summary["theory"])
+    return outcome, _summary(study, folder, outcome.frame, others=others)
 
 
 def workers_of(scheduler: str | None, workers: int, insecure: bool) -> "Workers":

@@ -5,6 +5,7 @@ from math import ceil
 
 import numpy as np
 import xarray as xr
+from scipy.optimize import minimize_scalar
 
 from dynamics import DynamicsError
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
@@ -12,7 +13,6 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import filtered_derivatives, interpolated
 from identify.model.common_error_prior import with_recorded_errors
-from identify.model.likely_delay import likely_delay
 from identify.model.model_side import ModelSide
 from identify.model.stretch import Stretch, begun_stretch
 from identify.model.timed_model import TimedModel, grid_times
@@ -29,6 +29,9 @@ from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
 
 REACH = 4.0
 """Largest offset of a clock that is tried, in its standard deviations."""
+
+DELAYS = 50
+"""Number of delays of a clock, of either sign, that are tried first."""
 
 SAME_RATE = 0.05
 """Relative difference up to which the rate of commands counts as equal to the frame rate."""
@@ -170,9 +173,31 @@ def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
     except DynamicsError:
         # the search raises an error for an unstable model, with more evidence
         return run
-    offset = likely_delay(
+    offset = _likely_delay(
         run.times[run.ok], model[run.ok], run.measured[run.ok], REACH * stds[CLOCK_OFFSET]
     )
     drawn = np.zeros(len(run.errors_had))
     drawn[len(run.common.names) + list(stds).index(CLOCK_OFFSET)] = offset / stds[CLOCK_OFFSET]
     return replace(run, drawn=drawn)
+
+
+def _likely_delay(times: Array, model: Array, measured: Array, farthest: float) -> float:
+    """Return the delay, s, of measured poses (k, 6) behind those of a model at times (k,).
+
+    It is the delay up to `farthest` with the smallest squared difference, each component in units
+    of its spread.
+    """
+    spread = measured.std(axis=0)
+    moving = spread > 0
+    scaled = [one[:, moving] / spread[moving] for one in (model, measured)]
+    inner = (times > times[0] + farthest) & (times < times[-1] - farthest)
+
+    def apart(delay: float) -> float:
+        moved = interpolated(times[inner] - delay, times, scaled[0])
+        return float(np.mean((moved - scaled[1][inner]) ** 2))
+
+    coarse = np.linspace(-farthest, farthest, 2 * DELAYS + 1)
+    best = coarse[int(np.argmin([apart(delay) for delay in coarse]))]
+    step = coarse[1] - coarse[0]
+    found = minimize_scalar(apart, bounds=(best - step, best + step), method="bounded")
+    return float(found.x)

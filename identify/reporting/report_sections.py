@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from identify.reporting import paper, parameter_tables, tables
-from identify.reporting.diagnosis_text import diagnosis_table, diagnosis_text
-from identify.reporting.number_format import number, typographic
+from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
+
+CAUSES = 12
+"""Largest number of causes in the table of a diagnosis."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,10 @@ def fit_section(data: RunData) -> Section:
         f"{typographic(found['stop_reason'])}."
     )
     table = tables.excitation_error_table(data.result, data.repeats_paper)
-    causes = diagnosis_table(data.result)
+    causes = _diagnosis_table(data.result)
     return Section(
         "Fit",
-        (text, *_paper_text(data), *diagnosis_text(data.result)),
+        (text, *_paper_text(data), *_diagnosis_text(data.result)),
         ("fit_excitation", "diagnosis"),
         tables=(table, *([causes] if causes.rows else [])),
     )
@@ -236,6 +238,49 @@ def _index_text(data: RunData) -> tuple[str, ...]:
             f"{paper.INDEX_BEST:g} by a genetic algorithm."
         )
     return (text,)
+
+
+def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
+    """Return the diagnosis of a result and its remedies as sentences. Empty without a diagnosis."""
+    entry = result.get("diagnosis")
+    if entry is None:
+        return ()
+    remedies = [text for one in entry["findings"] for text in one["remedies"]]
+    introduction = (
+        "The residuals of the model were examined for their cause. Each possible cause is judged "
+        "by the share of the misfit that it explains in addition to the parameters. Causes that "
+        "are not explained by chance are fitted, one after the other."
+    )
+    return (
+        introduction,
+        f"Diagnosis: {entry['says']}.",
+        *(f"Remedy: {text}." for text in remedies),
+    )
+
+
+def _diagnosis_table(result: dict[str, Any]) -> Table:
+    """Return the candidates of a diagnosis in their order, without rows if there is no
+    diagnosis.
+    """
+    entry = result.get("diagnosis") or {"candidates": []}
+    rows = tuple(
+        (
+            one["name"],
+            f"{number(100 * one['share'], 3)} %",
+            number(one["statistic"], 4),
+            str(one["freedoms"]),
+            "-" if one["value"] is None else with_deviation(one["value"], one["std"]),
+            one["unit"],
+        )
+        for one in entry["candidates"][:CAUSES]
+    )
+    return Table(
+        "Share of the misfit that each cause alone explains",
+        ("cause or group", "explains", "score statistic", "free numbers", "size ± std", "unit"),
+        rows,
+        "To first order, before any cause is fitted. Standard deviations are due to noise.",
+        folded=True,
+    )
 
 
 def _paper_text(data: RunData) -> tuple[str, ...]:

@@ -48,6 +48,7 @@ def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
     A row that could not be computed has the verdict "failed".
     """
     own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
+    # A row that could not be computed lacks its figures, which are NaN here.
     kinds = [_name(TROUBLES, own[f"trouble_{place}"]) for place in (1, 2)]
     numbers = {name: own[name] for name in _NEEDED if not name.startswith(("trouble_", "first_"))}
     sort = np.select(

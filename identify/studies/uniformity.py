@@ -140,6 +140,7 @@ def uniformity_figure(found: list[Uniformity]) -> Figure:
     points, low, high = simultaneous_band(rows)
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     axes = figure.subplots()
+    # The deviations of uniform numbers shrink with the root of their number.
     root = np.sqrt(rows)
     axes.fill_between(
         points, root * low, root * high, color="0.85", label=f"band of right ones, {BAND:.0%}"
