@@ -10,8 +10,7 @@ from identify.experiment.sensor_in_loop import teach
 from identify.files.run_folder import RunFolder, load_result, result_json
 from identify.progress import Progress
 from identify.record import recording
-from identify.scenario import Scenario
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from identify.stages.estimate import identify, identify_own
 from identify.stages.plan import begin, excite, is_begun, is_planned, open_run, record_files
 from identify.stages.validate import validate
@@ -29,9 +28,7 @@ __all__ = [
 ]
 
 
-def run(
-    scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None
-) -> None:
+def run(planned: Setup, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """Run all stages that are not finished: excite, record, identify, validate, report.
 
     Settings that cannot work are refused before any file is written. If the folder holds the
@@ -40,13 +37,12 @@ def run(
     """
     began = time.perf_counter()
     run_folder = RunFolder(folder)
-    planned = Setup(with_renderer(scenario), seed)
     seconds: dict[str, float] = {}
     setup = None
     taught = None
     if not is_begun(planned, folder):
         setup, seconds = begin(planned, folder, progress)
-    names = record_files(scenario.identification)
+    names = record_files(planned.scenario.identification)
     if not all((folder / name).is_file() for name in names):
         taught = record(folder, progress, setup)
     if not run_folder.result.is_file():

@@ -6,7 +6,7 @@ A setup is made once. It can run the experiment repeatedly, and validate the ide
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,6 +108,14 @@ class Setup:
     loaded: Robot | None = None
     calibrated: KnownGeometry | None = None
     progress: Progress | None = None
+
+    def on_this_machine(self) -> Setup:
+        """Return a copy with the renderer of this machine in place of "auto".
+
+        Without OpenGL, a warning is given.
+        """
+        renderer = choose_renderer(self.scenario.renderer).name
+        return replace(self, scenario=self.scenario.with_overrides({"renderer": renderer}))
 
     @cached_property
     def in_file(self) -> Robot:
@@ -290,14 +298,6 @@ class Setup:
         return UnseenErrors(unseen_errors(result.estimate, self.in_file, scenario, self.seed))
 
 
-def with_renderer(scenario: Scenario) -> Scenario:
-    """Return the scenario with the renderer of this machine in place of "auto".
-
-    Without OpenGL, a warning is given.
-    """
-    return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
-
-
 def set_up(
     scenario: Scenario, seed: int | np.random.SeedSequence = 0, progress: Progress | None = None
 ) -> Setup:
@@ -335,7 +335,7 @@ def set_up(
         raise ScenarioError(
             f"{scenario!r} is not a scenario: identify.load_scenario(name) returns one"
         )
-    setup = Setup(with_renderer(scenario), integer_seed(seed), progress=progress)
+    setup = Setup(scenario, integer_seed(seed), progress=progress).on_this_machine()
     # Errors of the plant or the sensor are raised here, and not at their first use.
     _ = setup.plant, setup.sensor
     return setup

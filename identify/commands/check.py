@@ -102,7 +102,14 @@ def check(
         return
     if page is not None:
         raise typer.BadParameter(f"{robot} is a robot, and has no page", param_hint="--page")
-    _check_robot(robot, scenario or "paper", parameters, settings, json, quiet)
+    from dynamics import load_robot
+    from identify.setup import Setup
+    from identify.verification.robot_check import checked_in
+
+    chosen = load_robot(robot)
+    setup = Setup(chosen_scenario(scenario or "paper", settings, None))
+    name, findings = checked_in(setup, chosen, parameters, terminal_progress(quiet))
+    _tell(findings, f"{chosen.name}, parameters `{name}`", chosen.name, json, quiet)
 
 
 def _check_record(path: Path, page: Path, json: Path | None, quiet: bool) -> None:
@@ -116,23 +123,6 @@ def _check_record(path: Path, page: Path, json: Path | None, quiet: bool) -> Non
     findings = check_telemetry(logged, terminal_progress(quiet))
     write_text(page, telemetry_page(logged, findings, path.name))
     _tell(findings, f"{path.name}, page: {page}", path.name, json, quiet)
-
-
-def _check_robot(
-    robot: str,
-    scenario: str,
-    parameters: str | None,
-    settings: list[str] | None,
-    json: Path | None,
-    quiet: bool,
-) -> None:
-    from dynamics import load_robot
-    from identify.verification.robot_check import checked_in
-
-    chosen = load_robot(robot)
-    given = chosen_scenario(scenario, settings, None)
-    name, findings = checked_in(given, chosen, parameters, terminal_progress(quiet))
-    _tell(findings, f"{chosen.name}, parameters `{name}`", chosen.name, json, quiet)
 
 
 def _tell(

@@ -66,12 +66,12 @@ def geometry(
     from identify.geometry.static_poses import read_static_poses
     from identify.reporting.figures.geometry_calibration import geometry_figure
     from identify.reporting.figures.style import drawn, svg_text
-    from identify.setup import Setup, with_renderer
+    from identify.setup import Setup
 
     chosen = chosen_scenario(scenario, settings, robot)
     folder = context.with_resource(new_run_folder(out or Path("runs") / f"geometry-{seed}")).path
     own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
-    setup = Setup(with_renderer(chosen), seed)
+    setup = Setup(chosen, seed).on_this_machine()
     outcome = run_geometry(setup, terminal_progress(quiet), own)
     picture = drawn(lambda: geometry_figure(outcome.entry))
     outcome.write(folder, {"geometry.png": picture, "geometry.svg": svg_text(picture, "geometry")})

@@ -92,7 +92,7 @@ def _run(setup: "Setup", folder: Path, progress: Progress, workers: int | None) 
     if planned and RunFolder(folder).report.exists():
         return
     with new_run_folder(folder, BEGUN if planned else UNFINISHED) as run_folder:
-        pipeline.run(setup.scenario, setup.seed, run_folder.path, progress, workers)
+        pipeline.run(setup, run_folder.path, progress, workers)
 
 
 def _results(folder: Path, ours: Scenario, progress: Progress) -> "PaperRuns":

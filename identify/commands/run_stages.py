@@ -32,7 +32,6 @@ from identify.files.run_folder import (
 )
 from identify.progress import print_warnings, terminal_progress
 from identify.runtime import interruptible_imports
-from identify.scenario import Scenario
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 """Files that the first two stages write."""
@@ -74,16 +73,19 @@ def run(
                                               model, seen in the residuals
     """
     with interruptible_imports():
-        from identify.setup import Setup, with_renderer
+        from identify.setup import Setup
+        from identify.verification.robot_check import run_warning
 
     chosen = chosen_scenario(scenario, settings, robot)
+    setup = Setup(chosen, seed).on_this_machine()
     path = out or Path("runs") / f"{chosen.name}-{seed}"
     # An experiment that was begun in this folder is continued, so its files are allowed there.
-    begun = _pipeline().is_begun(Setup(with_renderer(chosen), seed), path)
+    begun = _pipeline().is_begun(setup, path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))
     if not begun:
-        _warn_of_robot(chosen, quiet)
-    _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
+        said = run_warning(setup, terminal_progress(quiet))
+        print_warnings([said] if said else [])
+    _pipeline().run(setup, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_goals(result, folder.report))
 
@@ -114,11 +116,10 @@ def warm_up(
     with interruptible_imports():
         from dynamics import built_in_robots
         from identify.experiment.warm_up import warm_up
-        from identify.setup import Setup, with_renderer
+        from identify.setup import Setup
 
-    chosen = with_renderer(chosen_scenario(scenario, settings, robot))
-    setup = Setup(chosen)
-    others = set(built_in_robots()) - {chosen.robot} if all_robots else ()
+    setup = Setup(chosen_scenario(scenario, settings, robot)).on_this_machine()
+    others = set(built_in_robots()) - {setup.scenario.robot} if all_robots else ()
     warm_up(setup.plant, setup.sensor_plan, terminal_progress(quiet), tuple(others))
 
 
@@ -159,9 +160,9 @@ def excite(
     may_hold = () if compare else UNFINISHED
     folder = context.with_resource(new_run_folder(out or Path("runs") / name, may_hold))
     with interruptible_imports():
-        from identify.setup import Setup, with_renderer
+        from identify.setup import Setup
 
-    setup = Setup(with_renderer(chosen), seed)
+    setup = Setup(chosen, seed).on_this_machine()
     if compare:
         compare_excitation(setup, folder.path, terminal_progress(quiet), json, quiet)
         return
@@ -314,14 +315,6 @@ def report(
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)
-
-
-def _warn_of_robot(scenario: Scenario, quiet: bool) -> None:
-    """Say in one line that `cmmsim check` finds fault with a robot file."""
-    from identify.verification.robot_check import run_warning
-
-    said = run_warning(scenario, terminal_progress(quiet))
-    print_warnings([said] if said else [])
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:

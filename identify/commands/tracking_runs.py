@@ -86,7 +86,7 @@ def track(
       cmmsim track --law feedforward --model true --motion poses.csv
     """
     from dynamics.errors import SimulationError
-    from identify.setup import Setup, with_renderer
+    from identify.setup import Setup
     from identify.tracking.track import MODELS
     from identify.tracking.track import track as follow_all
 
@@ -101,7 +101,7 @@ def track(
         new_run_folder(out or Path("runs") / f"track-{chosen.name}-{seed}")
     ).path
     progress = terminal_progress(quiet)
-    setup = Setup(with_renderer(chosen), seed, progress=progress)
+    setup = Setup(chosen, seed, progress=progress).on_this_machine()
     entry = follow_all(setup, laws, models, progress, run, motion)
     save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
     tell(entry, json, quiet, lambda: _print(entry, folder))

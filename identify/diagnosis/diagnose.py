@@ -11,18 +11,23 @@ import xarray as xr
 from dynamics import Robot
 from identify.arrays import Array
 from identify.diagnosis.asking import ask_first
-from identify.diagnosis.catalogue import catalogue
+from identify.diagnosis.body_causes import body_causes
 from identify.diagnosis.cause import Cause
+from identify.diagnosis.command_causes import command_causes
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
+from identify.diagnosis.geometry_causes import geometry_causes
+from identify.diagnosis.loop_causes import loop_causes
+from identify.diagnosis.measurement_causes import measurement_causes
 from identify.diagnosis.own_cause import check_columns
 from identify.diagnosis.ranking import Rows
 from identify.diagnosis.selection import select
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import AT_BOUND
-from identify.estimation.identification import asked_of, identify, output_error_problem
+from identify.estimation.identification import Asked, asked_of, identified, output_error_problem
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
+from identify.progress import SilentProgress
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
@@ -70,10 +75,15 @@ def diagnose(
     >>> identify.diagnose(record).findings
     ()
     """
-    if result is None:
-        result = identify(record, robot, scenario)
-    began = time.perf_counter()
     asked = asked_of(record, robot, scenario)
+    return diagnosed(asked, result or identified(asked, SilentProgress()), causes)
+
+
+def diagnosed(
+    asked: Asked, result: IdentificationResult, causes: Sequence[Cause] = ()
+) -> Diagnosis:
+    """Return what `diagnose` does, from its checked inputs, and with the same errors."""
+    began = time.perf_counter()
     side = asked.side.with_drive(result.drive.law)
     problem = output_error_problem(asked.records, side, asked.settings)
     errors = result.common_errors.learned
@@ -126,6 +136,22 @@ def diagnosis_from(
     selected = select(problem, point, causes, first)
     rows = Rows.of(problem, point.residual)
     return diagnosis_of(selected, causes, rows, time.perf_counter() - began)
+
+
+def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the causes that model and record can have, of a problem at its optimum (p,).
+
+    Companions of others stand behind them all.
+    """
+    runs = [run.simulate(parameters) for run in problem.runs]
+    causes = (
+        *command_causes(problem),
+        *geometry_causes(problem),
+        *loop_causes(problem, parameters, runs),
+        *body_causes(problem, parameters, runs),
+        *measurement_causes(problem, parameters),
+    )
+    return (*causes, *(one.companion for one in causes if one.companion is not None))
 
 
 def _with_errors(problem: OutputErrorProblem, errors: Mapping[str, float]) -> OutputErrorProblem:

@@ -1,4 +1,4 @@
-"""Causes in the loop around the robot: friction, springs, limits and laws of the drives, and steps.
+"""Causes in the loop around the robot: friction, gains, springs, limits and laws of drives, steps.
 
 Many of them show nothing at a small size, or are there or not. They are looked for at some sizes
 of their own. Sizes are taken from the run of the model itself: velocities from those of its joints,
@@ -14,14 +14,16 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.closed_loop import ClosedLoopRun, FrictionLaw, LoopSettings
-from dynamics.closed_loop.drives import DriveName
+from dynamics.closed_loop.drives import READS, DriveName
+from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
-from identify.diagnosis.cause import Cause, Change, OnCommands, in_each_run
+from identify.diagnosis.cause import Cause, Change, OnCommands, OnGain, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
 from identify.filtering import interpolated
 from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
+from identify.model.unequal_gains import with_unequal_gains
 
 SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
 """Velocities over which static friction fades, as shares of the joints' RMS velocity."""
@@ -35,6 +37,12 @@ FINER = 4
 DEFLECTION = {"rad": 1e-4, "m": 1e-5}
 """Deflection at the largest torque for differences, by the unit of joint coordinates."""
 
+GAIN_STEP = 1e-3
+"""Change of a gain for differences, as a share of the gain."""
+
+LEAST_GAIN = -0.9
+"""Least difference of a gain, as a share of it. A law needs gains above zero."""
+
 
 def loop_causes(
     problem: OutputErrorProblem, parameters: Array, runs: Sequence[ClosedLoopRun]
@@ -44,6 +52,7 @@ def loop_causes(
     typical = float(np.sqrt(np.mean(np.concatenate(rates) ** 2)))
     peak = max(float(np.abs(found.torque).max()) for found in runs)
     return (
+        *gain_causes(problem, parameters),
         *friction_causes(problem.runs[0], typical),
         elasticity(problem, parameters, runs, rates),
         torque_limit(problem.runs[0], peak),
@@ -258,4 +267,43 @@ def finer_steps(settings: LoopSettings) -> Cause:
         step=0.0,
         remedy=lambda size: f"--set model.steps_per_frame={steps}",
         tried=(1.0,),
+    )
+
+
+def gain_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
+    """Return the gains that can differ from those of the first joint, at an optimum (p,).
+
+    The gains of the first joint are those of the model.
+    """
+    run = problem.runs[0]
+    layout = run.robot.layout
+    if layout.own_gains:
+        return ()
+    # a gain at its bound has the size of the initial guess
+    gains = np.where(parameters > 0, parameters, problem.guess.values)[layout.joint_pid]
+    return tuple(
+        _gain_difference(joint, kind, float(gains[kind]), layout.unit(layout.joint_pid_names[kind]))
+        for joint in range(1, layout.joints)
+        for kind, name in enumerate(JOINT_PID)
+        if name in READS[run.settings.drives.law] and gains[kind] > 0
+    )
+
+
+def _gain_difference(joint: int, kind: int, gain: float, unit: str) -> Cause:
+    """Return a gain of a joint beyond that of the first joint."""
+
+    def changed(run: LoopModel, size: float) -> LoopModel:
+        differences = np.zeros((run.robot.layout.joints, len(JOINT_PID)))
+        differences[joint, kind] = size
+        return with_unequal_gains(run, differences)
+
+    return Cause(
+        name=f"{JOINT_PID[kind]} of joint {joint + 1}, beyond that of joint 1",
+        unit=unit,
+        group="gains that differ between joints",
+        change=in_each_run(changed),
+        step=GAIN_STEP * gain,
+        remedy=lambda size: "--set model.gains=each",
+        least=LEAST_GAIN * gain,
+        effect=OnGain(joint, kind),
     )

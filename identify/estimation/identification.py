@@ -46,7 +46,15 @@ from identify.scenario import Scenario
 from identify.scenario.sections import Identification
 
 
-@one_thread
+@dataclass(frozen=True)
+class Asked:
+    """Records of an identification, and what the estimator knows beside them."""
+
+    records: list[xr.Dataset]
+    side: ModelSide
+    settings: Identification
+
+
 def identify(
     record: xr.Dataset | Sequence[xr.Dataset],
     robot: Robot | None = None,
@@ -93,9 +101,13 @@ def identify(
     >>> result.robot.name, bool(result.identifiable.any())
     ('rss6', True)
     """
-    progress = progress or SilentProgress()
+    return identified(asked_of(record, robot, scenario), progress or SilentProgress())
+
+
+@one_thread
+def identified(asked: Asked, progress: Progress) -> IdentificationResult:
+    """Return what `identify` does, from its checked inputs, and with the same errors."""
     began = time.perf_counter()
-    asked = asked_of(record, robot, scenario)
     records = asked.records
     side = asked.side
     robot = side.robot
@@ -171,15 +183,6 @@ def identify(
         notes=(*reading_notes(records), *clock_notes(errors)),
         **vars(judgement) | {"warnings": (*warned, *drive.warnings(), *judgement.warnings)},
     )
-
-
-@dataclass(frozen=True)
-class Asked:
-    """Records of an identification, and what the estimator knows beside them."""
-
-    records: list[xr.Dataset]
-    side: ModelSide
-    settings: Identification
 
 
 def asked_of(

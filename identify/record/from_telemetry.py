@@ -26,7 +26,7 @@ from identify.record.recording import build_record
 from identify.record.smoothness import wrong_poses
 from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, ReferenceLog, Telemetry
 from identify.record.timed_record import build_timed_record
-from identify.scenario import Scenario, Timing
+from identify.scenario import Timing
 
 MOST_GROSS = 0.1
 """Largest share of poses that can be gross errors."""
@@ -41,10 +41,13 @@ NOTES = "notes"
 """Attribute of a record with what was decided when its file was read, as a JSON list."""
 
 
-def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Array) -> xr.Dataset:
+def record_of(
+    telemetry: Telemetry, robot: Robot, timing: Timing, scenario_toml: str, stated: Array
+) -> xr.Dataset:
     """Return the record of a run from its logs.
 
-    stated (6, 6): covariance of the poses if the log holds none. Raises RecordError if more than a
+    scenario_toml: scenario that the record states. stated (6, 6): covariance of the poses if the
+    log holds none. Raises RecordError if more than a
     tenth of the poses are gross errors, if no command is logged, if clocks do not overlap, or as
     `build_record` and `build_timed_record` do.
     """
@@ -58,17 +61,17 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
     telemetry = replace(telemetry, poses=poses)
     given: dict[str, Any] = {
         "robot": robot.name,
-        "scenario_toml": scenario.to_toml(),
-        "frame_rate_hz": scenario.timing.frame_rate_hz,
+        "scenario_toml": scenario_toml,
+        "frame_rate_hz": timing.frame_rate_hz,
         "prismatic": robot.layout.prismatic,
     }
-    why = _not_on_grid(telemetry, scenario.timing, bool(wrong.any()))
+    why = _not_on_grid(telemetry, timing, bool(wrong.any()))
     if why is None:
         assert telemetry.reference is not None
         record = build_record(
             time=poses.time,
             reference_pose=telemetry.reference.pose,
-            reference_rate=rates(telemetry.reference, scenario.timing.frame_period_s),
+            reference_rate=rates(telemetry.reference, timing.frame_period_s),
             measured_pose=poses.pose,
             measured_covariance=covariances,
             measured_ok=poses.ok,
@@ -77,7 +80,7 @@ def record_of(telemetry: Telemetry, robot: Robot, scenario: Scenario, stated: Ar
             **given,
         )
     else:
-        times, acting, more = _event_times(telemetry, scenario.timing)
+        times, acting, more = _event_times(telemetry, timing)
         kept = _new_commands(telemetry.commands)
         gaps, held = _gaps(telemetry, acting, kept)
         record = build_timed_record(

@@ -173,7 +173,7 @@ def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:
         raise RecordError("; ".join(found))
     # Covariances of the log itself go first.
     stated = np.eye(6) if telemetry.poses.covariance is not None else _stated(measured, path)
-    record = record_of(telemetry, robot, scenario, stated)
+    record = record_of(telemetry, robot, scenario.timing, scenario.to_toml(), stated)
     record.attrs["title"] = f"Record of {path.name}"
     _state_anchor(record, scenario.identification, measured, description_file(path))
     if measured.under_payload:

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from dynamics import load_robot
-from identify.diagnosis.diagnose import diagnose
+from identify.diagnosis.diagnose import diagnosed
 from identify.errors import RecordError
-from identify.estimation import identification
+from identify.estimation.identification import Asked, asked_of, identified
 from identify.estimation.result import IdentificationResult
 from identify.files.atomic import write_figure, write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
@@ -21,7 +20,6 @@ from identify.files.run_folder import (
     rms_figures,
 )
 from identify.files.versions import versions
-from identify.model.model_side import model_side
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.conditions import DRIFT, read_finding
@@ -33,7 +31,7 @@ from identify.record.model_runs import build_model_run, model_groups
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RunFiles, digest
 from identify.reporting.figures.logs import motion_figure
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import load_scenario
 from identify.stages.diagnose import ENTRY as DIAGNOSIS
 from identify.stages.diagnose import with_diagnosis
 from identify.stages.plan import (
@@ -54,7 +52,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     ``settings`` of the estimator, by dotted path, replace settings of the scenario. After a
     successful identification, scenario.toml holds them for the later stages.
 
-    Raises the errors of `identification.identify`, and ScenarioError for settings that do not
+    Raises the errors of `identify.identify`, and ScenarioError for settings that do not
     belong to the estimator.
     """
     run_folder = RunFolder(folder)
@@ -73,7 +71,14 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     if seed is not None:
         for name, one in records.items():
             check_planned(run_folder.path / name, one, setup, trajectories)
-    found = _identified_files(run_folder, records, scenario, seed, progress)
+    known = known_geometry(load_robot(scenario.robot), scenario.geometry, run_folder.path)
+    asked = asked_of(list(records.values()), known.robot, scenario)
+    heading = {
+        "scenario": scenario.name,
+        "seed": seed,
+        "settings": scenario.estimator_settings(),
+    }
+    found = _identified_files(run_folder, names, asked, heading, progress)
     changed = {} if scenario == planned else scenario_file(run_folder, scenario.to_toml())
     write_files(changed | found)
 
@@ -106,7 +111,13 @@ def identify_own(
     for one in contents:
         if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
             store_geometry_covariance(one, known.robot, known.covariance)
-    found = _identified_files(run_folder, records, scenario, None, progress)
+    asked = asked_of(contents, known.robot, scenario)
+    heading = {
+        "scenario": scenario.name,
+        "seed": None,
+        "settings": scenario.estimator_settings(),
+    }
+    found = _identified_files(run_folder, names, asked, heading, progress)
     files = scenario_file(run_folder, scenario.to_toml())
     for name, one in records.items():
         files[folder / name] = netcdf(recording.record_groups(one))
@@ -129,29 +140,29 @@ def _is_missed(result: IdentificationResult) -> bool:
 
 def _identified_files(
     run_folder: RunFolder,
-    records: Mapping[str, xr.Dataset],
-    scenario: Scenario,
-    seed: int | None,
+    names: Sequence[str],
+    asked: Asked,
+    heading: Mapping[str, Any],
     progress: Progress,
 ) -> dict[Path, bytes]:
-    """Identify from records by file name, and return the contents of covariance.nc and result.json.
+    """Identify from records, and return the contents of covariance.nc and result.json.
+
+    names: file names of the records. heading: first entries of result.json, with the seed.
 
     For a user's own record, which has no seed, model.nc is returned as well, because `validate`
     cannot write it without the truth.
     """
     began = time.perf_counter()
-    nominal = load_robot(scenario.robot)
-    robot = known_geometry(nominal, scenario.geometry, run_folder.path).robot
-    result = identification.identify(list(records.values()), robot, scenario, progress)
+    result = identified(asked, progress)
     diagnosis = None
     # Causes are known only for records with joint commands.
     if result.drive.in_loop and _is_missed(result):
         with progress.stage("diagnosis", 1) as advance:
-            diagnosis = diagnose(list(records.values()), result, robot, scenario)
+            diagnosis = diagnosed(asked, result)
             advance()
-    first = next(iter(records.values()))
+    first = asked.records[0]
     # The models run with the identified drive law.
-    side = model_side(robot, scenario).with_drive(result.drive.law)
+    side = asked.side.with_drive(result.drive.law)
     before, after = (
         model_on_record(side, values, first) for values in (result.initial, result.estimate)
     )
@@ -160,11 +171,10 @@ def _identified_files(
     ok = first["measured_ok"].values.astype(bool)
     covariance = result.whole_covariance
     # Later stages check by these digests whether the result belongs to its files.
-    made_of = {name: digest(one) for name, one in records.items()} | {
-        "covariance.nc": digest(covariance)
-    }
+    made_of = {name: digest(one) for name, one in zip(names, asked.records, strict=True)}
+    made_of["covariance.nc"] = digest(covariance)
     files = {}
-    if seed is None:
+    if heading["seed"] is None:
         runs = model_groups(build_model_run(first["time"].values, before, after))
         files[run_folder.model] = netcdf(runs)
         made_of["model.nc"] = digest(runs)
@@ -172,9 +182,7 @@ def _identified_files(
     units = parameter_units(result.layout, result.common_errors.names)
     files[run_folder.covariance] = covariance_netcdf(units, covariance, result.sources)
     entries: dict[str, Any] = {
-        "scenario": scenario.name,
-        "seed": seed,
-        "settings": scenario.estimator_settings(),
+        **heading,
         "date": str(first.attrs.get("created", ""))[:10] or None,
         "versions": versions(),
         ENTRY: made_of,

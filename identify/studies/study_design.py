@@ -26,7 +26,7 @@ from identify.errors import ScenarioError, StudyError
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import tables_by_name
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
@@ -215,9 +215,8 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
     _check_keys(study, kind)
     try:
         # "auto" is resolved here, so that all machines use the same renderer.
-        scenario = with_renderer(
-            (given or load_scenario(study.scenario)).with_overrides(overrides(study.changes))
-        )
+        stated = (given or load_scenario(study.scenario)).with_overrides(overrides(study.changes))
+        scenario = Setup(stated).on_this_machine().scenario
     except ScenarioError as error:
         raise StudyError(f"scenario of the study: {error}") from error
     shared = Shared(study.kind, scenario, study.options, study.seed)

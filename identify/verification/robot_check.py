@@ -20,7 +20,8 @@ from identify.experiment.law_in_loop import feedback
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, OWN_SENSOR, platform_distances
 from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Excitation, Scenario
+from identify.scenario import Excitation
+from identify.setup import Setup
 from identify.verification.finding import Finding
 from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
 
@@ -61,12 +62,14 @@ def check_robot(
 
 
 def checked_in(
-    scenario: Scenario, robot: Robot, set_name: str | None = None, progress: Progress | None = None
+    setup: Setup, robot: Robot, set_name: str | None = None, progress: Progress | None = None
 ) -> tuple[str, list[Finding]]:
-    """Return the name of a parameter set, and the findings about it in the loop of a scenario.
+    """Return the name of a parameter set, and the findings about it in the loop of a setup.
 
-    The default set is the scenario's truth, or the initial guess if the robot has no such set.
+    The robot can be another one than that of the setup. The default set is the scenario's truth, or
+    the initial guess if the robot has no such set.
     """
+    scenario = setup.scenario
     truth = scenario.plant.parameters
     name = set_name or (truth if truth in robot.parameter_sets else NOMINAL)
     check_parameter_set(robot, name)
@@ -83,15 +86,16 @@ def checked_in(
     return name, check_robot(robot, robot.parameter_sets[name].vector, around, progress)
 
 
-def run_warning(scenario: Scenario, progress: Progress | None = None) -> str | None:
-    """Return one line if the check finds fault with the robot file of a scenario, else None.
+def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
+    """Return one line if the check finds fault with the robot file of a setup, else None.
 
     Built-in robots are not checked, because their documentation states their faults.
     """
-    if scenario.robot in built_in_robots():
+    file = setup.scenario.robot
+    if file in built_in_robots():
         return None
-    robot = load_robot(scenario.robot)
-    _, findings = checked_in(scenario, robot, progress=progress)
+    robot = load_robot(file)
+    _, findings = checked_in(setup, robot, progress=progress)
     failed = [finding for finding in findings if not finding.ok]
     if not failed:
         return None
@@ -99,7 +103,7 @@ def run_warning(scenario: Scenario, progress: Progress | None = None) -> str | N
     said = shorten(failed[0].text, LONGEST, placeholder=" …")
     return (
         f"cmmsim check finds fault with {robot.name}: of {failed[0].check} ({said}){more}; the run "
-        f"begins nevertheless; for all findings: cmmsim check {scenario.robot}"
+        f"begins nevertheless; for all findings: cmmsim check {file}"
     )
 
 

@@ -217,10 +217,16 @@ FORMS: Mapping[str, Callable] = {
 }
 
 
+def record_from(telemetry, scenario=None):
+    """The record of a log of rss6, in the scenario of every form where no other is given."""
+    scenario = scenario or scenario_of()
+    return record_of(telemetry, rss6(), scenario.timing, scenario.to_toml(), COVARIANCE)
+
+
 def record_in(form, seed):
     """The record of one form of an experiment, with its scale anchor."""
     telemetry, more = FORMS[form](seed)
-    record = record_of(telemetry, rss6(), scenario_of(**more), COVARIANCE)
+    record = record_from(telemetry, scenario_of(**more))
     # the scale was measured once, with an error that is the same in all forms
     error = 0.005 * np.random.default_rng(30_000 + seed).standard_normal()
     store_anchor(record, ScaleAnchor("platform_mass", true_parameters()[0] + error, 0.005))

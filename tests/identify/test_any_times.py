@@ -15,7 +15,7 @@ from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.model.from_record import identified_model
 from identify.record.frame_times import likelier_times
-from identify.record.from_telemetry import reading_notes, record_of
+from identify.record.from_telemetry import reading_notes
 from identify.record.recording import is_timed
 from identify.record.smoothness import gross_errors
 from identify.validation.unseen import model_on_record
@@ -28,12 +28,13 @@ from tests.identify.record_forms import (
     exact,
     held,
     logged,
+    record_from,
     record_in,
     scenario_of,
     true_parameters,
     with_rows,
 )
-from tests.identify.synthetic import quick, rss6, run_plant, side_of, truth
+from tests.identify.synthetic import quick, run_plant, side_of, truth
 
 CHANCE = 4.0
 """Standard deviations that a figure may be off by chance."""
@@ -65,7 +66,7 @@ def test_commands_that_change_while_no_pose_is_logged_drive_the_model():
     telemetry, _ = exact(0)
     telemetry.poses.ok[300:330] = False
     telemetry.poses.pose[300:330] = np.nan
-    record = record_of(telemetry, rss6(), scenario_of(), COVARIANCE)
+    record = record_from(telemetry)
     assert is_timed(record)
     assert "the servo saw poses that were not logged" in reading_notes([record])[0]
 
@@ -107,7 +108,7 @@ def test_a_cause_is_named_in_a_record_at_any_times():
     telemetry = logged(*run_plant(scenario, 0, duration_s=10.0))
     telemetry = with_rows(telemetry, slice(90, None))
     telemetry = at_times(telemetry, telemetry.poses.time - telemetry.poses.time[0])
-    record = record_of(telemetry, rss6(), scenario_of(), COVARIANCE)
+    record = record_from(telemetry)
     store_anchor(record, ScaleAnchor("platform_mass", true_parameters()[0], 0.005))
     found = diagnose(record)
     (first,) = found.findings
@@ -119,7 +120,7 @@ def test_a_cause_is_named_in_a_record_at_any_times():
 @pytest.mark.thorough
 def test_a_clock_that_is_not_stated_is_named_where_it_explains_the_record():
     telemetry, _ = FORMS["two clocks"](0)
-    record = record_of(replace(telemetry, reference=None), rss6(), scenario_of(), COVARIANCE)
+    record = record_from(replace(telemetry, reference=None))
     store_anchor(record, ScaleAnchor("platform_mass", true_parameters()[0], 0.005))
     found = identify(record)
     assert not found.explained
@@ -196,7 +197,7 @@ def test_more_than_a_tenth_of_wrong_poses_are_refused():
     rows = np.random.default_rng(9).choice(len(telemetry.poses.ok), 160, replace=False)
     telemetry.poses.pose[rows] += 5e-3
     with pytest.raises(RecordError, match=r"mine.csv: \d+ of 1200 poses are far from the motion"):
-        record_of(telemetry, rss6(), scenario_of(), COVARIANCE)
+        record_from(telemetry)
 
 
 def test_rows_missing_in_which_a_command_was_held_are_told_from_others():
@@ -204,7 +205,7 @@ def test_rows_missing_in_which_a_command_was_held_are_told_from_others():
     telemetry, _ = exact(0)
     telemetry.commands.command[301:331] = telemetry.commands.command[300]
     kept = np.setdiff1d(np.arange(1200), np.r_[301:330, 801:830])
-    record = record_of(with_rows(telemetry, kept), rss6(), scenario_of(), COVARIANCE)
+    record = record_from(with_rows(telemetry, kept))
     held = [note for note in reading_notes([record]) if "it was held" in note]
     assert held == [
         "rows are missing from t = 5.00 s to 5.50 s, and the command after them is the one before: "
@@ -218,12 +219,12 @@ def test_clocks_that_do_not_overlap_are_refused():
     telemetry, _ = exact(0)
     other = replace(telemetry.commands, time=telemetry.commands.time + 1e6)
     with pytest.raises(RecordError, match=r"line 2: its command acts 1000000 s after .* overlap"):
-        record_of(replace(telemetry, commands=other), rss6(), scenario_of(), COVARIANCE)
+        record_from(replace(telemetry, commands=other))
 
 
 def test_torque_commands_need_the_grid():
     telemetry = logged(*run_plant(scenario_of(), 0, duration_s=3.0))
-    record = record_of(replace(telemetry, reference=None), rss6(), scenario_of(), COVARIANCE)
+    record = record_from(replace(telemetry, reference=None))
     torques = record.assign_attrs(law="computed_torque", torque_commands=1)
     with pytest.raises(EstimationError, match=r"torques, under .* on one frame grid"):
         identified_model(torques, side_of(scenario_of()))

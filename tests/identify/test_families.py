@@ -13,7 +13,7 @@ from identify import pipeline
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from tests.dynamics.test_families import mixed_robot
 
 MOST_UM, MOST_URAD = 5.0, 25.0
@@ -44,7 +44,7 @@ def test_a_robot_that_no_code_knows_runs_from_its_file_alone(tmp_path):
     changes |= {"excitation.candidates": 2, "validation.count": 1, "validation.duration_s": 3.0}
     scenario, folder = load_scenario("quick").with_overrides(changes), tmp_path / "run"
     for stage in (
-        lambda: pipeline.excite(Setup(with_renderer(scenario)), folder, SilentProgress()),
+        lambda: pipeline.excite(Setup(scenario).on_this_machine(), folder, SilentProgress()),
         *_later_stages(folder),
     ):
         stage()

@@ -83,7 +83,7 @@ RECORD = (
     "identify.pipeline.teach",
     "identify.pipeline.excitation_run",
 )
-IDENTIFY = ("identify.estimation.identification.identify",)
+IDENTIFY = ("identify.stages.estimate.identified",)
 VALIDATE = (
     "identify.experiment.sensor_in_loop.SensorPlan.taught",
     "identify.stages.validate.run_unseen",

@@ -32,10 +32,8 @@ from identify.studies.rows.gauntlet.case import (
     run_case,
 )
 from identify.studies.rows.gauntlet.catalogue import INSIDE, OUTSIDE, TROUBLES, drawn_troubles
-from identify.studies.rows.gauntlet.late import late_plant
-from identify.studies.rows.gauntlet.play import PlantWithPlay
-from identify.studies.rows.gauntlet.trouble import Trouble
-from identify.studies.rows.gauntlet.typed import typed
+from identify.studies.rows.gauntlet.trouble import Trouble, typed
+from identify.studies.rows.gauntlet.troubled_plants import PlantWithPlay, late_plant
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge
 from tests.identify.commands import command, one_line, refusal
 
@@ -50,7 +48,7 @@ def scenario():
 
 def lab():
     """The laboratory without trouble."""
-    return laboratory(scenario(), 0)
+    return laboratory(scenario().to_toml(), 0)
 
 
 def rng(seed=0):
@@ -198,7 +196,7 @@ def test_bodies_that_are_drawn_can_exist():
 def test_the_record_says_nothing_of_the_trouble():
     """What the estimator reads names the scenario without trouble, and its commands' own times."""
     troubles = (INSIDE["latency"](lab(), rng()), INSIDE["cascade drives"](lab(), rng()))
-    made = recorded(scenario(), troubles, 3, 0)
+    made = recorded(lab(), troubles, 3)
     assert made.record.attrs["scenario"] == scenario().to_toml()
     assert np.array_equal(made.record["command_time"], made.record["time"])
     assert not any("plant_" in name for name in made.record.attrs)
@@ -213,7 +211,7 @@ def with_play(width):
 
 
 def test_a_servo_without_play_is_that_of_a_plain_plant():
-    plain, none = (recorded(scenario(), troubles, 3, 0) for troubles in ((), (with_play(0.0),)))
+    plain, none = (recorded(lab(), troubles, 3) for troubles in ((), (with_play(0.0),)))
     for name in ("measured_position", "measured_orientation", "command"):
         assert np.abs(none.record[name] - plain.record[name]).max() < 1e-7
 
@@ -221,7 +219,7 @@ def test_a_servo_without_play_is_that_of_a_plain_plant():
 def test_drives_act_on_what_the_play_leaves_of_the_logged_commands():
     """A plain plant that gets the log, filtered by a play operator written anew, moves the same."""
     width = 2e-3
-    made = recorded(scenario(), (with_play(width),), 3, 0)
+    made = recorded(lab(), (with_play(width),), 3)
     record = made.record
     reference = recorded_reference(record)
     last = made.plant.nominal.inverse_kinematics(reference.poses[0])
@@ -248,7 +246,7 @@ def test_drives_act_on_what_the_play_leaves_of_the_logged_commands():
 
 def test_a_scale_that_needs_a_second_record_is_refused():
     payload = scenario().with_overrides({"identification.scale_anchor": "payload"})
-    assert "scale_anchor = 'payload'" in refusal(ScenarioError, laboratory, payload, 0)
+    assert "scale_anchor = 'payload'" in refusal(ScenarioError, laboratory, payload.to_toml(), 0)
 
 
 def test_a_case_that_stops_has_failed_and_keeps_what_was_wrong(monkeypatch):
@@ -267,7 +265,7 @@ def test_an_error_after_the_remedy_leaves_the_right_cause_without_intervals(monk
         raise DynamicsError("no")
 
     monkeypatch.setattr(case_module, "identify", stops)
-    one = drawn(scenario(), np.random.SeedSequence(1), "one", 0)
+    one = drawn(lab(), np.random.SeedSequence(1), "one")
     assert case_module.after_remedies(one, [typed(finding())]) == ((), False)
 
 
@@ -275,7 +273,7 @@ def test_troubles_with_which_the_robot_cannot_run_are_drawn_again(monkeypatch):
     weak = replace(ZERO, settings={"control.torque_limit_N_m": 0.8 * lab().holding})
     draws = iter([(weak,), (weak,), (LATE,)])
     monkeypatch.setattr(case_module, "drawn_troubles", lambda *given: next(draws))
-    assert drawn(scenario(), np.random.SeedSequence(1), "one", 0).troubles == (LATE,)
+    assert drawn(lab(), np.random.SeedSequence(1), "one").troubles == (LATE,)
 
 
 def test_shares_count_the_cases_that_they_are_about():
@@ -320,14 +318,14 @@ def test_bad_input_of_the_command_is_refused_in_one_line(tmp_path, monkeypatch, 
 
 @pytest.mark.thorough
 def test_the_trouble_of_known_seeds_is_named_and_its_remedy_lets_the_intervals_hold():
-    done = run_case(drawn(scenario(), np.random.SeedSequence(0), "none", 0))
+    done = run_case(drawn(lab(), np.random.SeedSequence(0), "none"))
     assert judge(done) == "right intervals"
     held = []
     kinds = ("zero of a joint", "latency")
     for seed, kind in enumerate(kinds):
         trouble = INSIDE[kind](lab(), rng(seed))
-        made = recorded(scenario(), (trouble,), seed, 0)
-        done = run_case(case_module.Drawn(scenario(), (trouble,), made, seed, 100 + seed, 0))
+        made = recorded(lab(), (trouble,), seed)
+        done = run_case(case_module.Drawn(lab(), (trouble,), made, seed, 100 + seed))
         assert judge(done) == "right intervals", (kind, str(done.diagnosis))
         assert np.isnan(done.size_errors[0]) or abs(done.size_errors[0]) < 4
         assert done.explained
@@ -353,7 +351,7 @@ def test_the_command_writes_a_dozen_cases_that_it_continues_and_counts(tmp_path,
         assert "Misses" in (folder / f"gauntlet.{suffix}").read_text()
     # the truth is drawn anew from the seeds of the rows
     for row, seed in enumerate(np.random.SeedSequence(11).spawn(12)):
-        troubles = drawn(load_scenario("quick"), seed, "drawn", 0).troubles
+        troubles = drawn(laboratory(load_scenario("quick").to_toml(), 0), seed, "drawn").troubles
         kinds = [one.kind for one in troubles]
         assert [table[f"trouble_{place}"][row] for place in (1, 2)] == [*kinds, "", ""][:2]
 
@@ -362,7 +360,7 @@ def test_the_command_writes_a_dozen_cases_that_it_continues_and_counts(tmp_path,
 def test_two_causes_are_not_taken_for_one_that_is_there_or_not():
     """A latency with a clock that falls behind looks like drives of another law at first."""
     late = replace(LATE, plant=lambda plant: late_plant(plant, 7.9e-3, 1.55e-3))
-    made = recorded(scenario(), (late,), 71, 0)
+    made = recorded(lab(), (late,), 71)
     found = diagnose(made.record)
     assert {one.group for one in found.findings} == {
         "latency of the commands",

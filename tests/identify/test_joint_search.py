@@ -6,9 +6,8 @@ import pytest
 from identify.estimation.identification import asked_of, output_error_problem
 from identify.estimation.joint_search import JointProblem, JointRun
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.record.from_telemetry import record_of
-from tests.identify.record_forms import COVARIANCE, logged, scenario_of, true_parameters
-from tests.identify.synthetic import rss6, run_plant
+from tests.identify.record_forms import logged, record_from, scenario_of, true_parameters
+from tests.identify.synthetic import run_plant
 
 
 def test_the_linearisation_of_the_joint_search_is_the_slope_of_its_cost():
@@ -16,7 +15,7 @@ def test_the_linearisation_of_the_joint_search_is_the_slope_of_its_cost():
     stds = {"timing.clock_offset_std_s": 0.02, "timing.clock_drift_std": 1e-4}
     telemetry = logged(*run_plant(scenario_of(), 0, duration_s=2.2))
     unknown = scenario_of(**stds, **{"model.centre_std": 0.02})
-    record = record_of(telemetry, rss6(), unknown, COVARIANCE)
+    record = record_from(telemetry, unknown)
     store_anchor(record, ScaleAnchor("platform_mass", true_parameters()[0], 0.005))
     asked = asked_of(record, None, None)
     problem = output_error_problem([record], asked.side, asked.settings).driven_by_commands()

@@ -18,7 +18,7 @@ from identify.progress import SilentProgress
 from identify.record.recording import read, read_runs
 from identify.reporting.goals import check_goals
 from identify.scenario import load_scenario
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, recorded_run_folder, run_plant
 
@@ -81,7 +81,7 @@ def test_the_papers_experiment_gives_the_figures_that_are_quoted(
     """To the last digit that the README quotes, which are those of all ten validation runs; the
     report, which changes none, is the quick run's."""
     scenario = load_scenario("paper").with_overrides({"validation.count": unseen})
-    setup = Setup(with_renderer(scenario))
+    setup = Setup(scenario).on_this_machine()
     pipeline.excite(setup, tmp_path, SilentProgress())
     taught = pipeline.record(tmp_path, SilentProgress())
     pipeline.identify(tmp_path, SilentProgress())

@@ -34,7 +34,7 @@ from identify.record.recording import (
     write,
     write_runs,
 )
-from identify.setup import Setup, with_renderer
+from identify.setup import Setup
 from identify.trajectory import load_trajectories
 from tests.identify import synthetic
 from tests.identify.synthetic import (
@@ -436,5 +436,5 @@ def test_a_run_too_short_to_identify_from_is_refused_before_anything_is_computed
     with pytest.raises(
         EstimationError, match=r"duration_s gives 30 frames .0.5 s., at least 120 are needed"
     ):
-        pipeline.excite(Setup(with_renderer(short)), tmp_path / "new", SilentProgress())
+        pipeline.excite(Setup(short).on_this_machine(), tmp_path / "new", SilentProgress())
     assert not (tmp_path / "new").exists()

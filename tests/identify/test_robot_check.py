@@ -15,6 +15,7 @@ from identify.commands.help import BEYOND_LIMIT
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
+from identify.setup import Setup
 from identify.verification.robot_check import about_sensor, run_warning
 from tests.identify.commands import command, one_line
 
@@ -117,11 +118,11 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd, monkeypatch):
     assert {"inertias", "loop", "gain margin", "frame rate"} <= failed
     assert found["drives by design"]["ok"]
     assert "joint_pid = { lp = " in found["drives by design"]["text"]
-    warned = run_warning(load_scenario("quick", robot=str(tmp_path / "mine.toml")))
+    warned = run_warning(Setup(load_scenario("quick", robot=str(tmp_path / "mine.toml"))))
     assert warned.startswith("cmmsim check finds fault with ups6: of ")
     assert "gain margin" in warned
     assert "\n" not in warned
-    assert run_warning(load_scenario("quick", robot="ups6")) is None
+    assert run_warning(Setup(load_scenario("quick", robot="ups6"))) is None
     assert found["inertias"]["leg"] == 3
     assert found["loop"]["value"] > 1 == found["loop"]["limit"]
     assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(

@@ -3,8 +3,7 @@
 import numpy as np
 
 from identify.arrays import Array
-from identify.studies.rows.gauntlet.trouble import Laboratory, Trouble, log_uniform, sign
-from identify.studies.rows.gauntlet.typed import typed
+from identify.studies.rows.gauntlet.trouble import Laboratory, Trouble, log_uniform, sign, typed
 
 
 def centre_of_mass(lab: Laboratory, rng: np.random.Generator) -> Trouble:

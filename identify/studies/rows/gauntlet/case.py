@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,12 +16,11 @@ from identify.estimation.identification import identify
 from identify.experiment.plant import Plant
 from identify.experiment.run import excitation_run
 from identify.random_streams import child, integer_seed
-from identify.scenario import Scenario, scenario_from_toml
+from identify.scenario import scenario_from_toml
 from identify.setup import Setup
 from identify.studies.rows.coverage import intervals_hold
 from identify.studies.rows.gauntlet.catalogue import Wrong, drawn_troubles
-from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble
-from identify.studies.rows.gauntlet.typed import typed
+from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble, typed
 from identify.studies.rows.identified import designed_trajectories, row_setup
 from identify.studies.rows.kind import robot_named
 from identify.studies.rows.row_sensor import DrawnSensor
@@ -37,11 +36,10 @@ DRAWS = 10
 
 @dataclass(frozen=True)
 class Recorded:
-    """Record of a case, the plant that made it, and what the estimator knows of its scenario."""
+    """Record of a case, and the plant that made it."""
 
     record: xr.Dataset
     plant: Plant
-    scenario: Scenario
 
 
 @dataclass(frozen=True)
@@ -87,39 +85,36 @@ class Case:
 class Drawn:
     """Troubles of a case, and its record.
 
-    number, again: seeds of the record, and of the record after something was mended. trajectory:
-    seed of the exciting trajectory.
+    number, again: seeds of the record, and of the record after something was mended.
     """
 
-    scenario: Scenario
+    lab: Laboratory
     troubles: tuple[Trouble, ...]
     made: Recorded
     number: int
     again: int
-    trajectory: int
 
 
-def drawn(scenario: Scenario, seed: np.random.SeedSequence, wrong: Wrong, trajectory: int) -> Drawn:
-    """Draw a case from its seed, and make its record.
+def drawn(lab: Laboratory, seed: np.random.SeedSequence, wrong: Wrong) -> Drawn:
+    """Draw a case of a laboratory from its seed, and make its record.
 
     Troubles with which the robot cannot follow its trajectory are drawn again, because a laboratory
-    would have no record of them. wrong: sort of case. trajectory: seed of the trajectory.
+    would have no record of them. wrong: sort of case.
 
     Raises the exceptions of the experiment if no draw gives a record.
     """
     rng = np.random.default_rng(child(seed, TROUBLE))
     record, again = (integer_seed(child(seed, stream)) for stream in (RECORD, AGAIN))
-    lab = laboratory(scenario, trajectory)
     for left in reversed(range(DRAWS)):
         troubles = drawn_troubles(lab, rng, wrong)
         try:
-            made = recorded(scenario, troubles, record, trajectory)
+            made = recorded(lab, troubles, record)
         except DynamicsError:
             if not left:
                 raise
         else:
             break
-    return Drawn(scenario, troubles, made, record, again, trajectory)
+    return Drawn(lab, troubles, made, record, again)
 
 
 def run_case(case: Drawn) -> Case:
@@ -128,7 +123,7 @@ def run_case(case: Drawn) -> Case:
     Raises EstimationError, and the exceptions of the model, unless they come after the remedy.
     Then no interval holds.
     """
-    scenario = case.scenario
+    scenario = case.lab.scenario
     made = case.made
     plain = Setup(scenario, loaded=robot_named(scenario.robot)).robot
     began = time.perf_counter()
@@ -168,8 +163,11 @@ def run_case(case: Drawn) -> Case:
 
 
 @lru_cache(maxsize=4)
-def _laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
-    """Return a laboratory. Its robot runs the exciting trajectory once, for its largest torque.
+def laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
+    """Return the laboratory of a scenario without trouble. It is made once per process.
+
+    Its robot runs the exciting trajectory once, for its largest torque. trajectory: seed of the
+    trajectory.
 
     Raises ScenarioError if the scale needs a second record.
     """
@@ -187,33 +185,27 @@ def _laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
     dynamic = plant.parameters[plant.robot.layout.dynamic]
     holding = max(float(np.abs(plant.robot.static_torque(one, dynamic)).max()) for one in run.pose)
     peak = float(np.abs(run.torque).max())
-    return Laboratory(setup.robot, plant.parameters, scenario, peak, holding)
+    return Laboratory(setup.robot, plant.parameters, scenario, trajectory, peak, holding)
 
 
-def laboratory(scenario: Scenario, trajectory: int) -> Laboratory:
-    """Return the laboratory of a scenario without trouble. It is made once per process."""
-    return _laboratory(scenario.to_toml(), trajectory)
-
-
-def recorded(
-    scenario: Scenario, troubles: Sequence[Trouble], number: int, trajectory: int
-) -> Recorded:
-    """Make the record of a scenario with troubles, with a seed and the seed of its trajectory.
+def recorded(lab: Laboratory, troubles: Sequence[Trouble], number: int) -> Recorded:
+    """Make the record of a laboratory with troubles, with a seed.
 
     The record names the scenario without troubles, because an experimenter knows no other.
     """
+    scenario = lab.scenario
     settings = {key: value for one in troubles for key, value in one.settings.items()}
     setup = row_setup(scenario.with_overrides(settings), number)
     plant = setup.plant
     for one in troubles:
         plant = one.plant(plant)
-    motion = designed_trajectories(row_setup(scenario, number), trajectory).excitation
+    motion = designed_trajectories(row_setup(scenario, number), lab.trajectory).excitation
     covariance = setup.sensor_plan.covariance(setup.nominal.home_pose)
     sensor = DrawnSensor(covariance, plant.runs.timing.dropout)
     record = excitation_run(plant, sensor, motion, scenario.excitation, number).record
     for one in troubles:
         record = one.record(record)
-    return Recorded(record.assign_attrs(scenario=scenario.to_toml()), plant, scenario)
+    return Recorded(record.assign_attrs(scenario=scenario.to_toml()), plant)
 
 
 def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[bool, ...], bool]:
@@ -228,8 +220,8 @@ def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[boo
     made = case.made
     try:
         if len(left) < len(case.troubles):
-            made = recorded(case.scenario, left, case.again, case.trajectory)
-        known = case.scenario.with_overrides(settings)
+            made = recorded(case.lab, left, case.again)
+        known = case.lab.scenario.with_overrides(settings)
         record = made.record.assign_attrs(scenario=known.to_toml())
         for one in remedies:
             record = one.record(record)
@@ -244,12 +236,12 @@ def misfits_alone(case: Drawn) -> tuple[float, ...]:
     """Return how much each of two troubles alone raises the misfit, see `Case.alone`."""
     if len(case.troubles) < 2:
         return ()
-    known = case.scenario.with_overrides({"identification.method": "command_driven"})
+    known = case.lab.scenario.with_overrides({"identification.method": "command_driven"})
     plain = Setup(known, loaded=robot_named(known.robot)).robot
     found = []
     for one in case.troubles:
         try:
-            made = recorded(known, [one], case.number, case.trajectory)
+            made = recorded(replace(case.lab, scenario=known), [one], case.number)
             misfit = identify(made.record, plain, known).driven_misfit
         except (IdentifyError, DynamicsError):
             found.append(float("nan"))

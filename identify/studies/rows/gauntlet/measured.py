@@ -10,15 +10,15 @@ from identify.diagnosis.diagnosis import Finding
 from identify.diagnosis.measurement_causes import KINDS
 from identify.record.conditions import COMMAND_TIME
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
-from identify.studies.rows.gauntlet.late import late_plant
 from identify.studies.rows.gauntlet.trouble import (
     Laboratory,
     Remedied,
     Trouble,
     log_uniform,
     sign,
+    typed,
 )
-from identify.studies.rows.gauntlet.typed import typed
+from identify.studies.rows.gauntlet.troubled_plants import late_plant
 
 LATENCY_STD_S = 1e-3
 """Standard deviation with which a laboratory states a latency that a diagnosis has found.

@@ -10,15 +10,15 @@ from dynamics.parameters import passive_parameters
 from identify.diagnosis.body_causes import PASSIVE_GROUP, passive_words
 from identify.diagnosis.geometry_causes import GROUPS, ZEROS
 from identify.experiment.plant import Plant
-from identify.studies.rows.gauntlet.play import PlantWithPlay
 from identify.studies.rows.gauntlet.trouble import (
     Laboratory,
     Remedied,
     Trouble,
     log_uniform,
     sign,
+    typed,
 )
-from identify.studies.rows.gauntlet.typed import typed
+from identify.studies.rows.gauntlet.troubled_plants import PlantWithPlay
 
 ZERO = {"rad": (2e-4, 1.5e-3), "m": (5e-5, 5e-4)}
 """Smallest and largest error of a zero, by the unit of the joints."""

@@ -16,7 +16,13 @@ from dynamics import DynamicsError
 from identify.errors import IdentifyError
 from identify.scenario import Scenario
 from identify.scenario.section import Section
-from identify.studies.rows.gauntlet.case import Case, drawn, first_group, run_case
+from identify.studies.rows.gauntlet.case import (
+    Case,
+    drawn,
+    first_group,
+    laboratory,
+    run_case,
+)
 from identify.studies.rows.gauntlet.catalogue import TROUBLES, Wrong
 from identify.studies.rows.gauntlet.trouble import Trouble
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge
@@ -72,7 +78,8 @@ class GauntletOptions(Section):
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: GauntletOptions) -> Row:
     """Compute one row. A case that stops with a known error has failed."""
-    case = drawn(scenario, seed, options.wrong, options.trajectory_seed)
+    lab = laboratory(scenario.to_toml(), options.trajectory_seed)
+    case = drawn(lab, seed, options.wrong)
     row = trouble_figures(case.troubles)
     try:
         return row | figures(run_case(case))

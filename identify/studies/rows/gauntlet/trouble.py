@@ -1,5 +1,7 @@
 """Trouble of a laboratory: what is wrong, what shall be found, and what a laboratory does then."""
 
+import re
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +14,9 @@ from identify.arrays import Array
 from identify.diagnosis.diagnosis import Finding
 from identify.experiment.plant import Plant
 from identify.scenario import Scenario
+
+SETTING = re.compile(r"--set (?:'([^']+)'|(\S+))")
+"""Setting in a remedy, as it would be typed, with or without quotes."""
 
 
 def unchanged_plant(plant: Plant) -> Plant:
@@ -46,6 +51,28 @@ class Remedied:
 def mend(finding: Finding) -> Remedied:
     """Take the trouble away, and repeat the experiment."""
     return Remedied(mended=True)
+
+
+def typed(finding: Finding) -> Remedied:
+    """Set what the remedies of a finding say. Where one line names an alternative, the first.
+
+    A later remedy replaces an earlier one. A finding without settings names the trouble only as one
+    that cannot be told from its own cause, and the trouble is mended.
+    """
+    settings: dict[str, Any] = {}
+    for remedy in finding.remedies:
+        line, *_ = remedy.partition(", or ")
+        for quoted, plain in SETTING.findall(line):
+            key, _, value = (quoted or plain).partition("=")
+            settings[key] = _value(value)
+    return Remedied(settings, mended=not settings)
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text.rstrip(',;')}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text.rstrip(",;")
 
 
 @dataclass(frozen=True)
@@ -98,6 +125,8 @@ class Laboratory:
         True parameters without trouble.
     scenario : Scenario
         Scenario without trouble.
+    trajectory : int
+        Seed of the exciting trajectory.
     peak : float
         Largest torque or force of a run without trouble, N m or N.
     holding : float
@@ -107,6 +136,7 @@ class Laboratory:
     robot: Robot
     parameters: Array
     scenario: Scenario
+    trajectory: int
     peak: float
     holding: float
 
