@@ -8,9 +8,12 @@ import pytest
 from scipy.stats import kstest, truncnorm
 
 from dynamics import load_robot
+from identify.errors import StudyError
 from identify.estimation.bounds import bounded_estimate, parameter_bounds
 from identify.estimation.prior import starting_guess
-from identify.studies.rows.calibrated import drawn_truth, moving_frames
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.record.from_telemetry import record_of
+from identify.studies.rows.calibrated import drawn_truth, log_of_moving_robot, moving_frames
 from identify.studies.rows.kind import PROBABILITY
 from identify.studies.uniformity import (
     BAND,
@@ -18,6 +21,15 @@ from identify.studies.uniformity import (
     simultaneous_band,
     uniformity_figure,
 )
+from tests.identify.record_forms import (
+    COVARIANCE,
+    LATENCY_S,
+    at_times,
+    logged,
+    scenario_of,
+    with_rows,
+)
+from tests.identify.synthetic import rss6, run_plant
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +72,26 @@ def test_poses_are_compared_where_the_platform_has_left_its_start():
     poses[2:, 4] = 1e-12, 1e-6, 2e-6, 0.0
     assert moving_frames(poses).tolist() == [3, 4]
     assert moving_frames(np.ones((6, 6))).tolist() == [5]
+
+
+def test_a_record_without_its_beginning_is_what_the_reader_of_such_a_log_makes():
+    """The rows of the log from 1.5 s on, with a clock of their own, as a laboratory would bring
+    them.
+    """
+    scenario = scenario_of()
+    record, run = run_plant(scenario, 0, duration_s=3.0)
+    store_anchor(record, ScaleAnchor("platform_mass", 23.5, 0.005))
+    record["command_time"] = ("time", record["time"].values + LATENCY_S)
+    later = with_rows(logged(record, run), slice(90, None))
+    times = later.poses.time
+    expected = record_of(at_times(later, times - times[0]), rss6(), scenario, COVARIANCE)
+    found = log_of_moving_robot(record, 1.5, rss6())
+    assert found.sizes["time"] == expected.sizes["time"] > 80
+    for name in ("time", "acting", "command", "measured_position", "measured_orientation"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-12)
+    assert found.attrs["scale_anchor_value"] == 23.5
+    with pytest.raises(StudyError, match=r"log_from_s is 4 s, the record ends after 2\.983 s"):
+        log_of_moving_robot(record, 4.0, rss6())
 
 
 def probabilities(**figures):

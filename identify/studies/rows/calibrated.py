@@ -13,9 +13,12 @@ loop is unstable. The row counts these draws.
 from dataclasses import dataclass, replace
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import ndtr
 
+from dynamics import Robot
 from dynamics.closed_loop import LoopFailure
 from identify.arrays import Array
 from identify.errors import StudyError
@@ -24,6 +27,7 @@ from identify.estimation.identifiability import group_rows
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.result import IdentificationResult
+from identify.estimation.scale_anchor import read_anchor, store_anchor
 from identify.excitation.design import admissible_trajectories
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
@@ -32,6 +36,10 @@ from identify.experiment.truth import true_poses
 from identify.files.dataset import POSE
 from identify.progress import SilentProgress
 from identify.random_streams import child, stream_seed
+from identify.record.conditions import COMMAND_TIME
+from identify.record.recording import poses as recorded_poses
+from identify.record.stored_common_errors import CHANGES
+from identify.record.timed_record import build_timed_record
 from identify.scenario import Scenario
 from identify.setup import Setup
 from identify.studies.rows.coverage import intervals_hold
@@ -79,6 +87,17 @@ COLUMNS = {
         "1", "numbers of the truth that were drawn again because no body or drive can have them"
     ),
 }
+
+
+class CalibrationOptions(SensorOptions):
+    """Options of rows of kind `calibration_of_intervals`."""
+
+    log_from_s: float = Field(
+        0.0,
+        ge=0.0,
+        description="time at which the log begins, s; above 0 the robot moves already, so that the "
+        "logged commands drive the model and its state at the start is estimated",
+    )
 
 
 @dataclass(frozen=True)
@@ -169,7 +188,7 @@ def random_run(
     return run_plant(plant, sensor, trajectory, duration_s, setup.seed, number)
 
 
-def compute(scenario: Scenario, seed: np.random.SeedSequence, options: SensorOptions) -> Row:
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: CalibrationOptions) -> Row:
     """Compute one row.
 
     Raises StudyError if plant and model have other parameters, or if no drawn truth has a stable
@@ -190,7 +209,10 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: SensorOpt
     sensor = row_pose_sensor(setup, options)
     experiments = stable_experiments(setup, sensor, guess, bounds, seed)
     record, unseen = experiments.record, experiments.unseen
-    result = identify_record(record.record, side.robot, scenario)
+    logged = record.record
+    if options.log_from_s > 0.0:
+        logged = log_of_moving_robot(logged, options.log_from_s, side.robot)
+    result = identify_record(logged, side.robot, scenario)
     (predicted,) = predicted_runs(
         side.with_drive(result.drive.law),
         [unseen.record],
@@ -209,6 +231,38 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: SensorOpt
         **parameter_figures(result, experiments.plant),
         **pose_figures(predicted, unseen, frame),
     }
+
+
+def log_of_moving_robot(record: xr.Dataset, from_s: float, robot: Robot) -> xr.Dataset:
+    """Return what is left of a record if its log begins later, when the robot moves.
+
+    Its clock begins with the log, and it holds no reference. Raises StudyError if errors that all
+    frames have in common are stored frame by frame, which such a record cannot state, or if fewer
+    than two frames are left.
+    """
+    left = record.isel(time=np.flatnonzero(record["time"].values >= from_s))
+    if left.sizes["time"] < 2:
+        raise StudyError(
+            f"options.log_from_s is {from_s:g} s, the record ends after "
+            f"{float(record['time'][-1]):.4g} s"
+        )
+    if CHANGES in record:
+        raise StudyError("options.log_from_s needs options.sensor = drawn")
+    began = float(left["time"][0])
+    made = build_timed_record(
+        time=left["time"].values - began,
+        measured_pose=recorded_poses(left, "measured"),
+        measured_covariance=left["measured_covariance"].values,
+        measured_ok=left["measured_ok"].values,
+        acting=left[COMMAND_TIME].values - began,
+        command=left["command"].values,
+        scenario_toml=record.attrs["scenario"],
+        robot=robot.name,
+        frame_rate_hz=float(record.attrs["frame_rate_hz"]),
+        prismatic=robot.layout.prismatic,
+    )
+    store_anchor(made, read_anchor(record, robot.layout))
+    return made
 
 
 def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
@@ -273,7 +327,7 @@ CALIBRATION = Kind(
     "a truth drawn from the estimator's prior, identified from its record, and the probability "
     "that the stated distributions give to values below the truth",
     COLUMNS,
-    SensorOptions,
+    CalibrationOptions,
     KeysRead(
         READS.keys,
         (*READS.excluding, "scenario.plant.parameters", "scenario.plant.values"),
