@@ -79,14 +79,16 @@ def is_plugin_name(name: str) -> bool:
 
 
 def import_plugin(option: str, name: str) -> Any:
-    """Import the user's own part that ``module:name`` names.
+    """Import a user's own part by its name ``module:name``.
 
     ``option`` states the kind of part in messages, such as "detector". Raises CmmError if the
     module is not allowed to run, cannot be imported, or has no such part.
     """
     module, _, attribute = name.partition(":")
     if not (_is_module(module) and attribute.isidentifier()):
-        raise CmmError(f"{option} {name!r} is not of the form module:name, as my_module:my_part")
+        raise CmmError(
+            f"{option} {name!r} is not of the form module:name, such as my_module:my_part"
+        )
     # The dots keep "my_module" from allowing "my_module_2".
     if not any(f"{module}.".startswith(f"{allowed}.") for allowed in allowed_plugins()):
         raise CmmError(
@@ -98,13 +100,14 @@ def import_plugin(option: str, name: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     except (Exception, SystemExit) as error:
         raise CmmError(
-            f"{option} {name!r} cannot be imported: {error}; its folder must be on PYTHONPATH"
+            f"{option} {name!r} cannot be imported: {error}; the folder of the module must be on "
+            "PYTHONPATH"
         ) from error
 
 
 @dataclass(frozen=True)
 class PluginFunction:
-    """Function of a plugin. An exception in it becomes one line with file and line number.
+    """Function of a plugin. Its exceptions are reported in one line with file and line number.
 
     ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged,
     and any other exception becomes an ``error_class``. ``check`` is called with the part's name,
@@ -135,15 +138,17 @@ class PluginFunction:
 
 
 def require_detector(name: str) -> str:
-    """Return the name if it is a built-in detector or ``module:name``; else raise
-    UnknownOptionError.
+    """Return the name of a detector.
+
+    Raises UnknownOptionError unless it is built in or has the form ``module:name``.
     """
     return _required("detector", name, DETECTORS)
 
 
 def require_renderer(name: str) -> str:
-    """Return the name if it is a built-in renderer, "auto" or ``module:name``; else raise
-    UnknownOptionError.
+    """Return the name of a renderer.
+
+    Raises UnknownOptionError unless it is built in, "auto", or has the form ``module:name``.
     """
     return _required("renderer", name, {AUTO: "", **RENDERERS})
 
@@ -155,7 +160,7 @@ def find(
     kind: type[K],
     check: Callable[..., None],
 ) -> K:
-    """Return the Detector or Renderer that a built-in name or ``module:name`` names.
+    """Return the Detector or Renderer with a built-in name or a name ``module:name``.
 
     ``kind`` is the class Detector or Renderer. A user's own part can be an instance of ``kind``, a
     function, or a class whose instances are called like a function. Such a class is created without

@@ -1,4 +1,6 @@
-"""Random faults of stereo images. A measurement must still be right, or refuse the images.
+"""Random faults of stereo images.
+
+A measurement of images with a fault must be right, or must count as lost.
 
     faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
@@ -6,9 +8,9 @@
     images = cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, rng)
     cmmsim.Tracker(sensor.estimator).measure(images)
 
-Faults are laid over grey values, so they can be laid over images from any source. The kinds
-"obstacles" and "several" also contain bodies, which have to be drawn with the scene. Register these
-bodies once by ``sensor.add_bodies(fault_bodies())``, then call
+A fault changes the grey values of finished images, so the images can come from any source. The
+kinds "obstacles" and "several" also contain bodies, which have to be drawn with the scene. Register
+these bodies once with ``sensor.add_bodies(fault_bodies())``, then call
 ``sensor.look(pose, obstacles=fault.obstacles)``.
 """
 
@@ -31,7 +33,8 @@ from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
 # With probability one half, a fault changes at most this number of stickers.
 FEW = 4
-# For each kind, the method of FaultGenerator with the name _<kind> returns marks or a whole fault.
+# Kinds of faults. The method FaultGenerator._<kind> draws a fault of a kind, and returns marks or a
+# whole fault.
 KINDS = (
     *(
         "hidden",
@@ -106,12 +109,12 @@ class FaultGenerator:
         one_camera_dark     one black image
         one_camera_covered  one image of a single grey level
         false_discs         discs that look like stickers, each in one image only
-        false_points        discs at consistent places in both images
+        false_points        discs in both images that look like stickers at wrong places
         glint               bright light with a tail, on stickers or beside them
         merging             discs that overlap stickers, touch them or leave a small gap
         swapped             left and right image exchanged
         black, saturated    both images black or saturated
-        several             two or three of the faults that leave some stickers to measure
+        several             two or three faults of the kinds that leave stickers to measure
         ==================  ===============================================================
         """
         return KINDS
@@ -162,7 +165,7 @@ class FaultGenerator:
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
-        """Choose at least one random sticker and at most ``most``, by default all.
+        """Choose from 1 to ``most`` random stickers. The default of ``most`` is all stickers.
 
         With probability one half, at most FEW stickers are chosen.
         """
@@ -175,15 +178,15 @@ class FaultGenerator:
         sides = _one_or_both(rng)
         for k in self._some(rng):
             for side in sides:
-                # The largest singular value of the shape: the plate covers the ellipse at any
-                # angle.
+                # The 2-norm of the shape is the ellipse's largest half axis, so the plate covers
+                # the ellipse at any angle.
                 half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)
                 yield PlateMark(
                     side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE
                 )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Hide a part of each sticker behind a straight edge; the hidden part is often small."""
+        """Hide a part of each sticker behind a straight edge. The hidden part is often small."""
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
@@ -232,7 +235,7 @@ class FaultGenerator:
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Lay discs at places in space near stickers; they cover what the images show there."""
+        """Lay discs at places in space near stickers. The discs hide what is behind them."""
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)

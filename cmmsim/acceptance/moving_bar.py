@@ -52,10 +52,10 @@ TURN = np.deg2rad(8.0)
 TURN_CYCLES = np.array([1.0, 1.5, 0.5])
 # Angle of the bar to the image plane in the third orientation.
 TOWARDS_DEPTH = np.deg2rad(35.0)
-# s: step of the difference quotient of a path.
+# Time step of the difference quotient of a path, s.
 STEP = 1e-4
 SPEED_SAMPLES = 100
-# Number of the stream of noise of the first run.
+# Number that selects the random noise of the first run. The next runs have the next numbers.
 STREAM = 101
 # Number of exposures of the bar at rest at the start of each run.
 STANDING_FRAMES = 15
@@ -258,8 +258,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
                 break
     if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(
-            f"{path.name}: the bar is measured in no frame at rest, or in no frame in motion: "
-            f"{reason}"
+            f"{path.name}: the bar was not measured at rest, or not in motion: {reason}"
         )
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
     given_up = reason if lost_in_a_row == MOST_LOST_FRAMES else ""

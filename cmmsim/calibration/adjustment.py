@@ -32,9 +32,8 @@ MOST_STEPS = 60
 SMALLEST_GAIN = 1e-11
 # N, scaled to a unit diagonal, counts as singular if its smallest eigenvalue is below this.
 SINGULAR = 1e-14
-# Number of unknowns of a pose, then the slices of the unknowns that all views have in common and of
-# the unknowns of one view's board.
-POSE = 6
+POSE = 6  # number of unknowns of a pose
+# Each view has the unknowns that are common to all views, then the pose of its own board.
 COMMON = slice(None, -POSE)
 BOARD = slice(-POSE, None)
 
@@ -43,7 +42,7 @@ def free_directions(distortion: str, fix_aspect: bool) -> Array:
     """Return the matrix (9, k) that maps the k free intrinsics of a camera to all nine.
 
     ``distortion`` is the key of DISTORTIONS that names the free distortion terms. ``fix_aspect``
-    sets fx = fy. Raises UnknownOptionError for any other key.
+    sets fx = fy. Raises UnknownOptionError for an unknown key.
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
@@ -205,11 +204,13 @@ def adjust(
     state, steps = _minimise(build, start, free)
     normal = build(state)
     size = normal.rhs.shape[1] - POSE
-    freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
+    observations = sum(2 * len(s.view) for s in sightings)
+    unknowns = size + POSE * len(state.left_from_boards)
+    freedom = observations - unknowns
     if freedom < 1:
         raise CalibrationError(
-            f"too few points: {freedom + size} more observations than board poses, more than "
-            f"{size} needed"
+            f"too few points: their {observations} pixel coordinates must be more than the "
+            f"{unknowns} unknowns"
         )
     information, scores = normal.reduced()
     reduced = information.sum(axis=0)
@@ -240,7 +241,7 @@ def adjust(
 def _minimise(
     build: Callable[[RigState], _Normal], state: RigState, free: Array
 ) -> tuple[RigState, int]:
-    """Minimise by Levenberg and Marquardt; return the state of least cost and the steps taken."""
+    """Return the state of least cost by Levenberg and Marquardt's method, and the steps taken."""
     damping = 1e-4
     normal = build(state)
     k = free.shape[1]

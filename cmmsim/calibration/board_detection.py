@@ -1,11 +1,11 @@
 """Detection of a board in a picture: the visible points and their pixels.
 
-OpenCV finds the corners of squares, see square_detection. Dots are found directly if one threshold
-separates all
-dots from the background, and the dots lie on the perspective image of a grid. The four sharpest
-corners of the dots' convex hull are then the corners of the board, and a homography identifies the
-other dots. OpenCV finds the dots in any other picture. It tries two dozen thresholds and supports
-asymmetric grids, but is six times as slow.
+Corners of squares are found by OpenCV, see square_detection. A first search for dots uses a
+single threshold. It succeeds if the threshold separates all dots from the background, and if the
+dots lie on the perspective image of a grid. The four sharpest corners of the dots' convex hull are
+then the corners of the board, and a homography identifies the other dots. If this search fails,
+OpenCV searches for the dots. It tries two dozen thresholds and supports asymmetric grids, but is
+six times as slow.
 
 A fit of a bright ellipse to each dot refines its centre. The result is the centre of the dot's
 ellipse in the image, which differs from the image of the dot's centre (see
@@ -30,20 +30,20 @@ from cmmsim.detection.tags import find_tags
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-# Fraction of the board's points that must be measured, and number of a ChArUco board, which may be
-# partly outside of the picture.
+# Smallest fraction of a board's points that must be measured.
 FEWEST_MEASURED = 0.7
+# Smallest number of measured points of a ChArUco board, which may lie partly outside the picture.
 FEWEST_CHARUCO = 6
-# Largest distance of a point from its place in the plane's perspective image, over the distance
-# between neighbouring points.
+# Largest distance of a measured point from the place that the homography of the board predicts. The
+# unit is the distance between neighbouring points.
 LARGEST_POINT_GAP = 0.25
 # Largest relative difference between the measured and the given radius of the dots. A larger one
 # would make the correction of the dots' centres wrong by more than 20 %.
 LARGEST_RADIUS_GAP = 0.1
 
 FIT_ITERATIONS = 5
-# Radius of the fitted surroundings of a dot, and radius from which on pixels belong to the ground,
-# both in dot radii.
+# Radius of the part of the image that is fitted around a dot, in dot radii. Its pixels beyond
+# GROUND_FROM dot radii belong to the ground.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
 # Standard deviations of blur that are tried, and the number of dots on which they are tried.
@@ -59,7 +59,7 @@ CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
 EXTREME_PERCENTILES = (2.0, 98.0)
 # The noise of a photograph is unknown, and edges are blurred. All grey values therefore have equal
-# weight, and the limit rejects only shapes that are no ellipse (residuals of 25 grey values rms).
+# weight, and the limit rejects only shapes that are not ellipses (residuals of 25 grey values rms).
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
@@ -69,8 +69,8 @@ SMALLEST_AREA_PX = 20.0
 LARGEST_AREA = 0.01
 # OpenCV first searches an image reduced to at most this size, which is faster and has less noise.
 FIND_SIDE_PX = 1600
-# Largest distance of a dot from the grid that the four corners define, over the distance between
-# neighbours.
+# Largest distance of a dot from the grid that the four corners define. The unit is the distance
+# between neighbouring dots.
 LARGEST_GRID_GAP = 0.3
 
 
@@ -122,9 +122,10 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
 
 
 def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
-    """Return the view, with reversed rows if its order is mirrored, or the reason for rejecting it.
+    """Return the view with its points in the board's order, or the reason why it is rejected.
 
-    A camera sees only the front of a board, so a mirrored order is wrong.
+    A camera sees only the front of a board, so a mirrored order is wrong. It is corrected by
+    reversing each row, except for asymmetric dots, which are rejected.
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
@@ -145,7 +146,10 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     )
     gap = np.linalg.norm(expected - view.pixels, axis=1).max()
     if gap > LARGEST_POINT_GAP * step:
-        return f"points leave the plane by up to {gap:.1f} px: not in the board's order"
+        return (
+            f"points are up to {gap:.1f} px from the perspective image of the board, so their "
+            "order is wrong"
+        )
     return view
 
 
@@ -248,7 +252,10 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
 def _without_neighbours(
     windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float
 ) -> Array:
-    """Return windows (n, h, h) with the dot's ground at all pixels beyond ``reach`` dot radii."""
+    """Return windows (n, h, h) with only the dot's ground beyond ``reach`` dot radii.
+
+    The pixels there are set to the grey value of the ground.
+    """
     # Imported late, because importing numba takes time.
     from cmmsim.detection.start_kernels import isolate_dots
 
@@ -258,12 +265,13 @@ def _without_neighbours(
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Return the median radius of bright dots, over half the distance to a neighbour.
+    """Return the median radius of bright dots, in units of half the distance to a neighbour.
 
-    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. From
-    grey values, the dot covers the fraction (mean of the cell - ground) / (dot - ground) of the
-    cell. The radius is overestimated if a dot is so blurred that its middle is not uniform: by a
-    quarter at 2.5 px radius and 1 px of blur.
+    Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. The dot
+    covers the fraction (mean - ground) / (dot - ground) of its cell. These are the mean grey value
+    of the cell, and the grey values of the ground and of the dot. The radius is
+    overestimated if a dot is so blurred that its middle is not uniform: by a quarter at 2.5 px
+    radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
@@ -318,7 +326,7 @@ def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
 
 
 def _bright_spots(bright: NDArray[np.uint8]) -> Array:
-    """Return the centroids (n, 2) px of bright spots that have a plausible area of a dot."""
+    """Return the centroids (n, 2) px of bright spots with an area that is plausible for a dot."""
     _, shown = cv2.threshold(bright, 0.0, 1.0, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
     centroids = []
     for contour in cv2.findContours(shown, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:

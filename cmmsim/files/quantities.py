@@ -25,7 +25,7 @@ class Bounds:
     zero: bool = False
 
     def check(self, value: float | None) -> float | None:
-        """Return the value. Raises ValueError, with the range, if it lies outside."""
+        """Return the value. Raises ValueError, which states the range, for a value outside."""
         if value is None or self.least <= value <= self.most or (self.zero and value == 0.0):
             return value
         also = "0 or " if self.zero else ""
@@ -36,7 +36,7 @@ class Bounds:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         inner = handler(source)
-        # Strict: texts and truth values are not accepted as numbers.
+        # In strict mode, pydantic does not accept texts and truth values as numbers.
         if inner["type"] == "float":
             inner = {**inner, "strict": True, "allow_inf_nan": False}
         return core_schema.no_info_after_validator_function(self.check, inner)
@@ -55,7 +55,9 @@ class Bounds:
 
 
 Length = Annotated[float, Bounds(1e-6, 1e3, "m")]
+"""Length that cannot be zero."""
 Distance = Annotated[float, Bounds(1e-9, 1e3, "m", zero=True)]
+"""Length that can be zero."""
 Place = Annotated[float, Bounds(-1e3, 1e3, "m")]
 """Coordinate of a point."""
 Angle = Annotated[float, Bounds(-1e2, 1e2, "rad")]

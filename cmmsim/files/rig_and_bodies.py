@@ -120,8 +120,8 @@ def _right_from_left(section: RightFromLeft) -> Array:
 class MarkedBody:
     """Body with planes and nominal sticker places, in body axes.
 
-    normals      (3, 3), unit normals n of the planes A, B, C, which fulfil n . p = d
-    offsets      (3,), offsets d of the planes, m
+    normals      (3, 3), unit normals n of the planes A, B, C
+    offsets      (3,), offsets d of the planes n . p = d, m
     sticker_ids  (n,), names of the stickers, such as "A1"
     plane_index  (n,), plane of each sticker, 0 to 2
     nominal      (n, 3), nominal places, m
@@ -147,7 +147,7 @@ class MarkedBody:
 
     @property
     def sticker_normals(self) -> Array:
-        """Outward normal (n,3) at each sticker."""
+        """Outward normals (n, 3) at the stickers."""
         return self.normals[self.plane_index]
 
     def selected(self, stickers: NDArray[np.int_]) -> "MarkedBody":

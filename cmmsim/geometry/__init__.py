@@ -1,4 +1,4 @@
-"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc.
+"""Poses, cameras, lens distortion, triangulation, registration, frames from planes, and discs.
 
 The modules of this package use neither files nor images.
 """

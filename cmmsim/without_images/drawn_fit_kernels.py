@@ -104,7 +104,10 @@ def lit_covariances(
     settings: FitSettings,
     covariances: Array,
 ) -> None:
-    """Fill the covariances as ``fit_covariances`` does, if light that rises is fitted as well."""
+    """Fill the covariances of fits that also estimate how the light rises across a sticker.
+
+    The arguments are those of ``fit_covariances``.
+    """
     mask = np.empty((size, size), np.bool_)
     window = np.empty((size, size))
     shares = np.empty((size, size))
@@ -212,7 +215,7 @@ class Ellipses(NamedTuple):
     shapes     (2, m, 2, 2), px
     smears     (2, m, 2), movements during the exposure, px
     seen       (2, m), True for wholly visible ellipses
-    noise      (2, m, 6), unit normal numbers: two for the centre, three for the shape, and one
+    noise      (2, m, 6), standard normal numbers: two for the centre, three for the shape, and one
                for the limit of thin ellipses
     contrasts  (2, m), grey values
     grounds    (2, m), grey values
@@ -276,9 +279,10 @@ class DetectionLimits(NamedTuple):
 def nearest_stickers(
     seen: Array, centres: Array, corners: Array, side_px: int, windows: Windows
 ) -> None:
-    """Fill the fitted parts of windows of ``side_px`` px with first pixels ``corners`` (2, k, 2).
+    """Choose the fitted part of each window, and write it to ``windows``.
 
-    A part is centred at the sticker nearest to the middle of its window, and limited to the window.
+    The windows have ``side_px`` px and the first pixels ``corners`` (2, k, 2). A part is centred at
+    the sticker nearest to the middle of its window, but it does not extend beyond the window.
     """
     at = 0
     slack = side_px - windows.size
@@ -313,7 +317,7 @@ def fit_stickers(
     settings: FitSettings,
     fits: Fits,
 ) -> None:
-    """Fill the random results of the fits in windows.
+    """Draw random results of the fits in windows, and write them to ``fits``.
 
     Results that are not good have unit covariances and meaningless values.
     """

@@ -186,7 +186,7 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
     assert "needed" in found.given_up
     with pytest.raises(
         AcceptanceError,
-        match=r"hidden: the bar is measured in no frame at rest, or in no frame in motion",
+        match=r"hidden: the bar was not measured at rest, or not in motion",
     ):
         bar_run(sensor, hidden, np.arange(-2, 0) / 60.0)
 
