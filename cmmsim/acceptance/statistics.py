@@ -40,7 +40,7 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
 
     Neighbouring values are not independent, so they are resampled in blocks of ``block`` values.
     scipy.stats.bootstrap cannot do this, because it resamples single values only. Raises ShapeError
-    without values, and for values that are not finite.
+    if there are no values, or if a value is not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))

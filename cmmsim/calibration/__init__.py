@@ -1,7 +1,8 @@
 """Calibration of the stereo rig from pictures of a board, rendered or photographed.
 
-The steps are a board description, pairs of image files, the board in each image, OpenCV's
-calibration as a start, and one joint adjustment of both cameras with its covariance.
+The calibration reads the description of the board, pairs the image files, and finds the board in
+each image. OpenCV's calibration gives start values. One joint adjustment of both cameras gives the
+rig and its covariance.
 """
 
 from cmmsim.calibration.board import Board, read_board

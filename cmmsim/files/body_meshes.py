@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     import trimesh
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-# m: length of the largest mesh. A larger one probably has a wrong unit.
+# Largest length of a mesh, m. A larger one probably has a wrong unit.
 LARGEST_SIZE = 10.0
 # Largest ratio of a mesh's length to the largest distance between its stickers.
 LARGEST_SIZE_RATIO = 100.0
 # Smallest ratio of a mesh's length to the largest distance between its stickers.
 SMALLEST_SIZE_RATIO = 0.3
-# m: depth below the surface up to which the body does not hide the dark ring of a sticker.
+# Largest depth of a sticker below the surface, m. Up to this depth, the body does not hide the
+# sticker's dark ring.
 LARGEST_DEPTH = 0.0002
 REMEDY = "; {}.drop = true moves the planes of stickers onto the surface"
 # Fraction of a triangle by which a line may miss it, so that no line passes between two triangles.
@@ -75,10 +76,11 @@ def closed_mesh(path: Path, scale: float, where: str) -> trimesh.Trimesh:
 
 
 def with_meshes(file: SensorFile, source: str) -> SensorFile:
-    """Return the file after checks of its meshes, with dropped planes on their surfaces.
+    """Check the meshes of a file. Return the file with the planes moved onto them where asked.
 
-    Raises SensorFileError for a mesh that cannot be read, is not closed or has a wrong unit, and
-    for a sticker that does not lie on it.
+    The planes of a body are moved if its entry ``drop`` is True. Raises SensorFileError for a mesh
+    that cannot be read, is not closed or has a wrong unit, and for a sticker that does not lie on
+    it.
     """
     changes = {}
     for name, section in (("platform", file.platform), ("base", file.base)):
@@ -157,8 +159,8 @@ def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
         met = heights[(body.plane_index == k) & np.isfinite(heights)]
         if not len(met):
             raise SensorFileError(
-                f"{name}.mesh {section.mesh}: no sticker of plane {plane_name} can be dropped, the "
-                "surface lies neither below nor above them"
+                f"{name}.mesh {section.mesh}: no sticker of plane {plane_name} can be dropped, "
+                "because the surface lies neither below nor above them"
             )
         point = tuple((np.array(plane.point) + met.max() * unit(plane.normal)).tolist())
         planes[plane_name] = plane.model_copy(update={"point": point})

@@ -5,8 +5,9 @@ is, up to the limit,
 
     torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
-At the limit, li z - lx theta does not grow further: integration stops until the error changes its
-sign (conditional integration). The laws differ in the gains that they use, in c, and in lx:
+`motion_kernels.drive` computes the torque. At the limit, li z - lx theta does not grow further:
+integration stops until the error changes its sign (conditional integration). The laws differ in the
+gains that they use, in c, and in lx:
 
     pid            c = 1, lx = 0                  law of the paper (eq. 31)
     pd             c = 1, lx = 0                  no li

@@ -1,8 +1,8 @@
 """Execution of a run: the kernels process its frames in the memory that is set up here.
 
-The same code runs compiled and as plain Python, with which tests compare it. If a sensor or a
-controller is a Python function, the kernels process one frame at a time. The error of a run that
-ends early states the reason that the kernels found.
+The kernels run compiled. Tests also run the same code as plain Python, to compare both. If a sensor
+or a controller is a Python function, the kernels process one frame at a time. The error of a run
+that ends early states the reason that the kernels found.
 """
 
 from dataclasses import replace
@@ -51,19 +51,23 @@ FAILURES = {
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, and the servo has no command; there",
 }
+"""Reasons why a run ended early, by status.
+
+`failure` adds the leg to the two reasons that concern the reach.
+"""
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     """Do one run and return its record. Raises LoopFailure."""
     frames = problem.frames
-    # commands of a controller are written here frame by frame; the kernels read them like given
-    # commands
+    # A controller's commands are written to this array frame by frame. The kernels read them in the
+    # same way as given commands.
     commands = problem.commands
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
     memory, record, plan, *_kept = _set_up(problem, commands, compiled)
     run_kernel = chosen(run_frames, compiled)
-    # arrays instead of records, because passing a record costs Numba 8 us at every frame
+    # The kernel gets arrays instead of records, because passing a record takes 8 us in each call.
     arrays = [part if part.ndim else part.base for part in memory]
     measured = np.full((frames, 6), np.nan)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
@@ -262,7 +266,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
 def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarray:
     """Derivatives (m, p) of the servo integral at rest.
 
-    They follow from the derivatives (n, p) of the command, which the integral determines.
+    The integral determines the command. Its derivatives follow from those of the command (n, p).
     """
     ki = problem.settings.servo.ki
     size = problem.sizes.coordinates
@@ -311,7 +315,8 @@ def _fill(
         task.stiffness = settings.elasticity.stiffness
         task.damping = settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
-    task.rigid = rigid  # with elastic joints, without the inertia of the motors
+    # If the joints are elastic, the inertia of the motors is not part of these parameters.
+    task.rigid = rigid
     # indices of the parameters of rigid bodies that have a column of derivatives
     columns = problem.columns
     rigid_columns = len(problem.columns) - 2 * sizes.joints - sizes.gains
@@ -336,11 +341,13 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # a feedforward commands the joint coordinates, and the servo has added nothing yet
+    # `last_command` is the servo's part of the command. A feedforward is the whole command at the
+    # start, so the servo's part is zero.
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
-    # the last inputs are constant: parameters and geometric numbers, for all stages (columns) alike
+    # The last inputs of a function are constants: parameters and geometric numbers. If its inputs
+    # have a column for each stage, all columns have the same constants.
     for inputs, function, constants in (
         (now.known.inputs, functions["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
@@ -373,7 +380,7 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
 
 
 def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
-    """Error of a run that ended early. If a pose is out of reach, it names the leg."""
+    """Error of a run that ended early. It names the leg if a pose is out of reach."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         last = now.known.inputs[: problem.sizes.coordinates]

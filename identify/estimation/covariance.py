@@ -7,8 +7,9 @@ that closes its own loop cannot follow the second effect. Its residuals are colo
 makes the response nonlinear. Therefore the experiment is repeated on the identified model with
 random noise. Each repetition gives residuals r, and the scores J^T r have the same covariance as
 those of the real record. With W the information of data and prior, the covariance of the estimate
-is W^-1 (cov(J^T r) + prior information) W^-1. The part with the information of the initial guess is
-the effect of errors of the guess. These errors are the same in every record.
+is W^-1 (cov(J^T r) + prior information) W^-1. The prior information contains that of the initial
+guess. Its part of the covariance is the effect of errors of the guess, which are the same in every
+record.
 
 A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. If a
 model misses the record by more than noise explains, the effect of its error on the scores is added
@@ -21,10 +22,11 @@ correlation with the parameters. The search estimates the common errors of each 
 If records share the same errors, the covariance of the estimate takes this into account.
 
 A known load has errors, too. Under the load L the model has the parameters p + L. An error dL moves
-the residuals of its records by J dL, with J their Jacobian with respect to the parameters, and the
-scores by J^T J dL. With S the covariance of the load, the covariance of the scores grows by H S H,
-where H is the sum of J^T J over all records made under this load. For example, if the load fixes
-the scale and is one percent heavier than stated, all parameters are about one percent too small.
+the residuals of the records under this load by J dL, and the scores by J^T J dL. J is the Jacobian
+of the residuals with respect to the parameters. With S the covariance of the load, the covariance
+of the scores grows by H S H, where H is the sum of J^T J over these records. For example, if the
+load fixes the scale and is one percent heavier than stated, all parameters are about one percent
+too small.
 """
 
 from collections.abc import Sequence
@@ -55,7 +57,7 @@ NOISE, MODEL, LOAD, GUESS, ANCHOR = "noise", "model", "load", "guess", "anchor"
 a known load, errors of the initial guess, and error of the scale anchor.
 """
 CORRELATED = "correlated"
-"""Part due to covariances between kinds of common errors that are correlated beforehand."""
+"""Part due to prior covariances between kinds of common errors."""
 ROUNDING = 1e-9
 """Largest difference of variances that counts as rounding, as a share of the variance."""
 
@@ -124,9 +126,9 @@ class Uncertainty:
             return self.misfit.warnings()
         return (
             *self.misfit.warnings(),
-            f"of {DRAWS} simulated repetitions of the experiment on the identified model "
-            f"{self.unstable} were unstable, and are left out of the intervals: the loop is close "
-            "to instability",
+            f"{self.unstable} of {DRAWS} simulated repetitions of the experiment on the identified "
+            "model were unstable, and are left out of the intervals: the loop is close to "
+            "instability",
         )
 
 
@@ -232,9 +234,9 @@ def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:
 def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array]) -> Array:
     """Return the covariance (q, q) of the scores T^T J^T r due to errors of the loads.
 
-    It is of first order. information: T^T J^T J (q, p) of each run's residuals. Runs that state the
-    same load with the same standard deviations share its error. Errors of different loads are
-    independent.
+    It is of first order. information: T^T J^T J (q, p) of each run, with the Jacobian J of its
+    residuals, and the units T of the scores (see `_units`). Runs that state the same load with the
+    same standard deviations share its error. Errors of different loads are independent.
     """
     shown: dict[tuple[float, ...], Array] = {}
     for run, one in zip(runs, information, strict=True):
@@ -251,8 +253,8 @@ def _units(rows: list[Array]) -> Array:
     """Return a matrix T (p, p) with T^T W T = 1, and so W^-1 = T T^T.
 
     W is the information of all rows (n, p) together. T is computed from the rows by QR, because W
-    has the square of their condition number. If a record contradicts the model, W cannot be
-    inverted accurately.
+    has the square of their condition number. For a record that contradicts the model, W could
+    not be inverted accurately.
     """
     triangle = triangular_factor(np.vstack(rows))
     return np.asarray(solve_triangular(triangle, np.eye(triangle.shape[1])))
@@ -271,11 +273,11 @@ def _noise(
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, Misfit, int]:
-    """Return the covariance (q, q) of the scores due to noise, the misfit, and the failures.
+    """Return the covariance (q, q) of the scores due to noise, and the misfit.
 
-    found: linearisation of each run, with rows in the units of the scores. The failures are the
-    unstable repetitions. No experiment is repeated if the model's error makes most of the
-    residuals, or if the residuals are white.
+    The third result is the number of unstable repetitions. found: linearisation of each run, with
+    rows in the units of the scores. No experiment is repeated if the model's error causes most of
+    the residuals, or if the residuals are white.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))

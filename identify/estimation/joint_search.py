@@ -1,13 +1,14 @@
-"""Search for the parameters and for common errors with wide priors at once.
+"""Simultaneous search for the parameters and for common errors with wide priors.
 
-A start in motion or a clock of the commands moves the optimum of the parameters far. A search that
-eliminates such errors is right only near the errors about which the model was linearised. Here they
-are unknowns like the parameters: the search minimises
+Examples of such errors are the state at a start in motion, and the clock of the commands. They move
+the optimum of the parameters far away. A search that eliminates them is right only near the errors
+about which the model was linearised. Here they are unknowns like the parameters. The search
+minimises
 
     |r(p, z)|^2 + |z|^2 + |prior(p)|^2
 
-over the parameters p and the errors z in the models, in their prior standard deviations. The
-residuals r are whitened for all other errors. The optimum is that of a search which eliminates z.
+over the parameters p and the errors z, which are in units of their prior standard deviations. The
+residuals r are whitened for all other errors. A search that eliminates z has the same optimum.
 """
 
 from dataclasses import dataclass, replace
@@ -28,10 +29,10 @@ MOST = 30
 def with_likely_errors(
     problem: OutputErrorProblem, start: Array
 ) -> tuple[OutputErrorProblem, Array]:
-    """Return a problem about its most likely common errors, and the parameters (p,) of its optimum.
+    """Return the problem with its most likely common errors, and the optimal parameters (p,).
 
-    The problem is one returned by `with_common_errors` for the parameters (p,) at the start. Raises
-    LoopFailure if the model is unstable there.
+    problem: result of `with_common_errors` at the parameters start (p,). Raises LoopFailure if the
+    model is unstable with them.
     """
     bounds = problem.bounds
     joint = JointProblem(problem, tuple(JointRun.of(run, start) for run in problem.runs))
@@ -44,7 +45,8 @@ def with_likely_errors(
         np.concatenate([bounds.lower, least]),
         np.concatenate([bounds.spread(coordinates, problem.guess.std), np.ones(len(errors))]),
         replace(problem.stop, max_iterations=MOST),
-        # Where joints stick near the start, many steps fail, and modes cost more than a run.
+        # If joints stick near the start, many steps fail. Linearising them ahead would be wasted,
+        # because modes take more time than a run.
         ahead=False,
     )
     parameters, runs = joint.runs_at(found.parameters)
@@ -56,9 +58,9 @@ def with_likely_errors(
 class JointRun:
     """Model of one run whose errors in the loop and of bodies are unknowns.
 
-    run: model at the start of the search, which is not whitened for common errors. start (p,) and
-    modes (m, k): parameters there, and the modes of the unknown errors. others: whitener for all
-    other errors, with their modes there.
+    run: model at the start of the search, without whitening for common errors. start (p,):
+    parameters at the start. modes (m, k): modes of the unknown errors at the start. others:
+    whitener for all other errors, with their modes at the start, or None without other errors.
     """
 
     run: LoopModel
@@ -68,11 +70,11 @@ class JointRun:
 
     @classmethod
     def of(cls, run: LoopModel, start: Array) -> "JointRun":
-        """Return the run of a problem `with_common_errors` at parameters (p,)."""
+        """Return the joint run of a model that was whitened for common errors at start (p,)."""
         modes = run.whitened_modes.reshape(-1, run.whitened_modes.shape[2])
         rest = np.delete(modes, run.contained, axis=1)
         alone = replace(run, common=replace(run.common, geometry=None), marginal=None)
-        # Whitening changes no run.
+        # Runs that are already simulated remain valid, because whitening does not change them.
         alone.known_runs.update(run.known_runs)
         others = Marginal.of(rest) if rest.size else None
         return cls(alone, start, modes[:, run.contained], others)
@@ -103,7 +105,7 @@ class JointProblem:
     parts: tuple[JointRun, ...]
 
     def runs_at(self, unknowns: Array) -> tuple[Array, list[LoopModel]]:
-        """Return the parameters (p,) of unknowns, and the runs with their errors."""
+        """Return the parameters (p,), and the runs with the errors, that the unknowns contain."""
         bounds = self.problem.bounds
         coordinates, errors = np.split(unknowns, [len(bounds.lower)])
         runs = []

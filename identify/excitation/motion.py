@@ -1,14 +1,14 @@
 """Unknowns of a smooth-start trajectory (eq. 37), with its motion and regressors in CasADi.
 
-The conditions of a smooth start leave 2 (n - 1) free directions for each coordinate: n - 1
-combinations of the sines with sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. For
-the m coordinates q, with a dimensionless matrix Z of shape (m, 2 (n - 1)) and the diagonal matrix D
-of their amplitudes,
+A `FourierTrajectory` of n harmonics has coefficients s_l of the sines and c_l of the cosines for
+each coordinate. A smooth start requires sum_l s_l = 0 and sum_l l c_l = 0. Each condition leaves
+n - 1 free directions, together 2 (n - 1) for each coordinate. The m coordinates are
 
     q(t) = home + D Z B_0(t)^T,    q_dot(t) = D Z B_1(t)^T,    q_ddot(t) = D Z B_2(t)^T.
 
-Trajectories with a smooth start at home thus correspond one-to-one to vectors z of 2 m (n - 1)
-numbers.
+D is the diagonal matrix of their amplitudes. Z is a dimensionless matrix (m, 2 (n - 1)). The bases
+B_0, B_1 and B_2 are those of `Unknowns.basis`. The unknowns z are the 2 m (n - 1) entries of Z, row
+by row. They correspond one-to-one to the trajectories with a smooth start at home.
 """
 
 from dataclasses import dataclass
@@ -112,7 +112,7 @@ def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
 
 
 SAMPLES_PER_HARMONIC = 20
-"""Number of sampled poses of a criterion per period of the highest harmonic."""
+"""Number of poses per period of the highest harmonic at which a criterion is evaluated."""
 
 
 def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> Array:

@@ -1,4 +1,4 @@
-"""Control laws with a model of the robot, prepared to follow a motion of a scenario's plant."""
+"""Preparation of a model-based control law, by which a scenario's plant follows a motion."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -53,7 +53,7 @@ class LoopSensor:
     measure : callable
         Function ``measure(frame, t, pose, rate)`` like `SensorInLoop.measure`.
     noise : callable
-        Covariance (6, 6) of the noise of a frame's pose.
+        Function of a frame's number that returns the covariance (6, 6) of the noise of its pose.
     common : ndarray, shape (6, 6)
         Covariance of the error that all poses have in common.
     """
@@ -65,7 +65,7 @@ class LoopSensor:
 
 @dataclass(frozen=True)
 class KnownModel:
-    """Knowledge of a control law.
+    """Robot as a control law knows it.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class KnownModel:
     drive : DriveName, optional
         Law of the drives. The default is the law in the scenario's model.
     doubt : float
-        Relative standard uncertainty of the torques, see `inverse_dynamics.Model`.
+        Expected rate at which errors of torques change, relative to the torque at rest, 1/s.
     """
 
     parameters: Array
@@ -104,7 +104,7 @@ def prepared(
     law : str
         Name of the law, or ``module:function``.
     known : KnownModel
-        Model of the law.
+        Robot as the law knows it.
     motion : NamedMotion
         Motion to follow.
     seen : LoopSensor
@@ -118,7 +118,8 @@ def prepared(
         If the law is unknown, if it needs torque commands but the drives do not accept them, or if
         the actuators cannot hold the platform.
     TrajectoryError
-        If the motion leaves reach or travel. The message names time and leg.
+        If the motion leaves the robot's reach or a joint's travel. The message names the time and
+        the leg.
     SimulationError
         If the gains are unstable with this model, or a user's own law fails.
     """

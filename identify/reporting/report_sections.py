@@ -241,7 +241,7 @@ def _index_text(data: RunData) -> tuple[str, ...]:
 
 
 def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
-    """Return the diagnosis of a result and its remedies as sentences. Empty without a diagnosis."""
+    """Return the diagnosis of a result and its remedies as sentences, or an empty tuple."""
     entry = result.get("diagnosis")
     if entry is None:
         return ()
@@ -249,7 +249,7 @@ def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
     introduction = (
         "The residuals of the model were examined for their cause. Each possible cause is judged "
         "by the share of the misfit that it explains in addition to the parameters. Causes that "
-        "are not explained by chance are fitted, one after the other."
+        "explain more than chance are fitted, one after the other."
     )
     return (
         introduction,
@@ -259,8 +259,9 @@ def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _diagnosis_table(result: dict[str, Any]) -> Table:
-    """Return the candidates of a diagnosis in their order, without rows if there is no
-    diagnosis.
+    """Return the candidates of a diagnosis in their order.
+
+    The table has no rows if there is no diagnosis.
     """
     entry = result.get("diagnosis") or {"candidates": []}
     rows = tuple(
@@ -278,7 +279,8 @@ def _diagnosis_table(result: dict[str, Any]) -> Table:
         "Share of the misfit that each cause alone explains",
         ("cause or group", "explains", "score statistic", "free numbers", "size ± std", "unit"),
         rows,
-        "To first order, before any cause is fitted. Standard deviations are due to noise.",
+        "The values are of first order, before any cause is fitted. Standard deviations are due to "
+        "noise.",
         folded=True,
     )
 

@@ -11,7 +11,7 @@ from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
 MISSED = "MISSED"
-"""Word for a finding beyond its limit, which the style of the page marks."""
+"""Word in the table for a finding that fails. The style of the page highlights this word."""
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
@@ -63,26 +63,28 @@ def _pictures(logged: LoggedRun) -> dict[str, Picture]:
     return {
         "motion": Picture(
             lambda: figures.motion_figure(logged.time, logged.poses, logged.gaps, logged.jumps),
-            "Measured poses over time. Grey: no pose was measured. Vertical lines: poses that are "
-            "far beside their neighbours.",
+            "Measured poses over time. Grey: no pose was measured. Vertical lines: poses that do "
+            "not fit their neighbours.",
         ),
         "joints": Picture(
             lambda: figures.joint_figure(
                 time, joints, commands.time, commands.command, robot.layout.joint_unit
             ),
-            "Joint coordinates of the measured poses (line) and commands (dashed): a shift in time "
-            "is the lag of drives and clocks, a shift in height a zero or a frame.",
+            "Joint coordinates of the measured poses (line) and commands (dashed). A shift in time "
+            "is the lag of drives and clocks. A shift in height is due to a wrong zero of a joint "
+            "or a wrong frame of the poses.",
         ),
         "intervals": Picture(
             lambda: figures.interval_figure(telemetry.poses.time, commands.time),
-            "Time from each row to the row before.",
+            "Time between each row of the log and the row before.",
             as_image=True,
         ),
         "spectrum": Picture(
             lambda: figures.spectrum_figure(
                 spectrum.frequency, spectrum.power, spectrum.highest_hz, logged.noise
             ),
-            "Spectra of the poses. Dotted: the noise beside the neighbours. The vertical line is "
-            "the frequency below which 99 % of the power lies.",
+            "Spectra of the poses. Dotted: the level of the noise, from the differences between "
+            "each pose and its neighbours. The vertical line is the frequency below which 99 % of "
+            "the power lies.",
         ),
     }
