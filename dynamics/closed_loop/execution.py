@@ -51,10 +51,7 @@ FAILURES = {
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, and the servo has no command; there",
 }
-"""Reasons why a run ended early, by status.
-
-`failure` adds the leg to the two reasons that concern the reach.
-"""
+"""Reasons why a run ended early, by status. `failure` adds the leg that is out of reach."""
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
@@ -341,8 +338,7 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # `last_command` is the servo's part of the command. A feedforward is the whole command at the
-    # start, so the servo's part is zero.
+    # A feedforward is the whole command at the start, so the servo's part of it is zero.
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry

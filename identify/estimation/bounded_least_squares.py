@@ -17,6 +17,7 @@ from scipy.optimize import lsq_linear
 
 from dynamics import DynamicsError
 from identify.arrays import Array
+from identify.estimation.convergence import StopCriteria, converged, relative_change
 
 # Factors by which the radius of the trust region shrinks and grows.
 SHRINK = 0.25
@@ -52,18 +53,6 @@ class Problem(Protocol):
         is unstable.
         """
         ...
-
-
-@dataclass(frozen=True)
-class StopCriteria:
-    """Criteria of eq. 35 by which a search stops.
-
-    The tolerances tol1 and tol2 are relative changes of the cost and of the parameters.
-    """
-
-    cost_tolerance: float
-    parameter_tolerance: float
-    max_iterations: int
 
 
 @dataclass(frozen=True)
@@ -143,8 +132,8 @@ def minimise(
         if ratio > 0:
             # A step limited by the trust region is no evidence of convergence.
             if largest < 0.9 * before:
-                change = _relative_change(step, parameters, scale)
-                reason = _converged(cost, new_cost, change, criteria)
+                change = relative_change(step, parameters, scale)
+                reason = converged(cost, new_cost, change, criteria)
             if not reason and len(costs) >= criteria.max_iterations:
                 reason = f"stopped after max_iterations = {criteria.max_iterations}"
             parameters = trial
@@ -200,20 +189,3 @@ def _new_radius(radius: float, ratio: float, largest: float) -> float:
     if ratio > GOOD and largest > 0.9 * radius:
         return GROW * radius
     return radius
-
-
-def _relative_change(step: Array, parameters: Array, scale: Array) -> float:
-    """Return max |step_i / p_i| of eq. 35. For a parameter near zero, its scale replaces p_i."""
-    return float(np.max(np.abs(step) / np.maximum(np.abs(parameters), 1e-3 * scale)))
-
-
-def _converged(cost: float, new_cost: float, change: float, criteria: StopCriteria) -> str:
-    gain = (cost - new_cost) / cost
-    if gain <= criteria.cost_tolerance:
-        return f"cost changed by {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} (eq. 35)"
-    if change <= criteria.parameter_tolerance:
-        return (
-            f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} (eq. "
-            "35)"
-        )
-    return ""

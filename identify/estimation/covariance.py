@@ -1,6 +1,6 @@
 """Covariance of an output-error estimate, from all uncertainties of the experiment.
 
-`identify.estimation.bounds` computes the intervals from it.
+`identify.estimation.intervals` computes the intervals from it.
 
 Sensor noise acts twice: in the measured poses, and through the servo on the plant's motion. A model
 that closes its own loop cannot follow the second effect. Its residuals are coloured, and stick-slip

@@ -42,11 +42,11 @@ from identify.estimation.base_parameters import (
     structure,
 )
 from identify.estimation.bounded_least_squares import Solution
-from identify.estimation.bounds import BoundedEstimate, bounded_estimate, combined_std
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.full_bodies import full_body_warnings
+from identify.estimation.intervals import BoundedEstimate, bounded_estimate, combined_std
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import (
     StartingGuess,

@@ -2,7 +2,7 @@
 
 The sequence is the linear warm start, the command-driven output error, which has few local minima,
 and the closed-loop output error, which has narrow local minima by stick-slip. The last two
-end by the criteria of `bounded_least_squares`. In the first search, errors that all poses have in
+end by the criteria of `convergence`. In the first search, errors that all poses have in
 common are treated as noise, because far from the optimum they would hide the relevant residuals. If
 the model is unstable with both the warm start and the initial guess, multiple shooting finds a
 stable model.
@@ -17,10 +17,10 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.common_error_estimates import errors_in_models
-from identify.estimation.joint_search import with_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.search_in_coordinates import minimise_in_coordinates
+from identify.estimation.simultaneous_search import with_likely_errors
 from identify.estimation.warm_start import linear_warm_start
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress

@@ -22,7 +22,6 @@ from dynamics.closed_loop.drives import READS, cascade_gains
 from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.bounds import BoundedEstimate
 from identify.estimation.budget import Budget, parameter_budget
 from identify.estimation.common_error_estimates import CommonErrorEstimates
 from identify.estimation.conditioning import Conditioning
@@ -30,6 +29,7 @@ from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, GroupEstimates
+from identify.estimation.intervals import BoundedEstimate
 from identify.estimation.prior import gains_among
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.files.dataset import POSE

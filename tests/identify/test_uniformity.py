@@ -9,7 +9,8 @@ from scipy.stats import kstest, truncnorm
 
 from dynamics import load_robot
 from identify.errors import StudyError
-from identify.estimation.bounds import bounded_estimate, parameter_bounds
+from identify.estimation.bounds import parameter_bounds
+from identify.estimation.intervals import bounded_estimate
 from identify.estimation.prior import starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.record.from_telemetry import record_of

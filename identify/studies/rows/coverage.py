@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from identify.arrays import Array
-from identify.estimation.bounds import HALF_WIDTH
+from identify.estimation.intervals import HALF_WIDTH
 from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from identify.estimation.identification import asked_of, output_error_problem
-from identify.estimation.joint_search import JointProblem, JointRun
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.estimation.simultaneous_search import JointProblem, JointRun
 from tests.identify.record_forms import logged, record_from, scenario_of, true_parameters
 from tests.identify.synthetic import run_plant
 
 
-def test_the_linearisation_of_the_joint_search_is_the_slope_of_its_cost():
+def test_the_linearisation_of_the_simultaneous_search_is_the_slope_of_its_cost():
     """The record has an unknown start and clock, and unknown centres of mass."""
     stds = {"timing.clock_offset_std_s": 0.02, "timing.clock_drift_std": 1e-4}
     telemetry = logged(*run_plant(scenario_of(), 0, duration_s=2.2))

@@ -1,0 +1,122 @@
+"""95 % intervals of estimates within bounds.
+
+The covariance of an estimate is computed without bounds. Active bounds move all parameters away
+from the unheld estimate, which is the estimate without bounds. Linearised about the bounded
+estimate, the unheld estimate is
+
+    unheld = estimate - W^-1 g,
+
+with the information W and the part g of the cost's gradient that the active bounds balance. At a
+flat body, all of the gradient with respect to its ten numbers is balanced. The interval of the
+unheld estimate, truncated at the bounds, has the stated coverage. But it can be empty, or not
+contain the estimate. The returned interval is the union of the intervals of both estimates and the
+range between them, truncated at the smallest allowed value. It is never empty, contains the
+estimate, and has at least the stated coverage. The truncated interval of the bounded estimate alone
+does not: a sum of many quantities near their bounds is estimated too high by more than its standard
+deviation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtri
+
+from identify.arrays import Array
+from identify.estimation.bounds import ParameterBounds
+
+HALF_WIDTH = float(ndtri(0.975))
+"""Half the width of a 95 % interval, in standard deviations."""
+
+
+def combined_std(rows: Array, covariance: Array) -> Array:
+    """Return the standard deviations (n,) of the combinations rows (n, p) @ parameters.
+
+    covariance (p, p): covariance of the parameters.
+    """
+    return np.asarray(np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)))
+
+
+@dataclass(frozen=True)
+class BoundedEstimate:
+    """Estimate (p,) within bounds.
+
+    at_bound (p,): True for coordinates at their bounds. unheld (p,): estimate without bounds.
+    covariance (p, p): covariance of the unheld estimate.
+    """
+
+    estimate: Array
+    at_bound: NDArray[np.bool_]
+    unheld: Array
+    covariance: Array
+    bounds: ParameterBounds
+
+    def intervals(self, rows: Array) -> Array:
+        """Return the 95 % intervals (n, 2) of the quantities rows (n, p) @ parameters.
+
+        They are truncated at the smallest allowed values.
+        """
+        half = HALF_WIDTH * combined_std(rows, self.covariance)
+        # The interval covers the intervals of both estimates, see the module docstring.
+        centres = np.stack([rows @ self.estimate, rows @ self.unheld])
+        low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
+        return np.stack([low, centres.max(axis=0) + half], axis=1)
+
+    def probabilities(self, rows: Array, values: Array) -> Array:
+        """Return the probabilities (n,) that the quantities rows (n, p) @ parameters are smaller.
+
+        values (n,): values with which the quantities are compared. The stated distribution of a
+        quantity is normal about its unheld estimate, truncated at its smallest allowed value.
+        """
+        std = combined_std(rows, self.covariance)
+        centre = rows @ self.unheld
+        # Logarithms of upper tails keep their digits far below a bound.
+        tail = log_ndtr((centre - values) / std)
+        whole = log_ndtr((centre - self.bounds.least(rows)) / std)
+        return np.asarray(np.clip(-np.expm1(tail - whole), 0.0, 1.0))
+
+    @property
+    def active_bounds(self) -> tuple[str, ...]:
+        """Statements of the active bounds, such as "platform.Izz <= Ixx + Iyy"."""
+        held = (self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
+        return tuple(dict.fromkeys(held))
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return a warning if bounds are active, with the distance of the unheld estimate."""
+        if not self.at_bound.any():
+            return ()
+        beyond = self.bounds.linear_lower - self.bounds.linear_coordinates(self.unheld)
+        to_coordinates = np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float)
+        distances = beyond / combined_std(to_coordinates, self.covariance)
+        moved = self.unheld - self.estimate
+        for own in self.bounds.log_cholesky:
+            to_body = np.linalg.solve(self.covariance[own, own], moved[own])
+            distances[own] = np.sqrt(moved[own] @ to_body)
+        said = ", ".join(
+            dict.fromkeys(
+                f"{self.bounds.statements[k]} ({max(distances[k], 0):.2g})"
+                for k in np.flatnonzero(self.at_bound)
+            )
+        )
+        return (
+            f"the estimate is held at {len(self.active_bounds)} bounds, beyond which no robot "
+            f"exists: {said}; in brackets the distance of the unbounded estimate beyond the bound, "
+            "in standard deviations; the intervals take it into account",
+        )
+
+
+def bounded_estimate(
+    estimate: Array,
+    at_bound: NDArray[np.bool_],
+    gradient: Array,
+    information: Array,
+    covariance: Array,
+    bounds: ParameterBounds,
+) -> BoundedEstimate:
+    """Return the estimate (p,) of a search within bounds.
+
+    gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
+    `BoundedEstimate`.
+    """
+    unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)
