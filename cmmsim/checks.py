@@ -199,7 +199,7 @@ def _explain(error: Any, model: type[BaseModel]) -> str:
             f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
         )
     if error["type"] == "missing":
-        return f"{where}: {error['msg']}"  # the input is the whole section
+        return f"{where}: {error['msg']}"  # the input, the whole section, is not shown
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
     return f"{where}: {error['msg']} (got {_shown(repr(error['input']))})"

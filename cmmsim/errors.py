@@ -81,7 +81,7 @@ class DividedError(LostError):
 
 
 class TeachingWarning(UserWarning):
-    """Teaching that cameras and stickers as stated do not explain."""
+    """Warning that the stated cameras and stickers do not explain what teaching observed."""
 
 
 class TeachingError(CmmError):

@@ -1,4 +1,4 @@
-"""Teaching and measuring from photographs, by the names or paths of a sensor file."""
+"""Teaching and measuring from photographs, with a sensor file given by its name or path."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RENDERER = "analytic"
 
 
 def sensor_for(name: str | Path) -> Sensor:
-    """Return the sensor of a file, which knows its cameras with the covariance in the file.
+    """Return the sensor of a file. It knows its cameras with the covariance that the file states.
 
     Raises SensorFileError for a covariance that is not valid.
     """
@@ -58,8 +58,9 @@ def teach(
 
     The cameras and the base stand still, and the platform moves from pair to pair. Stickers need no
     labels: those with the same pixels in most pairs belong to the base, and those that move
-    together to the platform. The sensor file names them by rough places. If it states the
-    covariance of its cameras, as that of `cmmsim calibrate` does, they are adjusted within it.
+    together to the platform. Each sticker is identified by its rough place in the sensor file. If
+    the file states the covariance of the cameras, as a file of `cmmsim calibrate` does, the cameras
+    are adjusted within this covariance.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def teach(
         Built-in name, or path of a TOML sensor file with the cameras, the radius of the stickers,
         and the planes with the rough places of the stickers.
     colour : {"grey", "red", "green", "blue"}, optional
-        How grey values are made of colours. Without it, images with colours are refused.
+        How grey values are computed from colours. Without it, images with colours are refused.
     advance : callable, optional
         Function that is called after each pair.
 
@@ -117,7 +118,7 @@ def measure(
     Returns
     -------
     iterator of MeasuredPair
-        Name, time, and measurement of each pair, when its images are read.
+        Name, time and measurement of each pair. Its images are read when it is requested.
 
     Raises
     ------

@@ -97,7 +97,7 @@ class Instrument:
         bodies = self.platform, self.base
         self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
-        # Teaching from photographs begins with these, also when it is repeated.
+        # Each teaching from photographs begins with these values, a repeated one as well.
         self._stated = self.platform, self.rig, self._known
         self._taught: Taught | None = None
         if taught is not None:
@@ -188,7 +188,7 @@ class Instrument:
 
     @property
     def _known_rig(self) -> KnownRig:
-        """Known rig, with the covariance zero if it is known exactly."""
+        """Known rig, with a covariance of zero if it is known exactly."""
         return self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
 
     @property
@@ -211,7 +211,7 @@ class Instrument:
         Parameters
         ----------
         progress : callable, optional
-            Function that is called with the number of steps done and of all steps.
+            Function that is called with the number of steps done and their total.
         frames : iterable of StereoFrame or of results of `Sensor.look`, optional
             Exposures of the platform in several poses, to teach from instead of exposures that the
             sensor takes itself. An earlier teaching is replaced.
@@ -247,7 +247,7 @@ class Instrument:
     def teach_from(
         self, photographs: Iterable[Photograph], advance: Callable[[], None] = lambda: None
     ) -> PhotographedTeaching:
-        """Return what photographs teach about this sensor's frames, without taking it over.
+        """Return the result of teaching from photographs. The sensor itself does not use it.
 
         Parameters
         ----------
@@ -273,7 +273,7 @@ class Instrument:
         return replace(found, taught=replace(found.taught, setup=setup_of(self._file)))
 
     def _take(self, taught: Taught) -> None:
-        """Measure from now on with a result of teaching, its rig and its stickers."""
+        """Use a result of teaching, with its rig and its stickers, from now on."""
         self._taught = taught
         if taught.known is not None:
             self._known = taught.known

@@ -36,7 +36,7 @@ def load_sensor(
     taught : Taught, optional
         Result of an earlier teaching of the same cameras and bodies.
     progress : callable, optional
-        Function that is called during teaching with the number of steps done and of all steps.
+        Function that is called during teaching with the number of steps done and their total.
     renderer : {"pyrender", "analytic", "scene", "auto", "statistical"}, optional
         Renderer to use instead of the renderer that the file names. ``module:name`` names a user's
         own renderer.

@@ -1,7 +1,7 @@
 """Measurement of many frames at once, in blocks and on all cores.
 
-For all exposures of a block together, windows are read, ellipses are fitted and stickers are
-triangulated. The pose of each exposure is then solved separately.
+Windows are read, ellipses fitted and stickers triangulated for all exposures of a block together.
+The pose of each exposure is then solved separately.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Frames:
     """N frames of a platform at ``poses`` (N, 6), which change at ``rates`` (N, 6).
 
     Each frame has its own generator of noise in ``rngs``. Stickers are searched near the poses
-    ``near`` (N, 6). Obstacles stand still at base_from_body (4, 4), by name. ``period`` is the time
-    between two frames, s.
+    ``near`` (N, 6). ``obstacles`` maps names of bodies that stand still to their base_from_body
+    (4, 4). ``period`` is the time between two frames, s.
     """
 
     estimator: PoseEstimator
@@ -131,8 +131,8 @@ def measure_exposures(
     """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
 
     ``exposure_ends`` are the expected camera_from_platform (N,4,4) at the beginning and at the end
-    of the exposures, and ``frame_ends`` those half a frame period from their middles. The
-    results equal those of ``PoseEstimator.measure`` for each exposure.
+    of the exposures. ``frame_ends`` are those half a frame period before and after the middles of
+    the exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places
     normals = estimator.platform.sticker_normals

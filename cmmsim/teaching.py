@@ -5,9 +5,9 @@ smooth path. Its stickers are observed at each pose, and registration moves all 
 each other. The planes are fitted to the mean constellation. Because the stickers lie on different
 sub-pixel positions at different poses, errors of the image formation are averaged out as well.
 
-The centres always come from the maximum-likelihood fit, whichever detector the sensor measures
-with. The base is seen at one pose only. Every measured pose would therefore contain the bias of
-another detector.
+The centres always come from the maximum-likelihood fit, whichever detector the sensor uses later.
+The base is seen at one pose only. If another detector were used here, every measured pose would
+therefore contain the bias of that detector.
 
 The search windows are made for the largest image of a sticker. This is the larger of two images:
 the image at the nearest working distance, assumed a fifth nearer than the rig's target, and the
@@ -49,19 +49,19 @@ Progress = Callable[[int, int], None]
 SHIFT = 0.008
 TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-# Largest distance of a sticker from its place in averaged exposures, m. If the sticker is not
-# hidden, this is a few micrometres.
+# Largest distance of a sticker from its place in averaged exposures, m. Unless the sticker is
+# hidden, the distance is a few micrometres.
 LARGEST_GAP = 1e-4
-# Largest rms of the distances of two rays of the base's stickers, in deviations. It is 1.2 to 1.4
-# with cameras and stickers as stated.
+# Largest rms distance between the two rays of a sticker of the base, in standard deviations. It is
+# 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
-# Allowance for errors by print in the distance of a sticker from its place, in their deviations.
+# Distance of a sticker from its place that errors by print may cause, in deviations of these.
 PRINT_REACH = 20.0
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
 # a sticker's radius at the rig's target.
 ROOM = 1.35
-# Smallest free margin around the largest sticker at teaching, px. Rounding can use up half of one.
+# Smallest free margin around the largest sticker at teaching, px. Rounding can use up half a pixel.
 SMALLEST_ROOM_PX = 0.7
 SMALLEST_FIT = 12
 SMALLEST_BLURRED_FIT = 14
@@ -260,7 +260,7 @@ class Teacher:
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError if a sticker has moved against the others, as if partly hidden."""
+        """Raise LostError if a sticker has moved relative to the others, as if partly hidden."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px

@@ -42,7 +42,7 @@ from cmmsim.without_images.drawn_stickers import (
 from cmmsim.without_images.sticker_scene import StickerScene
 from cmmsim.without_images.verified import require_proved
 
-# Renderers to which a body is the convex hull of its mesh.
+# Renderers that take each body as the convex hull of its mesh.
 SEE_HULLS = ("analytic", "statistical")
 
 
@@ -207,7 +207,7 @@ class TrueCameras:
         )
 
     def _centre_errors(self) -> CentreErrors | None:
-        """Return the errors of centres without images by uneven print and outlines, or None."""
+        """Return the errors that uneven print and outlines cause in drawn centres, or None."""
         file = self._file
         if file.print.unevenness == 0.0 and file.print.outline == 0.0:
             return None

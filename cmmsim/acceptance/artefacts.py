@@ -1,8 +1,8 @@
 """Artefacts of the acceptance tests, and the sensor under test.
 
-An artefact is a long board with a ridge and stickers on its three upper sides. Its frame has x
-along it, z out of its front side A, and its origin in the middle of that side. Sides B and C slope
-away from A by SLOPE, so that all stickers are seen from the front.
+An artefact is a long board with a ridge and stickers on its three upper sides. The x axis of its
+frame points along the board, and the z axis out of the front side A. The origin is the middle of
+that side. Sides B and C slope away from A by SLOPE, so that all stickers are seen from the front.
 """
 
 from dataclasses import dataclass, replace

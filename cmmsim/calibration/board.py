@@ -5,8 +5,8 @@ axis from row to row, and its z axis away from an observer who looks at the fron
 z = 0. They are ordered row by row, and along x within a row, as in OpenCV.
 
 The points of a chessboard and of a ChArUco board are the inner corners of their squares. A ChArUco
-board has a marker in each bright square, which tells its corners apart even where a part of the
-board is outside of the picture.
+board has a marker in each bright square. The markers identify the corners even if a part of the
+board lies outside of the picture.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def calibrate(
 ) -> Calibration:
     """Calibrate both cameras from pairs of images of size (width, height) px.
 
-    A pair in which one camera sees the board contributes to that camera only. Raises
+    A pair in which only one camera sees the board contributes to that camera only. Raises
     CalibrationError if both cameras see the board in too few pairs, with the reasons, or if the
     views do not determine the cameras.
     """

@@ -25,8 +25,8 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left", "rig.covariance")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-# Largest ratio of the calibrated baseline to that of the sensor file, or of the latter to the
-# former, without a warning.
+# Largest ratio without a warning between two baselines, that of the calibration and that of the
+# sensor file. The longer one is divided by the shorter one.
 LARGEST_BASELINE_RATIO = 1.5
 
 
@@ -79,7 +79,7 @@ class Calibration:
 
         Rows and columns of fixed parameters are zero.
         """
-        # the adjustment states small rotations, and the parameters are a rotation vector
+        # the adjustment's covariance is for a small rotation, the parameter is a rotation vector
         jacobian = np.eye(len(PARAMETER_NAMES))
         jacobian[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
         return np.asarray(jacobian @ self.adjustment.covariance @ jacobian.T)

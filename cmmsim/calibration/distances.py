@@ -1,10 +1,10 @@
 """Distances between points of a board, measured with cameras that other pictures have calibrated.
 
-They are compared with the distances of the board file. Three errors are stated for each: that of
-the known rig, the noise of images, and the board's own error, as of its print. The errors of a
-board move a point in both images alike. They therefore leave no gap between its two rays, but
-residuals of the calibration. So the ray gaps give the noise of images, and what is left of the
-residuals is the error of the board.
+They are compared with the distances of the board file. Three errors are stated for each distance:
+that of the known rig, that of the images' noise, and that of the board, such as of its print. An
+error of the board moves a point in both images alike. It therefore causes residuals of the
+calibration, but no gap between the point's two rays. Thus the ray gaps give the noise of the
+images, and the rest of the residuals gives the error of the board.
 """
 
 from collections.abc import Sequence
@@ -31,8 +31,8 @@ ROUNDS = 3
 class MeasuredBoard(NamedTuple):
     """Points of a board in one pair of pictures.
 
-    ``numbers`` (n,) are those of the points. ``points`` are their places for pixels with a variance
-    of 1 px². ``pixel`` is the size of a pixel at the distance of the board, m.
+    ``numbers`` (n,) are the numbers of the points. ``points`` are their places, with covariances
+    for pixels of variance 1 px². ``pixel`` is the size of a pixel at the board's distance, m.
     """
 
     numbers: NDArray[np.int_]
@@ -42,7 +42,7 @@ class MeasuredBoard(NamedTuple):
 
 @dataclass(frozen=True)
 class Distances:
-    """Measured distances between the points of a board, for n pairs of points and pictures.
+    """Measured distances between points of a board, n in all pairs of pictures together.
 
     errors    (n,), measured minus stated distance, m
     variances (n,), stated variances of the errors, m²
@@ -69,7 +69,7 @@ class Distances:
 def measured_distances(
     calibration: Calibration, own: Sequence[PairView], other: Sequence[PairView]
 ) -> Distances:
-    """Return the distances in ``other`` pairs of pictures than those of a calibration.
+    """Measure distances in ``other`` pairs of pictures with the cameras of a calibration.
 
     ``own`` are the pairs from which the cameras were calibrated. All pairs must show the board to
     both cameras.
@@ -90,7 +90,7 @@ def measured_distances(
 
 
 def _measured(board: Board, rig: StereoRig, pair: PairView) -> MeasuredBoard:
-    """Return the points that both images show, in the order in which their rays meet best."""
+    """Return the points that both images show, numbered such that their rays meet best."""
     left, right = pair.sides
     assert isinstance(left, BoardView)
     assert isinstance(right, BoardView)
@@ -149,7 +149,7 @@ def _errors(
     found = np.linalg.norm(gaps, axis=1)
     along = gaps / found[:, None]
     by_points, by_rig = (np.concatenate(part, axis=1) for part in rig.derivatives(points))
-    # The rays still meet if errors of the rig move the point.
+    # Errors of the rig move the triangulated point such that its pixels change least.
     moved = -np.linalg.pinv(by_points) @ by_rig
     by_rig = np.einsum("ni,nik->nk", along, moved[first] - moved[second])
     spread = noise * measured.points.covariances

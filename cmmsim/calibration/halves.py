@@ -26,7 +26,7 @@ class Halves:
 
     ``squares`` (n, p) belong to p independent directions of the free parameters. Each is divided by
     the sum of the variances that both calibrations state, so its expected value is 1.
-    ``distances`` are those of both halves of each split, measured with the cameras of the other.
+    ``distances`` are measured in each half of each split with the cameras of the other half.
     """
 
     squares: np.ndarray
@@ -111,7 +111,7 @@ def compare_halves(
 
 
 def _seen_by_both(found: Calibration, pairs: Sequence[PairView]) -> list[PairView]:
-    """Return the pairs whose images a calibration has both used."""
+    """Return the pairs of which a calibration used both images."""
     names = {view.name for view in found.used if len(view.rms_px) == len(SIDES)}
     return [pair for pair in pairs if pair.name in names]
 

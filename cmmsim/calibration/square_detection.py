@@ -15,7 +15,7 @@ FEWEST_CORNERS = 4
 PAINTED = 0.5
 # Percentile of the grey values of the square that gives the grey value of the paint.
 PAPER_PERCENTILE = 90.0
-# Binary digits behind the point in the corners of painted polygons.
+# Number of fractional binary digits in the coordinates of painted polygons.
 SHIFT = 4
 # A corner farther than this from its place by the homography of the board is an outlier.
 OUTLIER_PX = 2.0

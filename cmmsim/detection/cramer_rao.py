@@ -4,7 +4,7 @@ The mean grey value of a pixel is ground + contrast * share. The share of light 
 the pixel that the ellipse covers, blurred by a Gaussian point spread. The unknowns are the centre
 and shape of the ellipse, the contrast and the ground. The grey value is the mean plus normal noise,
 rounded and clipped. The variance of the noise depends on the mean. The Fisher information of a grey
-value is a sum over all its possible numbers.
+value is a sum over all values that it can have.
 
 If the noise is below half a grey value, the information depends on the position of the mean between
 two grey values. No estimator is then unbiased at each single position of a centre. The
@@ -27,7 +27,7 @@ TABLE_STEPS = 64
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
-    """Return the Fisher information of rounded and clipped grey values on their means.
+    """Return the Fisher information of rounded and clipped grey values about their means.
 
     The unit is 1 / (grey value)². Raises CmmError for a camera without noise, for which there is no
     bound.

@@ -1,4 +1,4 @@
-"""Square markers of others (ArUco, AprilTag): their dictionaries, and their detection by OpenCV."""
+"""Square markers (ArUco, AprilTag): their dictionaries, and their detection by OpenCV."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Sections of a sensor file for lenses, light, and what is wrong with printed stickers.
+"""Sections of a sensor file for lenses, light, and the imperfections of printed stickers.
 
 All keys have defaults with which stickers are flat, round and evenly bright, and images are sharp
 and free of other light.

@@ -10,7 +10,7 @@ from cmmsim.geometry.sticker_print import PrintSizes
 
 
 def print_sizes(file: SensorFile) -> PrintSizes:
-    """Return the sizes of the errors of the stickers of a sensor file."""
+    """Return the sizes of the print errors of the stickers of a sensor file."""
     stickers = file.stickers
     section = file.print
     rim = stickers.sticker_level if section.rim_level is None else section.rim_level

@@ -1,7 +1,7 @@
 """A pinhole camera with its lens: distortion, point spread and vignetting.
 
 Pixel coordinates (0, 0) are the centre of the top-left pixel. Camera axes are x right, y down, z
-forward. Ideal pixels are the pixels of the same camera with a perfect lens. In them lines are
+forward. Ideal pixels are the pixels of the same camera with a perfect lens. In these, lines are
 straight, and the linear formulas of epipolar geometry and triangulation hold.
 """
 

@@ -57,7 +57,7 @@ def distort_point(
 
 @compiled
 def distort_points(lens: Array, points: Array, distorted: Array, slopes: Array) -> None:
-    """Fill distorted points (n, 2) and their derivatives (n, 2, 2), ``slopes``.
+    """Fill ``distorted`` (n, 2) with distorted points, and ``slopes`` (n, 2, 2) with derivatives.
 
     ``lens`` (5,) is k1, k2, p1, p2, k3, and ``points`` (n, 2) are undistorted.
     """
@@ -191,9 +191,9 @@ def add_image(
 ) -> float:  # fmt: skip
     """Add one image's contribution to the normal equations of a point (3,); return r' W r.
 
-    r is the measured ``pixel`` (2,) minus the predicted pixel, J the derivative of the latter with
-    respect to the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I. J' W J is
-    added to the six entries ``normal`` (6,), and J' W r to ``right`` (3,).
+    r is the measured ``pixel`` (2,) minus the predicted pixel. J is the derivative of the predicted
+    pixel with respect to the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I.
+    J' W J is added to the six entries ``normal`` (6,), and J' W r to ``right`` (3,).
     """
     x, y, z = transformed(move, point)
     u, v, a, b, c, d = project(camera, x, y, z)
@@ -282,11 +282,11 @@ def triangulate_point(
 
 @compiled
 def signed_distance(cameras: Cameras, pixels: Array, point: Array, gap: float) -> float:
-    """Return the distance of two rays in deviations, from its square ``gap``.
+    """Return the signed distance of two rays in standard deviations, from its square ``gap``.
 
-    The distance is positive if the left pixel of ``pixels`` (2, 2) lies on a fixed side of the
-    image of the triangulated ``point`` (3,). This side is perpendicular to the image of the line
-    between the cameras.
+    The distance is positive if the left pixel of ``pixels`` (2, 2) lies on a fixed side of a line
+    in the left image. This line passes through the image of the triangulated ``point`` (3,), in the
+    direction from the left to the right camera.
     """
     move = cameras.extrinsics[0]
     camera = cameras.intrinsics[0]

@@ -84,7 +84,7 @@ class StereoRig:
 
     @cached_property
     def kernel_cameras(self) -> Cameras:
-        """Both cameras in the form of the compiled functions, for points in the camera frame C."""
+        """Both cameras as compiled functions take them, for points in the camera frame C."""
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import Cameras
 
@@ -192,8 +192,8 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     """Return camera_from_base (4, 4) of a rig with the middle of its baseline at ``position`` (3,).
 
     The rig looks at ``target`` (3,). The viewing direction is the mean of both optical axes,
-    projected perpendicular to the baseline. For a rig of ``toed_in_rig`` with the same position and
-    target, the result is the same as there.
+    projected perpendicular to the baseline. For a rig that ``toed_in_rig`` made for the same
+    position and target, both functions return the same transform.
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)

@@ -36,7 +36,7 @@ SHARP_SUB_PIXELS = 12
 SIDE_STEP = 4
 # Number of drawn pixels that the cubic needs on either side.
 REACH = 2
-# Depths to which the blur of defocus is limited, in shares of the usual distance.
+# Smallest and largest depth for which defocus is computed, in shares of the usual distance.
 DEPTHS = (0.7, 1.5)
 # px: point spreads of windows are rounded to multiples of this.
 SPREAD_STEP = 0.01
@@ -84,7 +84,7 @@ class ImageFormation:
     """Image formation by a renderer, with the drawn bodies, the radiance of the background, and the
     optics of the lenses.
 
-    ``painter`` replaces the renderer's evenly lit and printed stickers; None leaves them.
+    ``painter``, if not None, replaces the evenly lit and printed stickers of the renderer.
     """
 
     renderer: Renderer

@@ -16,7 +16,7 @@ class Solids(NamedTuple):
 
     ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. Rows starts[k] to starts[k + 1]
     belong to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y of the s solids. ``slots``
-    (s,) are the indices under which the shares of pixels that they cover are stored, or -1.
+    (s,) are the indices under which the covered shares of pixels are stored; -1 stores none.
     """
 
     half_planes: Array

@@ -13,12 +13,12 @@ from cmmsim.compilation import Array, compiled
 class Painted(NamedTuple):
     """Stickers that a camera sees, with their print and light.
 
-    to_stickers   (n, 3, 3), map pixels to places (u, v, 1) on the stickers, in their radii
+    to_stickers   (n, 3, 3), matrices that map pixels to places (u, v, 1) on stickers, in radii
     to_places     (n, 2, 2), derivatives d(u, v) / d(pixels)
     boxes         (n, 4), lowest x, y and highest x, y of the rings, px
     slopes        (n, 2), movements in (u, v) of the lower edges of the rims
     shifts        (n, 2), shifts in (u, v) of what is seen of the stickers
-    lights        (n, 3), light at the centres, and its changes a radius along u and v
+    lights        (n, 3), light at the centres, and its changes over a radius along u and v
     faces         (n,), levels of the stickers
     ring, rim     levels of the rings and of the rims
     prints        (n, 5), coefficients of the modes of brightness
@@ -40,7 +40,7 @@ class Painted(NamedTuple):
 
 @compiled
 def print_at(prints: Array, u: float, v: float) -> float:
-    """Return the relative brightness at a place (u, v), which is moved into the unit disc."""
+    """Return the relative brightness at (u, v). Outside of the unit disc, it is that at the rim."""
     size = math.sqrt(u * u + v * v)
     if size > 1.0:
         u /= size
@@ -73,7 +73,7 @@ def outline_at(outlines: Array, u: float, v: float) -> float:
 
 @compiled
 def covered(u: float, v: float, radius: float, to_places: Array) -> float:
-    """Return the share of a pixel at (u, v) that a disc of a radius covers.
+    """Return the share of a pixel at (u, v) that a disc of the given radius covers.
 
     ``to_places`` (2, 2) is the derivative d(u, v) / d(pixels).
     """
@@ -87,7 +87,7 @@ def covered(u: float, v: float, radius: float, to_places: Array) -> float:
 
 @compiled
 def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Painted) -> None:
-    """Paint sticker ``n`` into a window (h, w), by the share ``shown`` (h, w) that is visible."""
+    """Paint sticker ``n`` into a window (h, w), weighted by the visible share ``shown`` (h, w)."""
     height, width = image.shape
     box = painted.boxes[n]
     slope = painted.slopes[n]
@@ -118,7 +118,7 @@ def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Pai
                 face = painted.faces[n] * max(print_at(painted.prints[n], u, v), 0.0)
                 level += own * (face - painted.ring)
                 if squared > 0.0 and own < 1.0:
-                    # The depth of the rim that this pixel sees best, from 0 to the thickness.
+                    # Depth of the part of the rim that this pixel shows best, in thicknesses.
                     depth = (u * slope[0] + v * slope[1]) / squared
                     depth = min(max(depth, 0.0), 1.0)
                     low_u = u - depth * slope[0]
@@ -155,11 +155,11 @@ def scatter_objects(
     images: Array, behind: Array, group: Array, corners: Array, objects: Array, turn: Array,
     focal: Array, principal: Array,
 ) -> None:  # fmt: skip
-    """Paint far objects into the windows ``images[group]`` (n, h, w) where nothing is before them.
+    """Paint far objects into the windows ``images[group]`` (n, h, w) where no body hides them.
 
     ``behind`` (all, h, w) are the shares of pixels that show the background. ``objects`` (o, 5) are
     a direction in the base frame, an angular radius, rad, and the level above the background.
-    ``turn`` (3, 3) leads from base axes to camera axes.
+    ``turn`` (3, 3) is the rotation from base axes to camera axes.
     """
     height, width = images.shape[1:]
     ray = np.empty(3)

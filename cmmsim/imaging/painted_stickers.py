@@ -1,9 +1,9 @@
 """Stickers with light and print, painted into what any renderer has drawn.
 
-A renderer draws the scene with empty rings. It also draws in which share of each pixel a ring, with
-its sticker, is visible. The sticker is then painted where it is visible, pixel by pixel, from the
-place on the sticker that a pixel sees. So all renderers have the same light and print, and bodies
-hide stickers as before. Pixels must be much finer than the rims of stickers.
+A renderer draws the scene with empty rings. It also draws a second image, which states the share of
+each pixel in which a ring and its sticker are visible. There, the sticker is painted pixel by
+pixel, from the place on the sticker that the pixel shows. Light and print are thus the same for all
+renderers, and bodies still hide stickers. Pixels must be much finer than the rims of stickers.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Paint:
     radius            radius of the stickers, m
     ring_radius       radius of the rings, m
     face, ring        levels of stickers and rings
-    sizes             sizes of what is wrong with the stickers
+    sizes             sizes of the imperfections of the stickers
     prints, outlines  (n, 5) and (n, 8), coefficients of the modes of brightness and outline
     light             light of the sensor file
-    target            (3,), place at which lamps have their strength, in the base frame, m
+    target            (3,), place at which lamps have the stated strength, in base axes, m
     """
 
     bodies: NDArray[np.int_]

@@ -12,7 +12,7 @@ def draw_print(
     """Draw a print over a window (h, w).
 
     ``texels_from_pixels`` (3, 3) maps homogeneous pixels of the window to places in the print, in
-    sides of its picture elements. ``levels`` (r, c) are the levels of these elements. Only pixels
+    units of its picture elements. ``levels`` (r, c) are the levels of these elements. Only pixels
     from ``box`` (first x, first y, last x, last y) are drawn, with ``samples``² samples each.
     """
     height, width = levels.shape

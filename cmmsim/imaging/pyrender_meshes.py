@@ -89,7 +89,7 @@ def _joined(pieces: Sequence[Mesh]) -> Mesh:
 
 
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
-    """Return a disc whose level falls to the level ``around`` it within a band at its rim."""
+    """Return a disc whose level falls to the level ``around`` within a band at its rim."""
     width = min(RIM_SAMPLES * sample, disc.radius)
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # same total light as the sharp disc
     sides = _sides(disc.radius, sample)

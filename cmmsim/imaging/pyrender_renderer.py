@@ -114,8 +114,8 @@ class _Patch:
 class _Uploaded:
     """Parts of a drawable in OpenGL's memory.
 
-    ``patches`` contains all patches by the number of drawn pixels per radian. In ``ringed``, stacks
-    of discs are made for cells that are cleared to the level of their lowest disc.
+    ``patches`` contains all patches, for each number of drawn pixels per radian. ``ringed`` differs
+    in the stacks of discs, which are made for cells that are cleared to their lowest disc's level.
     """
 
     patches: dict[float, list[_Patch]]
@@ -208,8 +208,9 @@ class _Atlas:
         return frame_buffer.read()
 
     def _draw_by_depth(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
-        """Draw the patches of a cell with depth tests. ``matrices`` are addresses of matrices by
-        patch.
+        """Draw the patches of a cell with depth tests.
+
+        ``matrices`` maps each patch to the address of its matrix.
         """
         gl = self._gl
         triangles, unsigned = self._constants
@@ -223,7 +224,7 @@ class _Atlas:
     def _draw_in_order(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
         """Draw the patches of a cell over each other: the solid, then the stack that lies on it.
 
-        ``matrices`` are addresses of matrices by patch. All patches belong to one body.
+        ``matrices`` maps each patch to the address of its matrix. All patches belong to one body.
         """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):

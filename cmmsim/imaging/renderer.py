@@ -257,7 +257,7 @@ def choose_renderer(name: str) -> Renderer:
     valid names, and CmmError if a user's own renderer cannot be imported or called.
     """
     if name == AUTO:
-        # Imported here, because the module imports this one.
+        # Imported here, because that module imports this one.
         from cmmsim.imaging.pyrender_renderer import require_opengl
 
         try:

@@ -1,8 +1,8 @@
 """Exposure of an image row after row, as by a rolling shutter.
 
-A pose belongs to the middle row of an image. Each window is drawn as the platform stands when the
-middle row of the window is exposed. The platform hardly moves while the few rows of a window are
-exposed.
+A pose belongs to the middle row of an image. Each window is drawn with the platform where it is
+when the middle row of the window is exposed. The platform hardly moves while the few rows of a
+window are exposed.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, transforms_of
 from cmmsim.imaging.formation import ImageFormation, Side
 
-# Number of rows over which the movement of a platform is divided, for its change a row.
+# Number of rows over which the movement of the platform is averaged, for its change per row.
 SWEPT_ROWS = 100.0
 
 
 def row_sweeps(
     poses: Array, rates: Array, row_time: float, from_base: Sequence[Array]
 ) -> list[Array | None]:
-    """Return the changes (2, 4, 4) of camera_from_platform from one row to the next.
+    """Return, for each of N poses, the changes (2, 4, 4) of camera_from_platform per row.
 
     The platform has poses (N, 6) that change at rates (N, 6), and a row is exposed ``row_time`` s
     after the row above it. ``from_base`` are camera_from_base (4, 4) of both cameras. The change is

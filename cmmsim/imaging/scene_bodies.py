@@ -145,7 +145,7 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
 def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: str) -> None:
     """Raise SensorFileError if a sticker lies in a hollow of a body.
 
-    The renderer, named in the message, takes the convex hull for the body, which would hide it.
+    The renderer, named in the message, draws the body's convex hull, which would hide the sticker.
     """
     normals, offsets = ConvexSolid(body.solid.vertices).faces
     heights = (body.sticker_places @ normals.T + offsets).max(axis=1)
@@ -321,7 +321,7 @@ def _sunk(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     normals = np.asarray(mesh.face_normals)
     for k, faces in enumerate(mesh.vertex_faces):
         around = normals[faces[faces >= 0]]
-        # Directions in which the normals hardly differ count as equal: the vertex stays near.
+        # Normals that hardly differ count as equal, so that the vertex does not move far.
         moved[k] -= SUNK * np.linalg.lstsq(around, np.ones(len(around)), rcond=0.1)[0]
     return trimesh.Trimesh(moved, mesh.faces, process=False)
 

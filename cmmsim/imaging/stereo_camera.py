@@ -140,9 +140,9 @@ class VirtualStereoCamera:
         """Return the mean radiance (2, n, size, size) of windows over the moments of each exposure.
 
         For each exposure, the windows have first pixels ``corners`` (2, n, 2) in the left and the
-        right image, and ``sweeps`` has those of ``row_sweeps``. The
-        first moments of all exposures are drawn together, then the second ones, and so on. In this
-        way no more memory is needed than without motion.
+        right image. ``sweeps`` is the result of ``row_sweeps``. The first moments of all exposures
+        are drawn together, then the second ones, and so on. In this way no more memory is needed
+        than without motion.
         """
         swept_by = [None] * len(moments) if sweeps is None else sweeps
         light = self._drawn(
@@ -195,7 +195,7 @@ class VirtualStereoCamera:
         return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]
 
     def _sweeps(self, poses: Array, rates: Array | None) -> list[Array | None]:
-        """Return ``row_sweeps`` of a platform with poses (N, 6) that change at rates (N, 6)."""
+        """Return the result of ``row_sweeps`` for poses (N, 6) that change at rates (N, 6)."""
         if self.row_time == 0.0 or rates is None:
             return [None] * len(poses)
         return row_sweeps(poses, rates, self.row_time, self._from_base)
@@ -209,7 +209,7 @@ class VirtualStereoCamera:
     ) -> NDArray[np.float32]:
         """Return the mean radiance (height, width) of one whole image over all moments.
 
-        ``sweep`` (2, 4, 4) is that of ``row_sweeps``.
+        ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this exposure.
         """
         own = None if sweep is None else sweep[side]
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling, own)

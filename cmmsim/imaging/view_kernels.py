@@ -242,7 +242,8 @@ def solid_outlines(
 ) -> Solids:
     """Return the outlines of solids that lie wholly in front of the camera, from far to near.
 
-    ``slots`` (s,) are the indices under which the shares that solids cover are stored, or -1.
+    ``slots`` (s,) are the indices under which the covered shares of pixels are stored; -1 stores
+    none.
     """
     total = len(slots)
     depths = np.empty(total)

@@ -1,4 +1,4 @@
-"""Constellation of a body's stickers: the mean of many views, and the frame that it teaches."""
+"""Constellation of a body's stickers: the mean of many views, and the frame that it defines."""
 
 from __future__ import annotations
 

@@ -39,8 +39,8 @@ def frame_ends_of(read: StickerWindows) -> tuple[tuple[Array, Array] | None, flo
     flat = columns.reshape(-1, 12)
     found = np.linalg.lstsq(flat, away.ravel(), rcond=None)[0]
     known = flat.T @ flat
-    # Ratio of the variance of a pose with the movement to that without it, as a mean over the
-    # directions of the pose.
+    # Ratio of the variance of a pose that is fitted with the movement to that of a pose without it,
+    # as a mean over the directions of the pose.
     factor = float(np.trace(known[:6, :6] @ np.linalg.pinv(known)[:6, :6])) / 6.0
     ends = []
     for share in (-0.5, 0.5):

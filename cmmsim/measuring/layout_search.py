@@ -45,7 +45,7 @@ LINE_TOLERANCE_PX = 0.5
 # Allowed distance from epipolar lines due to errors of the rig, in standard deviations of this
 # distance.
 LINE_STDS = 4.0
-# Limits of a point's distance from the camera, m.
+# Smallest depth, and largest distance of a point from the left camera, m.
 NEAREST = 0.3
 FURTHEST = 6.0
 # Smallest area of a triangle of stickers, m².
@@ -61,7 +61,7 @@ DEFOCUSED_PX = (0.2, 0.4, 0.6, 0.9)
 def bright_ellipses(
     images: StereoImages | StickerExposure, observer: Observer
 ) -> tuple[EllipseFits, EllipseFits]:
-    """Fit ellipses to all bright spots of both images that fit into a window, with any misfit."""
+    """Fit ellipses, without a limit on misfits, to all bright spots that fit into a window."""
     if isinstance(images, StickerExposure):
         return images.bright(observer)
     frame = images.full()

@@ -175,7 +175,7 @@ class Observer:
         return self.evenly_lit(windows, corners)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Return windows (2, n, size, size) in which vignetting has its value of their middle.
+        """Return windows (2, n, size, size) whose vignetting is everywhere as in their middles.
 
         Vignetting would move the centre of a sticker because it varies across the sticker. The
         correction changes the noise by a few per mille only.

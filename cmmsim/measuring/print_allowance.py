@@ -1,9 +1,9 @@
 """Allowance of the fit of stickers for print that is not perfect.
 
-Uneven print and outlines that are not round move a sticker's centre. Most of this is the same in
-all frames, and in the taught places of the stickers as well. The rest changes with the place of the
-centre within a pixel, as noise does. The factors below were found from images without noise, with
-stickers of 3 to 4 px radius.
+Uneven print and outlines that are not round move a sticker's centre. Most of this movement is the
+same in all frames, and is contained in the taught places of the stickers. The rest changes with the
+place of the centre within a pixel, and acts like noise. The factors below were found from images
+without noise, with stickers of 3 to 4 px radius.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.radiometry.noise import CameraNoise
 
-# Probability that light that rises across the stickers is fitted in a frame with even light, and
-# the squared movement of the pose, in units of noise, that noise exceeds with this probability.
+# Probability that light that rises across the stickers is fitted in a frame with even light. With
+# this probability, noise moves the pose by more than LARGEST_LIGHT (squared, in units of noise).
 LIGHT_CHANCE = 1e-4
 LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
 # Errors of a centre, px, for an unevenness of 1, and for an outline that is off by 1 px. Errors
@@ -38,14 +38,14 @@ MISFIT_SPREAD = 4.0
 
 @dataclass(frozen=True)
 class PrintAllowance:
-    """Sizes of what print causes, and limits that follow from them.
+    """Sizes of the errors that print causes, and limits that follow from them.
 
     constant_px     rms of errors of a centre that are the same in all frames, px
     changing_px     rms of errors of a centre that change from frame to frame, px
     outline_px      rms of errors of the entries of an ellipse's matrix, px
     largest_misfit  largest accepted reduced chi-square
-    largest_light   light that rises across the stickers is fitted in exposures in which it would
-                    move the pose by more than this, as a squared movement in units of noise
+    largest_light   squared movement of the pose, in units of noise; light that rises across the
+                    stickers is fitted if it would move the pose by more than this
     known           True if print is not perfect, and its sizes are known
     """
 

@@ -39,7 +39,7 @@ LARGEST_MISFIT = float(chdtri(3, CHANCE))
 ROUNDS = 8
 # Repetition ends at a smaller change of d, which has no visible effect on centres and ellipses.
 TOLERANCE_PX = 0.05
-# Number of times that the weights of the start are updated.
+# Number of times that the weights for the start values are updated.
 REWEIGHTED = 5
 TINY_PX2 = 1e-6
 # Relative limit on singular values. The start values omit combinations of movements with smaller

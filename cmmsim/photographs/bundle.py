@@ -55,7 +55,7 @@ class Observations:
 
     @property
     def moves(self) -> NDArray[np.bool_]:
-        """Observations (m,) of the platform."""
+        """Mask (m,) of the observations of the platform."""
         return np.asarray(self.sticker >= self.base)
 
     def selected(self, keep: NDArray[np.bool_]) -> Observations:
@@ -134,7 +134,7 @@ class Bundle:
     covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, with poses eliminated
     residuals    (2, m, 2), px
     squares      (m,), squared residuals of both images in units of their noise
-    factor       ratio of the squared residuals to their noise
+    factor       sum of ``squares`` per degree of freedom
     freedom      number of observed numbers minus number of determined unknowns
     """
 
@@ -151,7 +151,7 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
 
     ``known`` is the rig as calibrated, and ``prior`` (24, 24) the covariance of its parameters.
     Parameters with zero variance do not change. The covariance of the result belongs to noise as
-    stated; ``factor`` tells how much larger the residuals are.
+    stated; ``factor`` tells how much larger the squared residuals are.
     """
     state = start
     free = np.flatnonzero(np.diag(prior) > 0.0)
@@ -199,7 +199,7 @@ def _step(
         matrix -= by_common.T @ by_pose @ mixed
         right -= by_common.T @ by_pose @ alone
         poses.append((mixed, alone))
-    # A row of an unseen sticker is empty.
+    # An unseen sticker has no observations. A unit diagonal keeps the matrix invertible.
     empty = np.diag(matrix) == 0.0
     matrix[empty, empty] = 1.0
     gauge = _gauge(seen, state, len(matrix))
@@ -223,8 +223,8 @@ def _rows(
 ) -> list[tuple[Array, Array, Array]]:
     """Return, for each pair, derivatives and residuals in units of their noise.
 
-    The derivatives of the r numbers are those by places and rig (r, 3 n + f), and by the pose of
-    the pair (r, 6).
+    A pair has r observed numbers. Their derivatives are with respect to places and rig (r, 3 n +
+    f), and to the pose of the pair (r, 6).
     """
     points = state.points(seen)
     by_points, by_rig = state.rig.derivatives(points)

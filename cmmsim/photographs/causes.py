@@ -1,6 +1,7 @@
 """Causes for which photographs teach nothing or little.
 
-Folders are exchanged, shifted, or of one camera, or the images are blurred or noisier than stated.
+The folders may be exchanged, shifted or of one camera, and the images may be blurred or noisier
+than stated.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Which spots of many pairs of photographs are the same sticker, without labels in the print.
+"""Matching of the spots in many pairs of photographs to stickers, without labels in the print.
 
 A spot of the left image and a spot of the right image that lie on each other's epipolar lines are a
 candidate: a point in space. The stickers of the base stand still, so their candidates have the same
-pixels in most pairs. All other candidates are compared as one rigid body: the pair with most of
-them is the first model, and this model is searched in every other pair. The rough places of the
-sensor file then only name the stickers that were found.
+pixels in most pairs. All other candidates are taken as points of one rigid body. Those of the pair
+with the most candidates are the first model, which is searched in every other pair. The rough
+places of the sensor file only serve to name the stickers that were found.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.measuring.pose_estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, TAUGHT_TOLERANCE
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# A sticker of the base has the same pixels in this share of all pairs, because it can be hidden.
+# Smallest share of all pairs in which a sticker of the base has the same pixels. It can be hidden.
 SHOWN_SHARE = 0.25
-# What has the same pixels in this share of all pairs does not belong to the platform.
+# A point with the same pixels in this share of all pairs does not belong to the platform.
 STANDING_SHARE = 0.6
 # Largest distance between the pixels of a standing sticker in two pairs, over both images.
 STANDING_PX = 0.7
 # Fewest candidates of a pair that are recognised as a rigid body.
 FEWEST_MOVING = 6
-# Most rough places may be off by the first tolerance, or else by the second, and single ones by the
-# second, m.
+# Tolerances of most rough places, m. The second is tried if the first finds no body. It is also the
+# tolerance of single places.
 ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
 # Number of pairs that are tried as the first model of the platform.
 REFERENCES = 4
-# m: a sticker that has moved is searched so far from its rough place.
+# m: a sticker that has moved is searched within this distance of its rough place.
 NEAR = 0.015
 
 
@@ -87,7 +87,7 @@ def candidates(spots: Spots, observer: Observer) -> Candidates:
     limits = observer.settings.limits
     for camera, fits in zip(observer.rig.cameras, spots, strict=True):
         pixels, found = camera.undistort(fits.centres)
-        # In images that are noisier than stated, a sticker must not fit worse than most others.
+        # In images that are noisier than stated, the limit grows with the usual misfit.
         usual = max(1.0, float(np.median(fits.misfits[fits.good]))) if fits.good.any() else 1.0
         allowed = replace(limits, largest_misfit=usual * limits.largest_misfit)
         found &= fits.within(allowed, observer.upright).good
@@ -125,13 +125,13 @@ class FoundBody:
     missing: dict[int, str]
 
     def without(self, positions: dict[int, str]) -> FoundBody:
-        """Return the body without the stickers at some positions; the values are reasons."""
+        """Return the body without the stickers at ``positions``, whose values are reasons."""
         count = len(self.sticker)
         gone = {int(self.sticker[k]): why for k, why in positions.items() if 0 <= k < count}
         return self.with_missing(gone)
 
     def with_missing(self, gone: dict[int, str]) -> FoundBody:
-        """Return the body without some stickers of the file; the values are reasons."""
+        """Return the body without the file's stickers in ``gone``, whose values are reasons."""
         kept = ~np.isin(self.sticker, list(gone))
         return replace(
             self,
@@ -145,7 +145,7 @@ class FoundBody:
 def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
     """Return the candidates (g, K) of g points in K pairs, or NONE where one is missing.
 
-    A point has the same pixels in two pairs or more.
+    Each of these points has the same pixels in two or more pairs.
     """
     counts = [len(one.points) for one in pairs]
     owner = np.repeat(np.arange(len(pairs)), counts)
@@ -294,7 +294,7 @@ def _extended(
 
 
 def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
-    """Return the place (4, 4) of a body, its stickers (n,), and the points (n,) that these are.
+    """Return the place (4, 4) of a body, and the found stickers and their points as indices (n,).
 
     Raises LostError if the rough places are not found among the points (g, 3).
     """
@@ -304,7 +304,7 @@ def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDA
         except LostError as error:
             said = error
             continue
-        # Stickers that lie farther from their rough places are found once the body is.
+        # Stickers farther from their rough places are found once the body's place is known.
         for _ in range(2):
             gaps = np.linalg.norm(apply(place, body.nominal)[:, None] - points, axis=2)
             own = gaps.argmin(axis=1)
@@ -320,7 +320,7 @@ def named(body: MarkedBody, points: Array) -> tuple[Array, NDArray[np.int_], NDA
 def match(
     pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody, names: Sequence[str]
 ) -> list[FoundBody]:
-    """Return the stickers of base and platform in K pairs with these names. Raises LostError."""
+    """Return the stickers of base and platform in K pairs with ``names``. Raises LostError."""
     # Points that stand for a while tell when a sticker has moved.
     briefly = standing(pairs)
     share = np.mean(briefly != NONE, axis=1)
@@ -353,8 +353,8 @@ def _missing(
 ) -> dict[int, str]:
     """Return reasons by the index of each sticker that cannot be used.
 
-    A sticker was not found, or points (g, 3) near its place belong to different pairs: it has
-    moved. ``members`` (g, K) are the candidates of the points.
+    Such a sticker was not found, or it has moved. If it has moved, points (g, 3) near its place
+    belong to different pairs. ``members`` (g, K) are the candidates of the points.
     """
     reasons = {}
     seen = members != NONE

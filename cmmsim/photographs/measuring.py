@@ -35,8 +35,8 @@ COLUMNS = (
     "ok",
     "why",
 )
-"""Columns of the table: ``covariance`` is new noise in each pair, ``common`` the same in all."""
-# Share of the platform's stickers that both images of a lost pair show if they are worth a hint.
+"""Columns of the table; ``covariance`` is for noise, ``common`` for errors shared by all pairs."""
+# A hint is given if each image of a lost pair shows this share of the platform's stickers.
 SHOWN_SHARE = 0.5
 # Radius of a circle around a found sticker in a picture, px.
 CIRCLE_PX = 14
@@ -71,7 +71,7 @@ class MeasuredPair:
 
     @property
     def row(self) -> list[str]:
-        """Cells of the columns `COLUMNS`; those of a pose that is missing are empty."""
+        """Cells of the columns `COLUMNS`; cells of a missing pose are empty."""
         found = self.measurement
         numbers = [
             *found.pose,
@@ -127,7 +127,7 @@ def measure_pairs(
 
 
 def _hint(lost: Photograph, estimator: PoseEstimator) -> str:
-    """Return a hint if the images of a lost pair show the stickers, but each for itself."""
+    """Return a hint if each image of a lost pair shows enough bright spots, or an empty text."""
     sides = bright_ellipses(readable(lost.images), estimator)
     counts = [int(fits.good.sum()) for fits in sides]
     if min(counts) < SHOWN_SHARE * len(estimator.platform.sticker_ids):

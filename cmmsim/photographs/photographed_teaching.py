@@ -1,7 +1,7 @@
 """Teaching from photographs: frames of base and platform from pairs of images of any source.
 
 The stickers are matched over all pairs without labels, and adjusted together with the poses of the
-platform. The frames go through the planes of the sensor file, as in the simulated teaching.
+platform. The planes of the sensor file define the frames, as in the simulated teaching.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
 FEWEST_PAIRS = 3
-# Of more pairs, such as those of a video, some are used.
+# Of more pairs, such as those of a video, only this many are used.
 MOST_PAIRS = 500
 # A warning is given if the squared residuals exceed the stated noise by this factor.
 LARGEST_FACTOR = 1.5
-# A warning is given if the radius of stickers differs by more than this share.
+# A warning is given if the radius of stickers differs from the stated one by more than this share.
 LARGEST_GROWTH = 0.02
-# A warning is given if the platform moves by less in all images.
+# A warning is given if the platform moves by less than this in the images.
 SHORTEST_WAY_PX = 3.0
 UNFOUND = "hidden, or its images do not belong together"
 
@@ -174,7 +174,7 @@ def _taught(
     name: str,
     known: KnownRig | None,
 ) -> PhotographedTeaching:
-    """Match, adjust, and put the frames through the planes. Raises LostError."""
+    """Match and adjust the stickers, and fit the planes of the frames. Raises LostError."""
     base, platform = whole
     pairs = [candidates(one, observer) for one in spots]
     bodies = match(pairs, platform, base, names)
@@ -194,12 +194,12 @@ def _taught(
             raise LostError(f"{error}: {said}") from error
         seen, start = observations(pairs, bodies, marked, observer)
         judged = adjust_robustly(seen, start, observer.rig, prior, names)
-        # The radius is known better from the images, and moves the centres of ellipses a little.
+        # The images determine the radius better, and it moves the centres of ellipses a little.
         seen = replace(seen, radius=judged.bundle.state.radius(judged.seen))
         judged = adjust_robustly(seen, judged.bundle.state, observer.rig, prior, names)
         if not judged.stickers:
             break
-        # A sticker that is left out leaves the unknowns, too.
+        # A sticker that is left out is removed from the unknowns, too.
         bodies = [
             body.without({k - first: why for k, why in judged.stickers.items()})
             for body, first in zip(bodies, (0, seen.base), strict=True)

@@ -1,4 +1,4 @@
-"""Frames of adjusted stickers through their planes, with the covariance of the whole result.
+"""Frames from the planes of adjusted stickers, with the covariance of the whole result.
 
 The frames are those of the simulated teaching. Their errors follow to first order from the errors
 of all places together. The derivatives are central differences.
@@ -92,7 +92,7 @@ def require_planes(body: MarkedBody) -> None:
 def taught_frames(
     bundle: Bundle, seen: Observations, base: MarkedBody, platform: MarkedBody
 ) -> TaughtFrames:
-    """Put the frames of base and platform through the planes of their adjusted stickers."""
+    """Return the frames of base and platform from the planes of their adjusted stickers."""
     places = bundle.state.places
     split = 3 * seen.base
     count = places.size
@@ -132,7 +132,7 @@ def _moved(points: Array) -> tuple[Array, Array]:
 
 
 def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array]:
-    """Return the function of adjusted and changed points that gives the body's frames."""
+    """Return a function that computes the body's frames from adjusted and from changed points."""
     size = len(body.nominal)
     blocks = np.array(np.einsum("iaib->iab", spread.reshape(size, 3, size, 3)))
 

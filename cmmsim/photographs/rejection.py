@@ -48,7 +48,7 @@ class Judged:
     bundle    their adjustment
     pairs     reasons by the number of a pair whose platform is left out
     stickers  reasons by the number of a sticker that is left out
-    singles   number of centres that are left out of other pairs and stickers
+    singles   number of single centres that are left out, of pairs and stickers in use
     """
 
     seen: Observations
@@ -114,7 +114,7 @@ def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
 def _left_out(
     seen: Observations, state: BundleState, kept: NDArray[np.bool_], names: Sequence[str]
 ) -> tuple[dict[int, str], dict[int, str]]:
-    """Leave out whole pairs and stickers of which too much is left out, and say why.
+    """Leave out pairs and stickers of which too many centres are left out; return the reasons.
 
     ``kept`` (m,) is changed.
     """

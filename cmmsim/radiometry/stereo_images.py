@@ -116,7 +116,7 @@ def _in_notebook() -> bool:
 
 @runtime_checkable
 class StereoImages(Protocol):
-    """One exposure of two cameras, of which images or windows can be read."""
+    """One exposure of two cameras, from which images or windows can be read."""
 
     def full(self) -> StereoFrame:
         """Return both whole images."""

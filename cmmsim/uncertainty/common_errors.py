@@ -198,8 +198,8 @@ class MeasuringGeometry:
     def _taught_by_print(self, print_errors: PrintErrors) -> tuple[Array, Array]:
         """Errors of teaching per standard deviation of the print's errors.
 
-        The results, (6, 2) and (2, n, 3), are of the kind of ``taught_by_rig``. They are zero if
-        the sensor was not taught by images.
+        The results (6, 2) and (2, n, 3) have the meaning of those of ``taught_by_rig``. They are
+        zero if the sensor was not taught by images.
         """
         if not self.taught.place_covariances.any():
             return np.zeros((6, 2)), np.zeros((2, *self.taught.platform_places.shape))
@@ -325,9 +325,9 @@ class _View:
         return self.points_by_pixels(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
-        """Return the changes (N, n, 3, 24) of expected points per unit of the rig's errors.
+        """Return the changes (N, n, 3, p) of expected points per unit of p errors.
 
-        ``places`` (24, n, 3) are the changes of the taught places.
+        ``places`` (p, n, 3) are the changes of the taught places.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
         return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])

@@ -311,8 +311,7 @@ class Finding:
 def movements(drift_information: DriftInformation) -> tuple[tuple[Movement, ...], float]:
     """Return a few parameters whose movement explains the residuals, and the explained fraction.
 
-    Parameters are chosen one after the other. Each explains most together with
-    those chosen before.
+    Parameters are chosen one by one. Each is the one that explains most together with those before.
     """
     information = drift_information.information
     score = drift_information.score

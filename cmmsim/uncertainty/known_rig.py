@@ -78,7 +78,7 @@ class KnownRig:
     def drawn(
         cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0
     ) -> KnownRig:
-        """Draw a random result of a calibration of a true rig, with errors of a covariance."""
+        """Draw the result of a calibration of a true rig, with random errors of the covariance."""
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))

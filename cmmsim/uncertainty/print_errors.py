@@ -38,7 +38,7 @@ class PrintErrors:
     ) -> Array:
         """Return the shifts (2, N, n, 2, 2) px of the centres of stickers in both images.
 
-        The last axis is the error, of the size of one standard deviation. The body stands at
+        The last axis has one entry per error of one standard deviation. The body stands at
         camera_from_body (N, 4, 4), and its stickers lie at ``places`` (n, 3).
         """
         turns = camera_from_body[:, None, :3, :3]
@@ -68,7 +68,7 @@ class PrintErrors:
 
 
 def known_errors(file: SensorFile) -> PrintErrors | None:
-    """Return the errors by print of which an estimator with this sensor file knows, or None."""
+    """Return the errors by print whose sizes an estimator with this sensor file knows, or None."""
     sizes = print_sizes(file)
     if file.print.known and (sizes.thickness or sizes.retro_shift):
         return PrintErrors(sizes, file.stickers.radius)

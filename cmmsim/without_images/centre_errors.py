@@ -17,8 +17,8 @@ PRINT_STREAM = 2
 class CentreErrors:
     """Errors of sticker centres by uneven print and by outlines that are not round.
 
-    ``constant`` (2, m, 2) px are those of each sticker in both images, and ``changing_px`` is the
-    rms of those that change from exposure to exposure.
+    ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
+    ``changing_px`` is the rms of the errors that change from exposure to exposure.
     """
 
     constant: Array

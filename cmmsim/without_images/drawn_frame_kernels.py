@@ -78,8 +78,8 @@ class Limits(NamedTuple):
     """Limits for finding a sticker, and properties of the images.
 
     grazing        smallest cosine between the normal of a sticker and the direction to a camera
-    thin_px        mean of the smallest half width of an ellipse
-    thin_std_px    standard deviation of the smallest half width
+    thin_px        mean of the smallest accepted half width of an ellipse
+    thin_std_px    standard deviation of the smallest accepted half width
     largest_gap    largest squared distance of the two rays
     clear          radius around a sticker, in its plane, within which no body may hide a point, m
     vignetting     vignetting of the lens
@@ -306,7 +306,7 @@ def measure_frame(
 ) -> None:  # fmt: skip
     """Fill the measured pose (6,) and its covariance (6, 6), or NaN if the frame is lost.
 
-    The first parameters are those of ``look``. ``verdict`` is filled with the state of the frame.
+    The first parameters are those of ``observe``. ``verdict`` receives the state of the frame.
     """
     observe(scene, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))

@@ -14,7 +14,7 @@ from cmmsim.imaging.scene_bodies import ConvexSolid, Mesh, SceneBody
 if TYPE_CHECKING:
     from cmmsim.without_images.hiding_kernels import Solids
 
-# Radius around a sticker within which nothing must be hidden, in sticker radii. It is about the
+# Radius around a sticker within which no point may be hidden, in sticker radii. It is about the
 # size of the fitted part.
 CLEAR = 1.75
 
@@ -68,8 +68,8 @@ class StickerScene:
     ) -> NDArray[np.bool_]:
         """Return the mask (m,) of stickers that a solid hides wholly or partly.
 
-        Stickers have places and normals (m, 3) in camera axes. Stickers that are not ``asked`` (m,)
-        count as not hidden.
+        Stickers have places and normals (m, 3) in camera axes. Only stickers in the mask ``asked``
+        (m,) are tested; the others count as not hidden.
         """
         from cmmsim.without_images.hiding_kernels import hidden_stickers
 
@@ -88,7 +88,7 @@ class StickerScene:
 
     @cached_property
     def occluders(self) -> "Solids":
-        """Solids in the form of ``hidden_stickers``."""
+        """Solids as ``hidden_stickers`` takes them."""
         from cmmsim.without_images.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]
