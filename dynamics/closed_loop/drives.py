@@ -26,9 +26,9 @@ A law without an integral balances a load by an error: at rest, its command is t
 joint plus the torque over lp.
 
 A drive can receive another command than the one that was sent, by a wrong scale s, a wrong zero z
-of the joint, and steps q of a digital interface:
+of the joint, steps q of a digital interface, and the limits of its range:
 
-    U = s q round(sent / q) + z
+    U = s clip(q round(sent / q), lowest, highest) + z
 """
 
 from collections.abc import Mapping
@@ -156,6 +156,9 @@ class Drives:
         no error.
     command_step : float, optional
         Step q of the received commands, rad or m. The default is no steps.
+    command_limits : tuple of float, optional
+        Lowest and highest command that the drives take, rad or m. They cut others, after rounding
+        them to steps. The default is no limits.
     friction_offset : tuple of float
         Half the difference of the Coulomb friction of each joint in its positive and its negative
         direction, N m or N. It is a constant torque against the joint, which the integral of the
@@ -164,9 +167,10 @@ class Drives:
     Raises
     ------
     SimulationError
-        If a limit, a time constant, a scale or a step is not > 0, if a zero or an offset is not
-        finite, if the law is unknown, if a filter is missing or belongs to another law, or if a law
-        without an integral has an offset of friction.
+        If a limit of torques, a time constant, a scale or a step is not > 0, if a zero, an offset
+        or a limit of commands is not finite, if the lowest command is not below the highest, if the
+        law is unknown, if a filter is missing or belongs to another law, or if a law without an
+        integral has an offset of friction.
 
     Examples
     --------
@@ -181,6 +185,7 @@ class Drives:
     command_scale: float = 1.0
     joint_zeros: tuple[float, ...] = ()
     command_step: float | None = None
+    command_limits: tuple[float, float] | None = None
     friction_offset: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -207,6 +212,11 @@ class Drives:
             real(f"zero of joint {joint}", zero, SimulationError, unit=" rad or m")
         if self.command_step is not None:
             real("step of the commands", self.command_step, SimulationError, above=0)
+        if self.command_limits is not None:
+            check_type("command_limits", self.command_limits, tuple, SimulationError)
+            low, high = self.command_limits
+            real("lowest command", low, SimulationError, unit=" rad or m")
+            real("highest command", high, SimulationError, above=low, unit=" rad or m")
         check_type("friction_offset", self.friction_offset, tuple, SimulationError)
         for joint, offset in enumerate(self.friction_offset, 1):
             real(f"friction_offset of joint {joint}", offset, SimulationError, unit=" N m or N")
@@ -231,20 +241,36 @@ class Drives:
         return _of_joints("friction offsets", self.friction_offset, joints)
 
     def interface(self, joints: int) -> dict[str, float | np.ndarray]:
-        """Scale, step (0: none) and zeros (n,) of the received commands, for kernels.
+        """Scale, step (0: none), limits and zeros (n,) of the received commands, for kernels.
 
         Drives that take torques receive them unchanged.
         """
         received = PID if self.torques else self
+        low, high = received.command_limits or (-np.inf, np.inf)
         return {
             "command_scale": received.command_scale,
             "command_step": received.command_step or 0.0,
+            "command_low": low,
+            "command_high": high,
             "joint_zero": received.zeros(joints),
         }
 
     def sent(self, received: np.ndarray) -> np.ndarray:
         """Commands (n,) that were sent, from those that the drives received, without steps."""
         return (received - self.zeros(len(received))) / self.command_scale
+
+    def check_limits(self, sent: np.ndarray) -> None:
+        """Check that commands (n,) at rest are within the limits. Raises SimulationError."""
+        if self.command_limits is None or self.torques:
+            return
+        low, high = self.command_limits
+        beyond = np.maximum(low - sent, sent - high)
+        joint = int(np.argmax(beyond))
+        if beyond[joint] > 0:
+            raise SimulationError(
+                f"joint {joint + 1} needs the command {sent[joint]:.6g} to stand still at the "
+                f"start, and the drives take commands from {low:g} to {high:g} rad or m"
+            )
 
     def joint_law(self, gains: np.ndarray) -> JointLaw:
         """Law with the gains lp, li, ld of each joint (n, 3), or of all joints (3,)."""

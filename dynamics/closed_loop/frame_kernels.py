@@ -43,7 +43,8 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_command_sensitivity, issued, now.parameters)
         further = plan.start_directions
         copy_rows(further, issued[:, now.parameters :], further.shape[1])
-        scale_received(task, issued, now.width)
+        last = plan.start_commands[len(plan.start_commands) - 1]
+        scale_received(task, last, issued, now.width)
         # at a start at rest, the command comes from the integral of the servo
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
@@ -130,7 +131,7 @@ def issue_command(
             for i in range(len(now.mode)):
                 for j in range(plan.directions.shape[2]):
                     issued[i, now.parameters + j] += plan.directions[k, i, j]
-        scale_received(task, issued, now.width)
+        scale_received(task, record.command[row], issued, now.width)
     return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
 
 
@@ -145,16 +146,22 @@ def received(task: Record, command: float, joint: int) -> float:
     """Command that a drive receives for the one that was sent. See `drives`."""
     if task.command_step > 0:
         command = task.command_step * np.rint(command / task.command_step)
+    command = min(max(command, task.command_low), task.command_high)
     return task.command_scale * command + task.joint_zero[joint]
 
 
 @kernel
-def scale_received(task: Record, rows: Array, width: int) -> None:
-    """Scale the derivatives of sent commands to those of received commands."""
-    if task.command_scale != 1.0:
-        for i in range(len(rows)):
+def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
+    """Scale the derivatives of sent commands (n,) to those of received commands.
+
+    A command that the drives cut at a limit has no derivatives.
+    """
+    for i in range(len(rows)):
+        inside = task.command_low <= sent[i] <= task.command_high
+        scale = task.command_scale if inside else 0.0
+        if scale != 1.0:
             for k in range(width):
-                rows[i, k] *= task.command_scale
+                rows[i, k] *= scale
 
 
 @kernel

@@ -156,7 +156,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("reads", "gain"),
         reals("rate_weight"),
         # commands as the drives receive them
-        reals("command_scale command_step"),
+        reals("command_scale command_step command_low command_high"),
         reals("joint_zero", "joint"),
         # number of columns from the gains of a joint to those of the next
         integers("gain_step"),

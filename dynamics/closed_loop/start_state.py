@@ -213,6 +213,7 @@ def equilibrium(
     net = torque - drives.offsets(len(angles))
     received, integral = law.held(net, angles)
     command = drives.sent(received)
+    drives.check_limits(command)
     by_command, by_integral = law.held_by_parameters(
         net, angles, torque_map, robot.layout.own_gains
     )

@@ -152,7 +152,11 @@ def measure_joints(
     angle = truth[at_encoder].values
     zeros = truth["joint_zero_error"].values if "joint_zero_error" in truth else 0.0
     # commands as the drives receive them, about the true zeros
-    command = zeros + record["command"].values * truth.attrs.get("plant_command_scale", 1.0)
+    sent = record["command"].values
+    for unit in ("rad", "m"):
+        if (limits := truth.attrs.get(f"plant_command_limits_{unit}")) is not None:
+            sent = np.clip(sent, *limits)
+    command = zeros + sent * truth.attrs.get("plant_command_scale", 1.0)
     known = true_parameters(truth)
     joints = range(1, command.shape[1] + 1)
     names = [f"joint{joint}.{gain}" for joint in joints for gain in JOINT_PID]

@@ -295,11 +295,13 @@ def with_command_errors(
     geometry is calibrated. Raises the ScenarioErrors of `true_zeros`.
     """
     off = true_zeros(nominal, switches)
+    limits = of_actuators(nominal, switches, "command_limits")
     drives = replace(
         settings.drives,
         joint_zeros=tuple(off.tolist()) if zeros and off.any() else (),
         command_scale=switches.command_scale,
         command_step=of_actuators(nominal, switches, "command_quantum"),
+        command_limits=None if limits is None else tuple(limits),
     )
     return replace(settings, drives=drives)
 

@@ -183,6 +183,21 @@ class Plant(_Side):
     command_quantum_m: float | None = quantity(
         None, "m", "the same for actuators that slide", gt=0, le=0.01
     )
+    command_limits_rad: list[float] | None = Field(
+        None,
+        description="lowest and highest command that the drives take, rad, the same for all "
+        "joints; they cut commands beyond",
+        min_length=2,
+        max_length=2,
+        json_schema_extra={"unit": "rad"},
+    )
+    command_limits_m: list[float] | None = Field(
+        None,
+        description="the same for actuators that slide, m",
+        min_length=2,
+        max_length=2,
+        json_schema_extra={"unit": "m"},
+    )
     steps_per_frame: int = quantity(
         16, "1", "integration steps per frame; elastic joints take more", ge=1, le=10_000
     )
@@ -234,6 +249,13 @@ class Plant(_Side):
     def drive_law(self) -> DriveName:
         """Law of the drives."""
         return self.drive
+
+    @field_validator("command_limits_rad", "command_limits_m")
+    @classmethod
+    def _limits_are_in_order(cls, limits: list[float] | None) -> list[float] | None:
+        if limits is not None and not limits[0] < limits[1]:
+            raise ValueError(f"the lowest command {limits[0]:g} is not below the highest")
+        return limits
 
     @field_validator("joint_zero_error_rad", "joint_zero_error_m")
     @classmethod

@@ -34,6 +34,7 @@ ACTUATOR_KEYS = {
     "joint_zero_std": ("joint_zero_std_rad", "joint_zero_std_m"),
     "joint_zero_error": ("joint_zero_error_rad", "joint_zero_error_m"),
     "command_quantum": ("command_quantum_rad", "command_quantum_m"),
+    "command_limits": ("command_limits_rad", "command_limits_m"),
     "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
