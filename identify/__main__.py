@@ -19,7 +19,7 @@ def main() -> None:
         raise SystemExit(STOPPED) from None
     finally:
         # If Ctrl-C came in code that Python compiled from a string, Python would end itself by the
-        # signal and ignore the exit status. Running another string makes it forget that.
+        # signal and ignore the exit status. Running another string prevents this.
         exec("")
         # The work is done. Ctrl-C while Python shuts down must not change the exit status.
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)

@@ -114,7 +114,7 @@ def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array
 
 
 def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
-    """Replace the samples (N, k) that are not ok (N,) by interpolation in time.
+    """Replace the samples (N, k) for which `ok` (N,) is False by interpolation in time.
 
     At least one sample must be ok.
     """

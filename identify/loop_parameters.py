@@ -75,7 +75,7 @@ def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:
     try:
         needed = _steps_at_start(robot, side.start_parameters, drives_of(side, None), period)
     except DynamicsError:
-        # a run of the model raises the same error with more evidence
+        # a run of the model raises the same error with more detail
         return side.steps_per_frame
     return max(side.steps_per_frame, needed)
 
@@ -145,7 +145,7 @@ def of_actuators(robot: Robot, section: Section, name: str) -> Any:
 
 
 def in_form(robot: Robot, side: Plant | Model) -> Robot:
-    """Return the robot with the bodies and the passive friction that plant or model state.
+    """Return the robot with the bodies and the passive friction that the plant or model states.
 
     Bodies without a statement stay as they are. Joints share their gains, or each has its own, as
     the plant or the model states. Raises ScenarioError, with the valid names, for a body or a
@@ -193,7 +193,7 @@ def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
 def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
     """Return the robot with shared gains, or gains of each joint, as the plant or the model states.
 
-    Raises ScenarioError for shared gains if they are unequal in the parameter set of this side.
+    Raises ScenarioError if the gains are shared, but unequal in the parameter set of this side.
     """
     own = side.gains == "each"
     layout = robot.layout
@@ -216,9 +216,10 @@ def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
 def known_value(values: Mapping[str, float], name: str) -> float | None:
     """Return the value of a parameter by name, also of a robot whose parameters have another form.
 
-    A first moment, product of inertia or passive friction without a value is zero. A gain or a
-    passive friction of one joint without a value is the shared one, and a shared one is the mean
-    over the joints. The result is None if there is no value.
+    A first moment or product of inertia without a value is zero. If a gain or a passive friction of
+    one joint has no value, the shared value is returned. If a shared one has no value, the mean
+    over the joints is returned. Without any value, a passive friction is zero. In all other cases
+    without a value, the result is None.
     """
     if name in values:
         return float(values[name])

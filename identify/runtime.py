@@ -107,8 +107,7 @@ def raise_interrupt() -> None:
 
 @contextmanager
 def interruptible_imports() -> Iterator[None]:
-    """After Ctrl-C in a `record_interrupts` block, raise KeyboardInterrupt at each import in this
-    block.
+    """Raise KeyboardInterrupt at each import in the block, once `record_interrupts` saw Ctrl-C.
 
     Libraries that look for optional libraries can swallow the exception. All further libraries
     would then be loaded before the command ends, which takes a minute on a busy machine. Clean-up

@@ -26,7 +26,10 @@ from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
 
 DEPENDENT = 1e-8
-"""Remainder below which a column of length one counts as linearly dependent on the pivots."""
+"""Remainder below which a column of length one counts as linearly dependent on the pivots.
+
+The remainder of a column is the length of its part that is orthogonal to the pivots.
+"""
 
 LONG_ENOUGH = 1e-3
 """Smallest remainder of a pivot column, as a fraction of the longest remainder."""
@@ -40,7 +43,7 @@ MOTIONS = 200
 REACH_SHARES = (0.03, 0.01, 0.003, 0.001)
 """Ranges of random positions about home, as shares of the platform's size.
 
-The first range is used in which the robot reaches all poses.
+The largest range in which the robot reaches all drawn poses is used.
 """
 
 TURN = 0.05
@@ -122,9 +125,9 @@ class BaseParameters:
 def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     """Return the base parameters of a regression matrix (rows, p), by pivoted QR.
 
-    Columns that are long enough become pivots in this order: friction, platform, moments and
-    products of inertia of the legs' bodies, their masses, beginning next to the platform, and their
-    first moments. Raises EstimationError if the matrix is zero.
+    Columns that are long enough become pivots in this order: friction; parameters of the platform;
+    then, of the legs' bodies, moments and products of inertia, masses (those near the platform
+    first), and first moments. Raises EstimationError if the matrix is zero.
     """
     names = layout.dynamic_names
     lengths = np.linalg.norm(matrix, axis=0)
@@ -159,7 +162,7 @@ def structure(robot: Robot) -> BaseParameters:
 
 
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
-    """Return the regression matrix (m motions, p) of random motions about home.
+    """Return the regression matrix (m * motions, p) of random motions about home.
 
     Random poses, twists and accelerations excite every parameter that can be excited. Rows are
     wrenches along the m coordinates that the platform can move in. Raises EstimationError, with the
@@ -185,7 +188,7 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
 
 
 def rank_by_singular_values(matrix: Array) -> int:
-    """Return the rank of a regression matrix, with columns of length one, by singular values."""
+    """Return the rank of a regression matrix by the singular values of its scaled columns."""
     lengths = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     return int(np.sum(singular > DEPENDENT * singular[0]))

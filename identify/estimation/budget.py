@@ -3,8 +3,8 @@
 The form is that of the Guide to the Expression of Uncertainty in Measurement (GUM, JCGM 100:2008).
 A source has a standard uncertainty, and a quantity has a sensitivity to the source. Their product
 is what the source adds to the standard uncertainty of the quantity. The squares of the products sum
-up to the square of the combined standard uncertainty. If sources are correlated beforehand, their
-covariances have a separate row, whose square can be negative (GUM, section 5.2).
+up to the square of the combined standard uncertainty. If sources are correlated, the effect of
+their covariances has a separate row, whose variance can be negative (GUM, section 5.2).
 
 The parts come from the matrices of the covariance itself, see `covariance`.
 """

@@ -1,6 +1,6 @@
-"""Hint at a separate clock of the commands, which a record needs but does not state.
+"""Hint that the commands of a record have a clock of their own, which the record does not state.
 
-If the model misses a timed record, the record is identified again with such a clock.
+If the model does not explain a timed record, the record is identified again with such a clock.
 """
 
 from dataclasses import replace
@@ -21,11 +21,11 @@ TRIED_S = 0.03
 """Standard deviation, s, of the clock that is tried."""
 
 EXPLAINS = 0.3
-"""Smallest share of the mean squared residual that a clock must explain to be named."""
+"""Share of the mean squared residual that a clock must explain before a hint is given."""
 
 
 def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tuple[str, ...]:
-    """Return a hint for each timed record that a separate clock of its commands explains.
+    """Return a hint for each timed record whose misfit a separate clock of its commands explains.
 
     warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
     """

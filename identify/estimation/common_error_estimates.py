@@ -1,10 +1,10 @@
 """Estimates of the errors that all poses of a record have in common.
 
 They are a by-product of the identification, a self-calibration. Let r = model - measured be the
-residuals in standard deviations of the noise, J their Jacobian with respect to the parameters, and
-M the modes of the common errors. The parameters p and the errors z, with prior variance one,
-minimise |r + J dp + M z|^2 + |z|^2 plus the prior of p. The search for the parameters eliminates z.
-At its optimum z = -(1 + M^T M)^-1 M^T r.
+residuals in standard deviations of the noise, and J their Jacobian with respect to the parameters.
+The modes M are their changes by one prior standard deviation of each common error. The parameters p
+and the errors z, with prior variance one, minimise |r + J dp + M z|^2 + |z|^2 plus the prior of p.
+The search for the parameters eliminates z. At its optimum z = -(1 + M^T M)^-1 M^T r.
 """
 
 from collections.abc import Sequence
@@ -78,11 +78,11 @@ def errors_in_models(problem: OutputErrorProblem, parameters: Array) -> list[Arr
 
 
 def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
-    """Return the runs for whose common errors numbers are drawn, and a matrix for all runs.
+    """Return the runs that need random numbers for common errors, and a matrix for all runs.
 
-    Records that state the same errors with the same covariance share one set, but each has its own
-    clock and start. The matrix (k, d) maps the standard normal numbers (d,) drawn for the returned
-    runs to those (k,) of all runs, in the order of the records.
+    Records that state the same errors with the same covariance share one set of numbers. Only the
+    errors of its clock and start are each record's own. The matrix (k, d) maps the standard normal
+    numbers (d,) of the returned runs to those (k,) of all runs, in the order of the records.
     """
     holders = [
         next(first for first in runs if first is run or run.common.known_as(first.common))
@@ -178,7 +178,7 @@ def with_first_errors(problem: OutputErrorProblem, whole: Array) -> Array:
 
 
 def clock_notes(records: Sequence[CommonErrorEstimates]) -> tuple[str, ...]:
-    """Return a sentence for each of several records whose commands have a clock of their own."""
+    """Return a sentence for each record whose commands have a clock of their own."""
     notes = []
     for number, found in enumerate(records, start=1):
         std = dict(zip(found.names, found.std.tolist(), strict=True))

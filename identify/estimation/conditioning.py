@@ -3,9 +3,9 @@
 Conditioning tells how much better a record determines some parameters than others. The information
 is in units of the prior: an eigenvalue of one belongs to a direction that the record determines as
 well as the initial guess does. The information with the prior covers all parameters. The
-information of the poses alone covers only the base parameters and the gains, because single
-parameters have none. The direction of the common factor is excluded, because poses never determine
-it (`scale_anchor`).
+information of the poses alone covers only the base parameters and the gains, because poses do not
+determine single parameters. The direction of the factor that is common to all parameters is
+excluded, because poses never determine it (`scale_anchor`).
 """
 
 from dataclasses import dataclass

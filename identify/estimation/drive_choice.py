@@ -1,9 +1,9 @@
 """Choice of the law of the drives, by the evidence of a record for each known law.
 
-Each law is a separate model with a warm start and a search for the optimum of the output error
-under the logged commands, for which residuals are white. The evidence is the probability of the
-record, integrated over all parameters with their prior. Near the optimum the cost is quadratic. By
-Laplace's method
+Each law is a separate model. Its optimum of the output error is searched from a warm start, with
+the logged commands as input, so that the residuals are white. The evidence is the probability of
+the record, integrated over all parameters with their prior. Near the optimum the cost is
+quadratic. By Laplace's method
 
     ln p(record | law) = -(cost + ln det W - ln det P) / 2 + constant,
 

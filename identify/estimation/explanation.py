@@ -3,8 +3,8 @@
 With the right model, noise alone determines the mean squared whitened residual. If the residual is
 significantly larger, the excess is caused by an error of the model. Such an error is correlated
 from frame to frame, and moves an estimate further than white residuals of the same size would.
-Scaling the covariance by the residual (Birge's ratio) is therefore not enough. The scores J^T r of
-stationary residuals with the autocorrelation R_k have the covariance
+Scaling the covariance by the residual (Birge's ratio) is therefore not enough. For stationary
+residuals r with the Jacobian J and the autocorrelation R_k, the scores J^T r have the covariance
 
     sum over frames i, j of J_i^T R_(i-j) J_j
 
@@ -14,12 +14,12 @@ due to the model's error is added to that due to noise. An error that is compens
 parameters does not appear in the residuals. If the model's error makes most of the residual, no
 interval can be trusted, and nothing counts as identified.
 
-A model driven by the logged commands has the same input as the plant. With the right model its
-residuals are the sensor's noise, independent from frame to frame. The portmanteau test of Ljung and
-Box checks their autocorrelations r_k: n (n + 2) sum_k r_k² / (n - k) over the lags k = 1 ... L is
-chi-square distributed with L degrees of freedom. A model that closes its own loop cannot follow the
-effect of the noise on the plant. Its residuals are coloured even if it is right, and are not
-tested.
+A model driven by the logged commands has the same input as the plant. If it is right, its residuals
+are the sensor's noise, independent from frame to frame. The portmanteau test of Ljung and Box
+checks their autocorrelations r_k in n frames: n (n + 2) sum_k r_k² / (n - k) over the lags
+k = 1 ... L is chi-square distributed with L degrees of freedom. A model that closes its own loop
+cannot follow the effect of the noise on the plant. Its residuals are coloured even if it is right,
+and are not tested.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Warnings of full bodies: numbers that a record does not show, and centres of mass outside."""
+"""Warnings about bodies with all ten inertial parameters (full bodies).
+
+They concern parameters that a record does not determine, and centres of mass outside of a body.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +18,7 @@ OUTSIDE_STDS = 3.0
 def full_body_warnings(
     robot: Robot, estimate: Array, covariance: Array, shown: NDArray[np.bool_]
 ) -> tuple[str, ...]:
-    """Return the warnings of the full bodies of a robot with estimates (p,).
+    """Return the warnings about the full bodies of a robot with estimates (p,).
 
     covariance (p, p): covariance of the estimates. shown (p,): True for each parameter that is
     identified or a part of an identified group.
@@ -24,7 +27,7 @@ def full_body_warnings(
 
 
 def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return a warning of the numbers of full bodies that a record does not show at all."""
+    """Return a warning about the parameters of full bodies that a record does not show at all."""
     unseen: dict[str, list[str]] = {}
     for kind, full, rows in zip(layout.kinds, layout.full, layout.body_slices, strict=True):
         if full and not shown[rows].all():

@@ -51,7 +51,7 @@ It converts the sensor's noise into standard deviations of rates and integrals.
 
 @dataclass(frozen=True)
 class Segment:
-    """Segment of a run from frame `first` to frame `last`, the first frame of the next segment.
+    """Segment of a run. Its frame `last` is the frame `first` of the next segment.
 
     state_std (s,): standard deviation of a state that corresponds to the sensor's noise.
     """

@@ -59,7 +59,7 @@ def gains_among(layout: ParameterLayout, kinds: Collection[str]) -> list[str]:
 
 
 FIXED = 1e-9
-"""Factor that makes the standard deviation of a gain negligible if no law reads it."""
+"""Factor that makes the standard deviation of a gain negligible if the drives do not read it."""
 
 
 def starting_guess(

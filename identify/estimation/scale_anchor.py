@@ -4,8 +4,8 @@ Multiplying all masses, inertias, friction and gains by one factor changes no po
 loop (eq. 17 and 31), so that poses alone do not determine this factor. One of these anchors does:
 
     platform_mass   the platform was weighed
-    joint_gain      the proportional gain of the joint PID is known, of the first joint if each
-                    joint has its own
+    joint_gain      the proportional gain of the joint PID is known (that of the first joint, if
+                    each joint has its own)
     payload         a second run with a known load on the platform (`identify.record.conditions`);
                     the record of that run states the standard deviations of the load, which widen
                     the intervals (`covariance`)
@@ -39,7 +39,7 @@ def measured_parameter(anchor: str, layout: ParameterLayout) -> str:
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
 """Standard deviation of an ordinary instrument, by units.
 
-The instrument is a platform balance, kg, or the data of the controller for a gain.
+A balance measures the platform's mass. A gain comes from the data of the controller.
 """
 
 
@@ -61,7 +61,7 @@ class ScaleAnchor:
     std: float | None = None
 
     def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
-        """Return the measurement as equations, in standard deviations.
+        """Return the measurement as k equations, in standard deviations.
 
         They have a matrix (k, p) and a right side (k,). k is 1, or 0 if no parameter was measured.
         """

@@ -1,7 +1,9 @@
 """Linear warm start: a linear fit that provides a start close to the optimum.
 
-The closed-loop equation is linear in all unknowns, so a single linear fit is enough. With the
-logged commands U and the joint coordinates theta of the measured poses, at every instant
+The closed-loop equation is linear in all unknowns, so a single linear fit is enough. Let U be the
+logged commands, theta the joint coordinates of the measured poses, Gamma the regressor of the
+dynamic parameters Xi, J_ad the Jacobian of the joints, and lp, li and ld the gains. At every
+instant
 
     J_ad^-T Gamma(pose, twist, twist_dot) Xi
         - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
@@ -13,8 +15,8 @@ near rest are left out. The equation is homogeneous. The scale anchor and, weakl
 determine the common factor.
 
 This equation is for the PID. In other laws of the drives the torque is also proportional to the
-gains. It is therefore the sum of its derivatives with respect to the gains, times the gains. The
-derivatives of a cascade depend on ratios of the gains, which are taken from the previous fit.
+gains. It is therefore the sum of the gains, each times the derivative of the torque with respect to
+it. The derivatives of a cascade depend on ratios of the gains, taken from the previous fit.
 
 One standard deviation of a common error of the poses or of the geometry shifts theta by e. An error
 of the latency, of the zeros or of the scale shifts U instead. In the equation, shifts are

@@ -2,17 +2,17 @@
 
 The two methods are instrumental variables and total least squares.
 
-Instrumental variables Z are the same matrix, computed from a simulated run of the current model.
-They are free of measurement noise and correlated with the true motion. The solution of
-Z^T (W x - tau) = 0 is therefore unbiased, unlike least squares (Janot, Vandanjon, Gautier, "A
-generic instrumental variable approach for industrial robot identification", IEEE TCST 22(1), 2014).
-The model closes its own loop, because logged commands would bring the sensor's noise into the
-instruments.
+The equations are W x = tau, with the regression matrix W of the measured poses. Instrumental
+variables Z are the same matrix computed from a simulated run of the current model. They are free of
+measurement noise and correlated with the true motion. The solution of Z^T (W x - tau) = 0 is
+therefore unbiased, unlike that of least squares (Janot, Vandanjon, Gautier, "A generic instrumental
+variable approach for industrial robot identification", IEEE TCST 22(1), 2014). The model closes its
+own loop, because logged commands would bring the sensor's noise into the instruments.
 
 Plain total least squares assumes equal and independent errors of all columns. Here all columns are
 computed from the same poses. Therefore the second moments of their errors are sampled: the poses
 are disturbed by random sensor noise, and the columns are computed again. The estimate x~ = (x, -1)
-minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the sampled errors of A. With A = Q R, it is
+minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the sampled errors of A. With A = Q R, x~ is
 R^-1 times the first right singular vector of E R^-1 (generalised total least squares, Van Huffel
 and Vandewalle, "The total least squares problem", SIAM 1991, chapter 10).
 
@@ -123,9 +123,9 @@ SHOWN = 3.0
 """Factor by which the motion must determine a direction better than the prior."""
 
 NOT_GENERIC = 1e-12
-"""Smallest entry of the right side in the singular vector for which there is a solution.
+"""Smallest last entry of the singular vector, relative to its largest, that gives a solution.
 
-It is relative to the largest entry of the vector.
+The last entry belongs to the right side of the equations.
 """
 
 
@@ -133,7 +133,7 @@ It is relative to the largest entry of the vector.
 def total_least_squares(evidence: Evidence) -> Estimate:
     """Estimate by total least squares with drawn errors of the columns.
 
-    Raises EstimationError if the solution is not generic: the torque column has no part in it.
+    Raises EstimationError if the solution is not generic, so that the torques have no part in it.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)

@@ -355,7 +355,7 @@ def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
 def check_periods(settings: Excitation) -> None:
     """Raise TrajectoryError if a run is not a whole number of periods.
 
-    Another run would not end at home and at rest.
+    Such a run would not end at home and at rest.
     """
     if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
         periods = settings.duration_s * settings.fundamental_hz

@@ -19,7 +19,8 @@ hold. An error d of the joint torques moves the pose x by
     x = -S d,
     S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
 
-where E maps pose rates to twists. The pose follows a reference x_d as
+with the mass matrix M and the viscous friction F_v. J_ad maps twists to joint rates, J_theta maps
+pose rates to joint rates, and E maps pose rates to twists. The pose follows a reference x_d as
 
     x = T x_d,    T = S L J_theta C exp(-s t_d).
 
@@ -27,8 +28,9 @@ Only viscous friction is included. Poses, wrenches and Jacobians are along the p
 coordinates.
 
 The robot thus follows each harmonic of the trajectory with a known lag, and the sensitivities are
-filtered columns of the torque regressor along that motion. Let Y be its Fourier coefficients at a
-harmonic, tau = Y Xi the torques, and e = tau / L the joint error that the PID needs for them. Then
+filtered columns of the torque regressor along that motion. Let Y be the regressor's Fourier
+coefficients at a harmonic, Xi the dynamic parameters, tau = Y Xi the torques, and e = tau / L the
+joint error that the PID needs for them. Then
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 

@@ -52,10 +52,10 @@ def _mesh(geometry: RobotGeometry, part: Part) -> trimesh.Trimesh:
 
 
 def stated_mesh(stated: BodyMesh, name: str) -> trimesh.Trimesh:
-    """Return a mesh [m] of a robot file in the axes of its body, which has a name.
+    """Return a mesh [m] of a robot file in the axes of its body.
 
-    Raises RobotFileError for a mesh that is far too large, and cmmsim.SensorFileError for one that
-    cannot be read or is not closed.
+    name: name of the body's part. Raises RobotFileError for a mesh that is far too large, and
+    cmmsim.SensorFileError for one that cannot be read or is not closed.
     """
     where = f"the mesh {stated.file} of {name}"
     mesh = closed_mesh(Path(stated.file), stated.scale, where)

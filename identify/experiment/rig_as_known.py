@@ -31,9 +31,9 @@ from identify.scenario.sections import Rig
 LARGEST_RATIO = 1.5
 """Largest ratio of focal lengths, or of baselines, at which two rigs count as the same."""
 ANGLE = np.deg2rad(10.0)
-"""Largest angle [rad] between right cameras, or between baselines, of rigs that are the same."""
+"""Largest angle [rad] of right cameras, or of baselines, at which two rigs count as the same."""
 SHARE = 0.1
-"""Largest distance of principal points of rigs that are the same, as a share of the image size."""
+"""Largest distance of principal points of such rigs, as a share of the image size."""
 
 
 def known_rig(

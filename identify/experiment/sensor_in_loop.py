@@ -25,7 +25,7 @@ from identify.random_streams import CALIBRATION, TEACHING, stream_seed
 from identify.scenario.sections import Rig
 
 OFF_PLATFORM_M = 0.05
-"""Largest distance, m, of a leg's end from the platform in the sensor file, and of both homes."""
+"""Largest distance, m, from a leg's end to the sensor file's platform, and between both homes."""
 
 OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE names it"
 """Next step if the platform of the sensor is not that of the robot."""
@@ -60,7 +60,7 @@ class SensorPlan:
 
     @property
     def sight(self) -> SightLines:
-        """Stickers and cameras, for the decision which stickers are visible."""
+        """Stickers and cameras, which determine the stickers that are visible."""
         return _sight(self.file)
 
     def covariance(self, pose: Array) -> Array:
@@ -135,7 +135,7 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
 
 
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
-    """Return the distances (n,) [m] of the legs' ends outside the platform of a sensor file.
+    """Return how far (n,) [m] the legs' ends lie outside the platform of a sensor file.
 
     The second value is the distance [m] between the home of this platform and the robot's home.
     """
@@ -150,8 +150,8 @@ def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
 def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
     """Raise ScenarioError if the platform of a sensor file is not the robot's platform.
 
-    This is the case if a leg ends too far outside the platform, or if the homes differ. The message
-    names leg and distance.
+    The platforms differ if a leg ends too far outside the platform, or if the homes differ. The
+    message names leg and distance.
     """
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
@@ -175,7 +175,7 @@ def _sight(file: SensorFile) -> SightLines:
 
 @lru_cache(maxsize=16)
 def _covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
-    """Return the covariance that a sensor states for a pose, which rows of a study share."""
+    """Return the covariance that a sensor states for a pose. It is cached for rows of a study."""
     file = SensorFile.model_validate_json(file_json)
     sensor = cmmsim.Sensor(file, 0, method, renderer="analytic")
     return stated_covariance(sensor, _sight(file), np.array(pose))
@@ -207,8 +207,9 @@ class PoseSensor(Protocol):
 class DrawnFrames:
     """Measurements of a sensor that does not look at the platform, drawn before the run.
 
-    noise (N, 6): what each measurement adds to the true pose, m and rad. covariance (6, 6): of one
-    measurement. lost: the reason for which each frame is lost, empty for a measured frame.
+    noise (N, 6): what each measurement adds to the true pose, m and rad. covariance (6, 6):
+    covariance of one measurement. lost: the reason for which each frame is lost, empty for a
+    measured frame.
     """
 
     noise: Array

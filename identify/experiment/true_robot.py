@@ -78,7 +78,7 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
 
 
 def _gains(layout: ParameterLayout) -> str:
-    """Return the names of the gains of a plant, with the setting for those of another form."""
+    """Return the names of the gains of a plant, with the setting for gains of each joint."""
     names = ", ".join(JOINT_PID)
     if layout.own_gains:
         return f"with plant.gains = 'each' also with {names}"
@@ -93,7 +93,7 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
     # Only the values of this guess are used, so its standard deviation is arbitrary.
     values = starting_guess(robot, switches.parameters, 1.0, drive=switches.drive).values
     layout = robot.layout
-    # a view: all joints have the gains of the plant's drives, if each has its own
+    # a view of the values, with one row per joint, or one row of shared gains
     gains = values[layout.joint_pid].reshape(-1, len(JOINT_PID))
     for name, gain in switches.drive_gains.items():
         gains[:, JOINT_PID.index(name)] = gain

@@ -104,7 +104,7 @@ def _side_by_side(
         while waiting or running:
             unfinished = {process.name for process in waiting + running}
             ready = [one for one in waiting if after.get(one.name) not in unfinished]
-            # others wait for these tasks
+            # tasks for which others wait begin first
             ready.sort(key=lambda one: one.name not in after.values())
             for process in ready[: cores() - len(running)]:
                 waiting.remove(process)

@@ -1,8 +1,8 @@
-"""Atomic writing: a file is written completely or not at all, and a failure is one line.
+"""Atomic writing: a file is written completely or not at all, and a failure gives a one-line error.
 
-The content of a file is made in memory, because some libraries, such as netCDF, crash if their disk
-is full. The content is then written to a temporary file in the same folder, flushed to the disk,
-and renamed.
+The content of a file is made in memory, because some libraries, such as netCDF, crash on a full
+disk. The content is then written to a temporary file in the same folder, flushed to the disk, and
+renamed.
 """
 
 import errno
@@ -187,7 +187,7 @@ def _write_beside(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError:
-        # The message states the free space, which includes that of the incomplete file.
+        # Removed first, so that the message counts the space of the incomplete file as free.
         with suppress(OSError):
             path.unlink(missing_ok=True)
         raise

@@ -31,10 +31,10 @@ def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
 
 
 def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
-    """Return the file of datasets by the names of their groups; the name ``""`` is the main group.
+    """Return the bytes of a file with datasets by the names of their groups.
 
-    Groups are written one by one, because an `xarray.DataTree` would give each truth the
-    coordinates of its record.
+    The name ``""`` is the main group. Groups are written one by one, because an `xarray.DataTree`
+    would give the group of a truth the coordinates of its record.
     """
     stream = io.BytesIO()
     mode: Literal["w", "a"] = "w"
@@ -223,7 +223,7 @@ def plain(value: object) -> object:
 
 
 def as_number(value: object) -> float:
-    """Return an attribute's value as a number; NaN for a truth value or anything else."""
+    """Return an attribute's value as a number; NaN for a boolean or anything else."""
     return (
         float(value)
         if isinstance(value, int | float | np.number) and not isinstance(value, bool)
@@ -250,9 +250,7 @@ def write_covariance(
 
 
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
-    """Return the units of a robot's parameters, and of other quantities, whose names end with
-    units.
-    """
+    """Return the units of a robot's parameters, and of others, whose names end with their units."""
     units = {name: layout.unit(name) for name in layout.names}
     return units | {name: name.rpartition("_")[2] if "_" in name else "1" for name in others}
 
@@ -260,10 +258,10 @@ def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict
 def covariance_netcdf(
     units: Mapping[str, str], covariance: Array, sources: Mapping[str, Array] | None = None
 ) -> bytes:
-    """Return the file of a covariance (p, p) of quantities, which are given by name with
-    their units.
+    """Return the bytes of a file with a covariance (p, p) of quantities.
 
-    `sources` are the parts of the covariance (p, p) by the sources of the uncertainty.
+    `units` are the units of the quantities by their names. `sources` are the parts of the
+    covariance (p, p) by the sources of the uncertainty.
     """
     labels: dict[str, list[str]] = {name: list(units) for name in DIMENSIONS}
     described = {

@@ -32,7 +32,7 @@ class UntrustedFileError(Exception):
 def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None = None) -> Any:
     """Call a function of a module in another process, within the limits, and return its result.
 
-    `limit_s` replaces the time limit, for files that take long in an honest way.
+    `limit_s` replaces the time limit, for valid files that take longer to read.
 
     Raises UntrustedFileError with the reason if a limit is exceeded, if the process dies, or if the
     function raises an exception. Exceptions of `dynamics` pass unchanged.
@@ -70,7 +70,7 @@ def _ended_by_alarm(status: int) -> bool:
 
 
 def serve() -> None:
-    """Read a pickled call from standard input, do it, and write the pickled result or exception."""
+    """Read a pickled call from standard input, run it, and write the pickled result or error."""
     # Output of the library must not be mixed with the bytes of the pickle.
     out = sys.stdout
     sys.stdout = sys.stderr

@@ -36,8 +36,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
-    """Lock a folder for this process during the block. The lock ends with the process at the
-    latest.
+    """Lock a folder for this process during the block, at the latest until the process ends.
 
     Leftovers of a killed process in the folder are removed first. A lock file of another user,
     which cannot be opened, is ignored.
@@ -53,7 +52,7 @@ def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            # Remove the file while it is locked, because no other process can have locked it.
+            # While the file is locked, no other process can lock it, so that it can be removed.
             with suppress(OSError):
                 (folder / LOCK).unlink()
             lock.release()

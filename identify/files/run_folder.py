@@ -1,6 +1,6 @@
 """Folder of a run: its files, the stages that write them, and its figures in result.json.
 
-The figures are standard JSON. A figure that does not exist is null.
+Figures here are numbers, written as standard JSON. A figure that does not exist is null.
 """
 
 import json
@@ -68,7 +68,7 @@ class RunFolder:
 
     @property
     def holds_own_record(self) -> bool:
-        """True if the record is from the user, and follows no trajectory designed here."""
+        """True if the record is from the user, and follows no trajectory of `excite`."""
         return self.experiment.is_file() and not self.trajectories.exists()
 
     @property
@@ -196,8 +196,8 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
     """Return the root mean square of pose errors (N, 6) [m, rad], in um and urad.
 
     ``counted`` (N,) bool selects the rows that count, such as frames that were not lost. The
-    default is all rows. All figures are NaN if no row counts, or if a counted row is not finite: a
-    model that diverged has no error.
+    default is all rows. All figures are NaN if no row counts, or if a counted row is not finite,
+    because a model that diverged has no meaningful error.
     """
     rows = np.asarray(errors, dtype=float)
     rows = rows if counted is None else rows[np.asarray(counted, dtype=bool)]

@@ -33,7 +33,7 @@ def versions() -> dict[str, str]:
 def _version(name: str) -> str:
     """Return the version of a package.
 
-    The version is cached, because a search takes 4 ms for each row of a study.
+    The version is cached, because looking it up takes 4 ms, for each row of a study.
     """
     try:
         return metadata.version(name)
@@ -52,7 +52,7 @@ def product_version() -> str:
 
 
 def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
-    """Compare the versions here with those of other places, such as workers, by the places' names.
+    """Compare the versions of this process with those of other places, such as workers, by name.
 
     Rows from another version of cmmsim belong to another simulation, which is an error. Other
     versions of numerical packages change figures slightly or not at all. A warning names each

@@ -1,14 +1,14 @@
-"""Errors of the bodies and passive joints that a model has in a simpler form.
+"""Errors of a model whose bodies and passive joints are simpler than those of the robot.
 
-A model with centred bodies takes centres of mass to be in their places and products of inertia to
-be zero. A model without friction of passive joints lets them turn freely. Most deviations of a real
+A model with centred bodies assumes centres of mass at their nominal places and products of inertia
+of zero. A model without friction of passive joints lets them turn freely. Most deviations of a real
 robot from such a model leave no residual, because wrong values of the parameters compensate them.
 Their standard deviations are therefore stated, in the robot file or in the scenario. The deviations
 are estimated as errors that all poses of a record have in common, and widen the intervals of the
 parameters.
 
-All bodies of a kind have the same error, each in its own axes, and so have the passive joints at
-one place of all legs, because they are made alike. The errors act as torques at the joints
+All bodies of a kind are made alike, and have the same error, each in its own axes. So do the
+passive joints at the same place in all legs. The errors act as torques at the joints
 (`body_torques`, `joint_torques`). Their effect on the poses is taken as linear.
 """
 
@@ -48,7 +48,7 @@ class BodyError:
     owners : tuple of int
         Rows of the bodies in the layout of the robot. There are none for a passive joint.
     parameters : tuple of str
-        Parameters that are zero in the model, one for each owner, or the friction of the joint.
+        Parameters that the model takes as zero: one for each owner, or the friction of the joint.
     """
 
     kind: str
@@ -102,7 +102,7 @@ def body_errors(run: "LoopModel", parameters: Array) -> Array | None:
 
 
 def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
-    """Return the changes (N, 6) of a run's poses due to its errors of bodies, by their places.
+    """Return, by place of the error, the changes (N, 6) of a run's poses by its errors of bodies.
 
     One run is differentiated along the changes of the commands. If the drives take torques, only
     errors that need no torque are returned. parameters (p,): those of the run. Raises LoopFailure
@@ -128,7 +128,7 @@ def fed_forward(
     """Return further arguments of `simulate_servo` that add the effect of a run's errors of bodies.
 
     The effect is added to the servo's commands. The servo begins at rest, as without the errors.
-    Without errors there are no arguments.
+    Without errors, the result is empty.
     """
     change = run.body_commands
     if change is None:

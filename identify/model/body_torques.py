@@ -2,7 +2,8 @@
 
 A model can lack these parameters. The torques of bodies are columns of the regressor of full
 bodies, and those of passive joints are the columns of `dynamics.rigid_body.passive_friction`. Both
-are evaluated without compiling them, so that a robot in another form costs no time.
+are evaluated without compiling them, so that no time is spent on compiling a robot with other
+parameters.
 """
 
 from collections.abc import Sequence
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 class RunMotion:
     """Motion of a run of the model at its frames.
 
-    poses, twists, twist_dots (N, 6). joint_rates (N, n). torque_maps (N, n, 6): torques of the
-    joints by a wrench on the platform.
+    poses, twists, twist_dots (N, 6). joint_rates (N, n). torque_maps (N, n, 6): matrices that map a
+    wrench on the platform to torques of the joints.
     """
 
     poses: Array
@@ -76,7 +77,7 @@ def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
 
 
 Together = tuple[tuple[str, ...], ...]
-"""Names of parameters of full bodies that act together, for each of k wrenches."""
+"""For each of k wrenches, names of the parameters of full bodies that act together."""
 
 
 @lru_cache(maxsize=8)

@@ -57,11 +57,11 @@ def with_recorded_errors(
     Parameters
     ----------
     run : LoopModel
-        Model without common errors, which need its whitener.
+        Model without common errors. Its whitener is needed for them.
     record : xarray.Dataset
         Record of the run, with the errors of its poses and of the geometry.
     side : ModelSide
-        Kinds of errors, and the standard deviations of those of loop and bodies.
+        Kinds of errors, and the standard deviations of the errors of the loop and of bodies.
     motion : ndarray, shape (N, 6)
         Poses of the run, which show the errors of the geometry.
     own : mapping of str to float
@@ -102,11 +102,11 @@ def with_recorded_errors(
 def loop_error_stds(
     robot: Robot, model: Model, latency_std_s: float, kinds: tuple[str, ...]
 ) -> dict[str, float]:
-    """Return the standard deviations of the errors in the loop by name, of some kinds.
+    """Return, by name, the standard deviations of the errors in the loop of some kinds.
 
-    Errors that are assumed to be zero are left out. latency_std_s: of the mean latency. Raises
-    ScenarioError for standard deviations of another kind of actuators or law of friction, and for
-    those of friction if this kind is left out.
+    Errors that are assumed to be zero are left out. latency_std_s: standard deviation of the mean
+    latency. Raises ScenarioError if a standard deviation belongs to another kind of actuators or
+    another law of friction, or if it belongs to friction and `kinds` leaves friction out.
     """
     found = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
     zero = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
@@ -125,15 +125,15 @@ def loop_error_stds(
 
 
 def zero_name(joint: int, unit: str) -> str:
-    """Return the name of the error of the zero of a joint, which is counted from 0."""
+    """Return the name of the error of a joint's zero. joint: index of the joint, from 0."""
     return f"{ZERO}{joint + 1}_{unit}"
 
 
 def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
-    """Return the standard deviations of what the law of friction leaves open, by name.
+    """Return, by name, the standard deviations of constants of friction.
 
-    These are its constants, and the offset of the friction of each joint. Raises ScenarioError for
-    a law of friction or of the drives that does not have them.
+    These are the constants of its law, and the offset of the friction of each joint. Raises
+    ScenarioError for a law of friction or of the drives that does not have them.
     """
     velocity = f"{STRIBECK_VELOCITY}_{robot.layout.joint_unit}/s"
     stds: dict[str, float] = {
@@ -161,7 +161,7 @@ def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
 def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: FrictionLaw) -> Array:
     """Return the smallest errors (k,) that a loop can contain, in their standard deviations.
 
-    No latency is negative, static friction is not below that of Coulomb, and scale and velocities
+    No latency is negative, static friction is not below Coulomb friction, and scale and velocities
     stay above zero.
     """
     least = {LATENCY: -mean_latency, SCALE: LEAST_SCALE - 1.0}
@@ -197,7 +197,7 @@ def _friction_with(friction: FrictionLaw, errors: Mapping[str, float]) -> Fricti
     velocity = sum(value for name, value in errors.items() if name.startswith(STRIBECK_VELOCITY))
     return replace(
         friction,
-        # rounding of the lowest errors
+        # rounding of the lowest errors can make the ratio slightly smaller than 1
         static_ratio=max(friction.static_ratio + errors.get(STATIC_RATIO, 0.0), 1.0),
         stribeck_velocity=friction.stribeck_velocity + velocity,
     )

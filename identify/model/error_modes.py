@@ -1,4 +1,4 @@
-"""Effect of errors that all poses of a run have in common, by runs of the model with each error.
+"""Effect of errors that all poses of a run have in common, from runs of the model with each error.
 
 Errors that act as changes of the commands need no run of their own: one run is differentiated along
 all of these changes.
@@ -34,8 +34,8 @@ def error_modes(
     """Return the changes (N, 6, k) of a run's poses by one standard deviation of each error.
 
     They are central differences about the common errors that the model contains, at parameters
-    (p,). shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6) by
-    errors that are not simulated, by the place of the error, beside the model's `derived_modes`.
+    (p,). shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6)
+    that need no simulation, by the place of their error. The model's `derived_modes` are added.
 
     Raises LoopFailure if the model is unstable.
     """
@@ -44,7 +44,7 @@ def error_modes(
     known = {**known, **run.derived_modes(parameters)}
     for place, change in known.items():
         modes[:, :, place] = change
-    # Errors of poses beyond the noticed ones change nothing.
+    # Errors of poses in unnoticed directions count as without effect.
     unnoticed = range(run.common.noticed, len(run.common.names))
     moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
     inside = (*run.common.names, *run.common.loop_std, *run.common.body_std)
@@ -71,7 +71,7 @@ def differentiated(
 ) -> tuple[ClosedLoopRun, Array]:
     """Return a run of the model with sensitivities, and the derivatives (N, 6, k) of its poses.
 
-    directions (N, n, k): those of the commands, see `LoopModel.along`.
+    directions (N, n, k): directions of the commands, see `LoopModel.along`.
     """
     room = most_directions(run.moving(parameters, run.robot)[0], run.groups)
     parts = np.split(directions, range(room, directions.shape[2], room), axis=2)

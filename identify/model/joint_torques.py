@@ -1,16 +1,17 @@
 """Torques at the joints as changes of the joint commands with the same effect.
 
-A drive turns a change U of its command into the torque
+A drive with the gains lp, li and ld and the weight c of the commanded rate turns a change U of its
+command into the additional torque
 
     lp U + ld c U_dot + li integral(U)
 
-beside that of the motion (`dynamics.closed_loop.drives`). A torque that a joint needs beside those
-of the model therefore acts as a change of its commands, which follows from this equation command by
-command. A model can thus have torques that its equation of motion lacks.
+(`dynamics.closed_loop.drives`). A torque that a joint needs in addition to those of the model
+therefore acts as a change of its commands, which follows from this equation command by command. A
+model can thus have torques that its equation of motion lacks.
 
-Over a command of the period h, the integral grows by h U for a held command, and for a ramp by the
-mean of U before and after it. The torque T in the middle of a held command, or at the end of a
-ramp, obeys in both cases
+In the period h of a command, the integral grows by h U if the command is held. For a ramp, it grows
+by h times the mean of U before and after the ramp. The torque T in the middle of a held command, or
+at the end of a ramp, obeys in both cases
 
     (lp + b + li h / 2) U_k - (lp + 2 b - li h / 2) U_k-1 + b U_k-2 = T_k - T_k-1,   b = ld c / h.
 """

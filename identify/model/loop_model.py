@@ -89,7 +89,7 @@ class LoopModel:
     bodies: Array | None = None
     groups: RigidGroups | None = None
 
-    begins_in_motion: ClassVar[bool] = False  # True if the start is estimated, and not at rest
+    begins_in_motion: ClassVar[bool] = False  # True if the state at the start is estimated
 
     def driven_by_commands(self) -> "LoopModel":
         """Return a copy of the model with joints driven by the logged commands."""
@@ -100,7 +100,7 @@ class LoopModel:
         return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return a copy with common errors (k,), in standard deviations, that a loop can have."""
+        """Return a copy with common errors (k,), in standard deviations, not below their limits."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         return replace(self, drawn=contained, marginal=None)
 
@@ -140,7 +140,7 @@ class LoopModel:
         return error_modes(self, parameters, lambda run: run.pose, given)
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return the shifts (N, 6) by errors that need no runs of their own, by their places."""
+        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own."""
         return body_modes(self, parameters)
 
     @property
@@ -186,7 +186,7 @@ class LoopModel:
 
     @property
     def contained(self) -> slice:
-        """Places of the common errors that move the model. Errors of poses move it by a servo."""
+        """Places of the common errors that move the model. Errors of poses need a servo for it."""
         return slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
 
     def in_deciding_stds(self, change: Array) -> Array:
@@ -342,7 +342,7 @@ class LoopModel:
         return self.without_common(missed), self.without_common(shown)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters, from those by pivots and other ones."""
+        """Return derivatives (..., p) by all parameters, from those by pivots and the ungrouped."""
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)

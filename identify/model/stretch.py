@@ -19,7 +19,7 @@ from identify.arrays import Array
 from identify.record.stored_common_errors import START
 
 FIRST_S = 0.2
-"""Time, s, from the start of a stretch whose poses determine the start."""
+"""Time, s, after the start of a stretch. The poses in this time determine the start."""
 
 FEWEST = 6
 """Smallest number of poses that determine the start."""
@@ -107,7 +107,7 @@ class Stretch:
         # The integrals have errors of their own, which do not depend on that of the pose.
         held = chart.pose(self.coordinates)
         rest = equilibrium(robot, parameters, held, settings.servo, drives=settings.drives)
-        # A run takes commands from before its start as issued one period apart.
+        # A run assumes that the commands before its start were issued one period apart.
         period = 1.0 / settings.timing.frame_rate_hz
         issued = np.arange(-len(commands), 0) * period
         return StartState(

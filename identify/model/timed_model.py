@@ -114,7 +114,7 @@ class TimedModel(LoopModel):
         return _joined(self._simulated(parameters, True, directions=directions))
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return the shifts (N, 6) by errors that need no runs of their own, by their places.
+        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own.
 
         These are errors of the starts, of the clock and of bodies.
         """
@@ -124,7 +124,7 @@ class TimedModel(LoopModel):
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in their posterior standard deviations.
 
-        The priors are wide, and tell nothing of how well the record determines these errors.
+        The priors are wide, and say nothing about how well the record determines these errors.
         """
         if self.marginal is None:
             return change
@@ -132,9 +132,10 @@ class TimedModel(LoopModel):
         return np.asarray(np.linalg.qr(np.vstack([np.eye(len(change)), modes]), mode="r") @ change)
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
-        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n) at poses.
+        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n).
 
-        They are interpolated between commands one period apart.
+        The torques are those at the times of the poses. The changes are interpolated between
+        commands one period apart.
         """
         timing = self.settings.timing
         grid = grid_times(self.times, timing.frame_rate_hz)
@@ -161,7 +162,7 @@ class TimedModel(LoopModel):
         )
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what is unusual about the record."""
+        """Return a warning for each gap in which commands are missing."""
         return tuple(
             f"commands are missing from t = {before:.2f} s to {after:.2f} s: the model starts anew "
             "after this gap"
@@ -184,7 +185,7 @@ class TimedModel(LoopModel):
     ) -> list[ClosedLoopRun]:
         """Return the runs of the stretches, with the errors that the model contains.
 
-        directions (M, n, k): those of the commands along which the runs are differentiated.
+        directions (M, n, k): directions of the commands along which the runs are differentiated.
         """
         errors = self._loop_errors
         moved, values = self.moving(parameters, robot or self.robot)
@@ -220,7 +221,7 @@ class TimedModel(LoopModel):
         return runs
 
     def _shown_starts(self, parameters: Array) -> dict[int, Array]:
-        """Return the changes (N, 6) of the poses by each error of a start, by the error's place."""
+        """Return, by place of the error, the changes (N, 6) of the poses by errors of a start."""
         runs = self._simulated(parameters, sensitivities=True, by_start=True)
         # The search linearises at the same parameters next.
         self.known_runs[True] = parameters.tobytes(), _joined(runs)
@@ -238,7 +239,7 @@ class TimedModel(LoopModel):
         return found
 
     def _shown_clock(self, parameters: Array) -> dict[int, Array]:
-        """Return the changes (N, 6) of the poses by each error of the clock, by its place.
+        """Return, by place of the error, the changes (N, 6) of the poses by errors of the clock.
 
         The run at the parameters (p,) without a step is cached already.
         """

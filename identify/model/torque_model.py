@@ -1,12 +1,12 @@
 """Model of a record with torque commands, simulated in short spans.
 
-Under logged torques the model has no feedback, and a deviation from the robot grows by about e^7
-per second. Over a span of half a second it stays small. For every set of parameters, the
+Under logged torques the model has no feedback, and a deviation from the robot grows by a factor of
+about e^7 per second. Over a span of half a second it stays small. For every set of parameters, the
 coordinates and rates at the start of each span are fitted to its measured poses by Gauss-Newton.
 The poses of a run are the poses of the fitted spans. Their derivatives with respect to the
 parameters account for the fit of the starts (variable projection in Kaufman's form; BIT 15, 1975).
-Prior knowledge of a start is negligible, so the fit of a start uses 2 m degrees of freedom of the
-residuals of its span.
+Prior knowledge of a start is negligible. For m coordinates of the platform, the fit of a start
+therefore uses 2 m degrees of freedom of the residuals of its span.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -50,7 +50,7 @@ It is so large that the filtered poses hardly affect the fit.
 """
 
 RATE = 20.0
-"""Noise of a filtered rate per noise of a pose, 1/s."""
+"""Ratio of the noise of a filtered rate to the noise of a pose, 1/s."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class TorqueModel(LoopModel):
         return replace(fits[0].run, pose=pose, measured=pose, pose_sensitivity=slopes)
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """Return the model's run. Only its fits are cached, because the next fits start there."""
+        """Return the model's run. Its fits are cached, because the next fits start from them."""
         return self.simulate(parameters, sensitivities)
 
     def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
@@ -163,8 +163,7 @@ class TorqueModel(LoopModel):
 
         The search begins at the start of the previous fit, if there is one and the span can be
         simulated from it. Otherwise it begins at the best start of half of the span, or at the
-        filtered start.
-        Raises LoopFailure.
+        filtered start. Raises LoopFailure.
         """
         near = np.diag(1 / self._width)
         first, last = span
@@ -260,8 +259,8 @@ class TorqueModel(LoopModel):
 def commands_before(run: LoopModel, frame: int) -> tuple[Array, Array | None]:
     """Return the commands (k, n) before a frame that can still act at it, and their latencies.
 
-    For the first frame it is the first command of the run. The latencies (k,) are in s. They are
-    None if all commands have the latency of the timing.
+    For the first frame, the first command of the run is returned. The latencies (k,) are in s. They
+    are None if all commands have the latency of the timing.
     """
     rows = slice(max(0, frame - MAX_DELAY_FRAMES - 2), max(frame, 1))
     latencies = run.latencies

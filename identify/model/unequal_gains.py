@@ -39,9 +39,9 @@ class UnequalGains(LoopModel):
         return self.robot.layout.split(parameters)[3] + self.differences
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return the shifts (N, 6) by errors that need no runs of their own, by their places."""
+        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own."""
         found = super().derived_modes(parameters)
-        # the run that was kept has sensitivities by the gains of each joint
+        # the cached run has sensitivities by the gains of each joint, not by the shared gains
         self.known_runs.clear()
         return found
 

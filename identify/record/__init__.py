@@ -1,1 +1,1 @@
-"""The record of a run, with the motion that was asked for and the loop that made it."""
+"""Records of runs: their data, their provenance, and checks before an identification."""

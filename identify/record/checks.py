@@ -163,7 +163,7 @@ def check_length(frames: int, fewest: int, rate_hz: float, what: str = "the reco
 
 
 def check_good_share(ok: NDArray[np.bool_], seen: Sequence[str] = ()) -> None:
-    """Check that enough frames were measured, those where `ok` (N,) is true.
+    """Check that enough frames were measured. ok (N,): True for measured frames.
 
     The message of the TooFewFramesError ends with `seen`, the warnings of the drift watch.
     """
@@ -242,7 +242,7 @@ The same limit holds for commands and the joint coordinates of the reference.
 BUILT = 0.05
 """Difference of commands from the inverse kinematics that is always allowed.
 
-It is a share of the joints' travel limit, because the real geometry differs from the robot file.
+It is a share of the joints' travel limit. The real geometry differs from the robot file.
 """
 
 OTHER_UNITS = {
@@ -270,7 +270,7 @@ def check_plausible(
 
 
 def check_timed_units(robot: Robot, measured: Array, followed: Array, logged: Array) -> None:
-    """Refuse a record without a reference that is in other units or frames than the robot.
+    """Refuse a record in other units or frames than the robot. The record has no reference.
 
     measured (k, 6): measured poses without lost ones. followed (M, 6): measured poses at the times
     of the commands logged (M, n). Raises EstimationError as `check_plausible` does.

@@ -155,7 +155,7 @@ class PoseColumns(Log):
 
     @property
     def other_conventions(self) -> tuple[str, ...]:
-        """Conventions with as many columns, those that are often mistaken for each other."""
+        """Other conventions with as many columns, for which this one is often mistaken."""
         alike = {3: ("rotation_vector", *EULER_USUAL), 4: ("quaternion_xyzw", "quaternion_wxyz")}
         return tuple(
             name for name in alike.get(len(self.orientation), ()) if name != self.convention
@@ -235,7 +235,7 @@ class Columns(Section):
 
     @property
     def holds_events(self) -> bool:
-        """Whether each row of a table is a pose or a command, at a time of the same column.
+        """Whether poses and commands are rows of one table, with one column of times.
 
         Commands then name the time of the poses again. A row without a pose is no lost pose.
         """

@@ -84,7 +84,7 @@ SAME_S = 1e-9
 def check_command_times(record: xr.Dataset, source: str) -> None:
     """Refuse times of commands that are impossible.
 
-    Raises RecordError with the first frame of that kind.
+    Raises RecordError with the first frame that has such a time.
     """
     if COMMAND_TIME not in record:
         return

@@ -46,7 +46,7 @@ LARGEST = 200_000_000
 BESIDE = ("pair", "stickers", "why", "common_")
 """Beginnings of the columns that `cmmsim measure` writes beside those of a record.
 
-They are not read. Its column ok is that of measured_ok.
+These columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
 """
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
@@ -139,7 +139,7 @@ class Table:
     def _measured_ok(self) -> NDArray[np.bool_]:
         """Return whether the pose of each row (N,) was measured.
 
-        Such a row has no empty measured cell. If the table has a column measured_ok, it is 1.
+        In such a row, no measured cell is empty. In a table with measured_ok, that cell is 1.
         """
         whole = np.asarray(np.isfinite(self.groups["measured"]).all(axis=1))
         if "ok" not in self.groups:
@@ -192,7 +192,7 @@ def read_table(path: Path, robot: Robot) -> Table:
 def lines_of(path: Path, separators: str = ",") -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that is neither empty nor a comment.
 
-    Of several separators of cells, the one that the first line with any of them has most is valid.
+    Of several possible separators, the most frequent one in the first line with any of them counts.
     """
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
     # Spreadsheets write a byte order mark at the beginning, which utf-8-sig removes.

@@ -1,7 +1,7 @@
 """Times of poses: those that a log states, or frames one period apart.
 
 Cameras are triggered by a clock, but logs round times or write them late. Poses of a moving robot
-show which times are right: as a function of these, they lie on smoother curves.
+show which times are right. As a function of the right times, they lie on smoother curves.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from identify.arrays import Array
 from identify.record.smoothness import local_misfit
 
 GAP = 1.5
-"""Time between two rows, in usual times between rows, above which rows are missing."""
+"""Time between two rows, as a multiple of the usual time, above which rows are missing."""
 
 FARTHEST = 0.4
 """Largest distance of a stated time from a frame, in periods, at which it can be of that frame."""
@@ -22,7 +22,7 @@ BETTER = 0.97
 def mean_rate(times: Array) -> float:
     """Return the rate, Hz, of rows at times (N,), s, without their gaps.
 
-    Times that are rounded, as to milliseconds, have another median interval than the rate.
+    If times are rounded, for example to milliseconds, their median interval does not give the rate.
     """
     steps = np.diff(times)
     steps = steps[steps > 0]
@@ -33,8 +33,8 @@ def mean_rate(times: Array) -> float:
 def frame_grid(times: Array, rate_hz: float) -> Array | None:
     """Return times (N,) of frames one period apart that are nearest to stated times (N,), s.
 
-    Frames can be missing. The period is fitted, and starts near that of rate_hz. Returns None if
-    some time is too far from every frame.
+    Frames can be missing. The period is fitted to the times, and is near that of rate_hz. Returns
+    None if some time is too far from every frame.
     """
     steps = np.rint(np.diff(times) * rate_hz)
     frames = np.concatenate([[0.0], np.cumsum(steps)])

@@ -33,8 +33,8 @@ class GeometryErrors:
     """Errors of the geometry of a known robot.
 
     covariance (g, g): covariance of the true geometric numbers about those of the robot, m and rad.
-    poses (N, 6): poses of the run. whitener (6, 6): whitener of its noise. Poses and whitener
-    determine which directions are noticed.
+    poses (N, 6): poses of the run. whitener (6, 6): whitener of the noise of measured poses. Poses
+    and whitener determine which directions are noticed.
     """
 
     robot: Robot
@@ -70,7 +70,7 @@ class GeometryErrors:
     def joints(self, poses: Array) -> Array:
         """Return the changes (N, n, k) of the joint coordinates along each noticed direction.
 
-        poses: (N, 6).
+        poses (N, 6): poses of the platform.
         """
         chart = self.robot.geometry.chart
         held = chart.pose(chart.coordinates(poses))
@@ -120,7 +120,7 @@ def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Arra
 def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
     """Return the covariance (g, g) of the geometric numbers of a record's robot, or None.
 
-    Raises RecordError if its names are other numbers, or if it is not finite or not a covariance.
+    Raises RecordError if it is for other numbers, or if it is not finite or not a covariance.
     """
     if COVARIANCE not in record:
         return None

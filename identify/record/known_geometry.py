@@ -67,7 +67,7 @@ def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = Non
         )
     if fault := covariance_fault(covariance):
         raise ScenarioError(f"{said}: {COVARIANCE} {fault}")
-    # The calibrated numbers are put into the nominal robot, because its functions are compiled.
+    # The calibrated numbers are put into the nominal robot, whose functions are already compiled.
     return KnownGeometry(
         nominal.moved(found.geometry.deviations_from(nominal.geometry)), covariance
     )

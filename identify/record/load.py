@@ -2,9 +2,9 @@
 
 A known load determines the scale of all parameters, if the same motion is made with and without it.
 The load is a rigid body anywhere on the platform: a mass m with its centre of mass c in the frame
-of the platform, and moments of inertia about c along the axes of the platform. It adds to the
-inertial parameters of the platform m, m c, and its inertia about the origin of the frame. If c is
-not the origin, the platform is a full body.
+of the platform, and moments of inertia about c along the axes of the platform. It adds m, m c, and
+its inertia about the origin of the frame to the inertial parameters of the platform. If c is not
+the origin, the platform is a full body.
 
 A record holds the experimenter's values of these figures and their standard deviations. Records
 that state the same figures were made with the same load.
@@ -78,8 +78,8 @@ def payload_vector(
     """Return the change (p,) of a robot's parameters by a load.
 
     `inertia_kg_m2` are the moments about the load's centre of mass, and `centre_m` is this centre
-    in the frame of the platform. For the standard deviations of the figures of a load in the origin
-    it returns the standard deviations of the change. Raises the RecordError of `load_parameters`.
+    in the frame of the platform. For a load at the origin, the standard deviations of its figures
+    give the standard deviations of the change. Raises the RecordError of `load_parameters`.
     """
     return load_parameters(layout, np.array([mass_kg, *centre_m, *inertia_kg_m2], dtype=float))
 
@@ -114,8 +114,8 @@ def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array
     """
     count = len(layout.names)
     stated = record.attrs
-    # A record that states one figure must state all of them. A centre that it does not state is in
-    # the origin.
+    # A record that states one figure must state all of them, except the centre, which is at the
+    # origin by default.
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):
         return np.zeros(count), np.zeros((count, len(ADDED)))
     figures = np.zeros(len(ADDED))

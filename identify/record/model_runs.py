@@ -1,6 +1,6 @@
 """Poses of the initial and the identified model in the runs of a folder, as netCDF (`model.nc`).
 
-They are the groups ``excitation``, ``run01``, ``run02``, ...
+The groups of the file are ``excitation``, ``run01``, ``run02``, ...
 """
 
 from collections.abc import Mapping, Sequence

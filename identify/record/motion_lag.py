@@ -15,10 +15,10 @@ FINEST_S = 1e-3
 """Smallest step, s, of the lags that are tried. The best is then refined by a parabola."""
 
 CLOSE_S = 1.0
-"""Lags, s, up to which another period of a motion is not mistaken for its lag."""
+"""Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion."""
 
 ALIKE = 0.02
-"""Difference of correlations, below which the smaller lag is taken."""
+"""Difference of correlations below which the smaller lag is taken."""
 
 FEWEST = 8
 """Smallest number of poses that overlap with commands."""
@@ -68,14 +68,14 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
         found = np.array(
             [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
         )
-        # A correlation that is good near zero is not looked for farther away.
+        # If a lag near zero has a good correlation, larger lags are not tried.
         if len(found) and found.max() > 1 - 5 * ALIKE:
             break
     if not len(found) or found.max() <= 0:
         return MotionLag(0.0, 0.0)
     good = np.flatnonzero(found >= found.max() - ALIKE)
     nearest = good[np.argmin(np.abs(lags[good]))]
-    # The best of the peak to which the nearest of the good lags belongs.
+    # From the good lag nearest to zero, climb to the peak to which it belongs.
     best = int(nearest)
     while 0 < best < len(lags) - 1 and found[best] < max(found[best - 1], found[best + 1]):
         best += 1 if found[best + 1] > found[best - 1] else -1

@@ -1,7 +1,7 @@
 """Noise and spectrum of measured poses, from the poses alone.
 
-A motion is smooth over a few frames, and the noise of the sensor is not: it is what poses deviate
-from the polynomials through their neighbours (`smoothness`).
+A motion is smooth over a few frames, and the noise of the sensor is not. The noise is therefore
+found from the deviations of poses from polynomials through their neighbours (`smoothness`).
 """
 
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ MOVING = 0.99
 """Share of the power of a motion that lies below its highest frequency."""
 
 MOVES = 2.0
-"""Smallest standard deviation of what moves, in that of its noise."""
+"""Smallest standard deviation of a moving component, as a multiple of that of its noise."""
 
 SEGMENTS = 4
-"""Number of segments of the spectrum, and more as they overlap."""
+"""Number of segments of the spectrum, not counting those that overlap two others."""
 
 SHORTEST = 128
 """Smallest number of frames of a segment, if there are as many."""
@@ -64,7 +64,7 @@ class Spectrum:
 def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     """Return the spectrum of poses (N, 6) that were measured at times (N,).
 
-    Poses are interpolated at even times, which are as many. Positions or angles that move no more
+    Poses are interpolated at as many evenly spaced times. Positions or angles that move no more
     than their noise (6,), m and rad, have no highest frequency.
     """
     even = np.linspace(time[0], time[-1], len(time))

@@ -95,9 +95,9 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
 
 @lru_cache(maxsize=8)
 def _scenario_of(text: str, folder: Path) -> Scenario:
-    """Read the scenario of records, whose paths are relative to the folder, the current one.
+    """Read the scenario of records, with paths relative to the current folder, `folder`.
 
-    Records of one experiment share their scenario, and are checked several times.
+    It is cached, because records of one experiment share it, and are checked several times.
     """
     return scenario_from_toml(text, "the record's attribute scenario")
 
@@ -226,7 +226,7 @@ class RunFiles:
     def content(self, name: str) -> Any:
         """Return the content of a file by its name, such as ``experiment.nc``."""
         stem = name.removesuffix(".nc")
-        # Further records have numbers.
+        # Further records have numbered names, and no property of their own.
         return getattr(self, stem) if hasattr(type(self), stem) else read(self.folder.path / name)
 
     def digests(self, *names: str) -> dict[str, str]:
@@ -290,7 +290,7 @@ def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset]
 def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
     """Return the hexadecimal digest of named arrays of numbers, whatever their order and type.
 
-    The bytes of a file would not do, because they differ each time the file is written.
+    A digest of the bytes of a file would differ each time the file is written.
     """
     whole = sha256()
     for name in sorted(arrays):

@@ -1,6 +1,6 @@
 """Templates of records of users: a table with two example rows, and the TOML file beside it.
 
-For a log of the user's own, the TOML file also has a proposal of what its columns are called.
+For a log of the user's own, the TOML file also has a proposal for the names of its columns.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ def proposed(
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return a path relative to a folder if it lies in it, and else its absolute path."""
+    """Return a path relative to a folder if it lies in the folder, or else its absolute path."""
     whole, inside = path.resolve(), folder.resolve()
     return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)
 

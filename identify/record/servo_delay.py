@@ -1,9 +1,9 @@
-"""Delay from a pose to the command that the visual servo made of it, by the sensor's noise.
+"""Delay from a pose to the servo's command for it, found from the sensor's noise.
 
-The servo computes a command from each measured pose, and the command has the noise of that pose. In
-the commands, noise therefore appears as many rows later as the servo wrote its command. The delay
-is the latency and the difference of the clocks of poses and commands, and neither drives nor
-friction act on it. Without a servo on these poses there is no such noise.
+The visual servo computes a command from each measured pose, and the command has the noise of that
+pose. The noise therefore appears in the commands after the delay. The delay is the sum of the
+latency and the difference of the clocks of poses and commands. Drives and friction do not affect
+it. If no servo used these poses, the commands do not have their noise.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from identify.record.smoothness import windows_of
 from identify.record.telemetry import Telemetry
 
 REACH_S = 0.5
-"""Largest delay, s, that is looked for, of either sign."""
+"""Largest delay, s, of either sign that is tried."""
 
 PARTS = 4
-"""Number of delays within the time between two poses that are tried."""
+"""Number of tried delays per time between two poses."""
 
 CERTAIN = 6.0
-"""Smallest correlation, in standard deviations of that of independent noise."""
+"""Smallest correlation, in standard deviations of the correlation of independent noises."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class ServoDelay:
     correlation : float
         Correlation of the noise of poses and commands, as joint coordinates.
     resolution : float
-        Time between two rows of the commands, s. If these are more than the poses, a command can
-        have been written by this much before the row in which it first stands.
+        Time between two rows of the commands, s. If there are more commands than poses, a command
+        can have been written earlier than its first row by up to this time.
     """
 
     seconds: float
@@ -76,7 +76,7 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
             for delay in delays
         ]
     )
-    # Half of a delay of one command is within the time until the next.
+    # A command is held until the next, so that PARTS delays in a row correlate. Take their middle.
     best = int(np.argmax(np.convolve(np.abs(found), np.ones(PARTS), mode="same")))
     correlation = float(found[best])
     if abs(correlation) * np.sqrt(noise.size) < CERTAIN:
@@ -96,7 +96,7 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
 
 
 def _written(telemetry: Telemetry) -> Array:
-    """Return the times (M,) at which commands were written, or else of their rows."""
+    """Return the times (M,) at which commands were written, or else the times of their rows."""
     commands = telemetry.commands
     return commands.time if commands.written is None else commands.written
 
@@ -104,7 +104,7 @@ def _written(telemetry: Telemetry) -> Array:
 def _held(
     telemetry: Telemetry, rows: NDArray[np.intp], moments: Array, time: Array
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the rows (K,) in which the commands at times (K,) first stand, and the commands."""
+    """Return the rows (K,) in which the commands at times (K,) first appear, and the commands."""
     command = telemetry.commands.command[rows]
     changed = np.concatenate([[True], (np.diff(command, axis=0) != 0).any(axis=1)])
     first = np.maximum.accumulate(np.where(changed, np.arange(len(rows)), 0))
@@ -113,7 +113,7 @@ def _held(
 
 
 def _correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two noises (K, n), of which each column counts alike."""
+    """Return the mean correlation of the n columns of two noises (K, n)."""
     product = (one * other).sum(axis=0)
     scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
     moving = scale > 0

@@ -17,7 +17,7 @@ NEIGHBOURS = 12
 """Number of poses near a pose, through which polynomials go."""
 
 TRUSTED = 9
-"""Number of these that must be right."""
+"""Number of these neighbours that must be right."""
 
 SUBSETS = 30
 """Number of polynomials that are tried for each pose."""
@@ -26,7 +26,7 @@ DEGREE = 6
 """Degree of the polynomial. It follows motions up to a tenth of the frame rate."""
 
 LONGEST = 2.5
-"""Longest time between two poses of a polynomial, in usual times between poses."""
+"""Longest time between two poses of a polynomial, as a multiple of the usual time."""
 
 GROSS = 100.0
 """Squared distance from the prediction above which a pose is a gross error.
@@ -38,7 +38,7 @@ MEDIAN = float(chdtri(6, 0.5))
 """Median of this squared distance for noise alone."""
 
 FEWEST = 30
-"""Smallest number of poses of which some can be called wrong."""
+"""Smallest number of poses in which wrong ones are searched."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Windows:
 
     @property
     def variance(self) -> Array:
-        """Variance (K,) of a deviation by noise, in that of a value."""
+        """Variance (K,) of a deviation due to noise, as a multiple of the variance of a value."""
         return np.asarray(1.0 + np.sum(self.weights**2, axis=1))
 
     def deviations(self, values: Array) -> Array:
@@ -85,11 +85,11 @@ def windows_of(times: Array) -> Windows:
 def wrong_poses(log: PoseLog, covariance: Array) -> NDArray[np.bool_]:
     """Return which poses (N,) of a log are single gross errors.
 
-    covariance (6, 6): of a pose. None are where poses are too few to tell.
+    covariance (6, 6): covariance of a pose. If there are too few poses, none counts as wrong.
     """
     wrong = np.zeros(len(log.ok), dtype=bool)
     good = np.flatnonzero(log.ok)
-    # An invalid covariance is refused later, with all that is known there.
+    # An invalid covariance is refused later, with a better message.
     valid = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0
     if valid and len(good) >= FEWEST:
         wrong[good[gross_errors(log.time[good], log.pose[good], covariance)]] = True
@@ -99,8 +99,8 @@ def wrong_poses(log: PoseLog, covariance: Array) -> NDArray[np.bool_]:
 def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
     """Return the mean squared distance of poses (N, 6) from local polynomials, per component.
 
-    It is in variances of the noise, and about one if the motion is smooth in times (N,), s. The
-    largest tenth of all distances is left out, where the motion has kinks.
+    It is in variances of the noise, and about one if the motion is a smooth function of the times
+    (N,), s. The largest tenth of all distances is left out, because a motion can have kinks.
     """
     white = _whitened(poses, covariance)
     neighbours, powers, _ = _windows(times, np.arange(len(times)))
@@ -112,9 +112,9 @@ def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
 def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.intp]:
     """Return the rows of single poses that are wrong.
 
-    A wrong pose is far from the polynomial through its neighbours, from which the neighbours
-    themselves are not. At a kink of the motion, all poses are far from it. Neighbours can be wrong
-    as well: of several polynomials through most of them, the one to which most are near counts
+    A wrong pose is far from the polynomial through its neighbours, and the neighbours are near the
+    polynomial. At a kink of the motion, all poses are far from it. Neighbours can be wrong as well.
+    Of several polynomials through most neighbours, the one that most of them are near to is used
     (least trimmed squares).
 
     Parameters
@@ -170,15 +170,15 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
 def _still_wrong(
     times: Array, white: Array, wrong: NDArray[np.intp], least: float
 ) -> NDArray[np.intp]:
-    """Return those of some wrong poses that are also far from right ones alone, in their order.
+    """Return the sorted rows of wrong poses that are also far from right poses alone.
 
-    A right pose beside wrong ones can be far from a polynomial through these. wrong: rows, the
-    least wrong first. least: smallest mean squared distance of neighbours.
+    A right pose beside wrong poses can be far from a polynomial through the wrong ones. wrong:
+    rows, the least wrong first. least: smallest mean squared distance of neighbours.
     """
     for row in wrong:
         others = np.delete(np.arange(len(times)), wrong[wrong != row])
         place = np.searchsorted(others, [row])
-        # Wrong poses in a row leave a gap, which is no reason to call their neighbours wrong.
+        # Consecutive wrong poses leave a gap, so that a longer time between poses is allowed.
         neighbours, powers, reached = _windows(times[others], place, 2 * LONGEST)
         squared, leftover = _predicted(white[[row]], powers, white[others[neighbours]])
         if reached[0] and squared[0] <= GROSS * max(least, leftover[0]):
@@ -213,9 +213,9 @@ def _windows(
 def _predicted(white: Array, powers: Array, values: Array) -> tuple[Array, Array]:
     """Predict whitened poses (k, 6) by polynomials through other poses (k, q, 6).
 
-    powers (k, q, DEGREE + 1): powers of the times of these. Returns the squared distances (k,) from
-    the predictions in units of their variance, and the mean squared distances (k,) of the other
-    poses from the polynomials, per component and degree of freedom.
+    powers (k, q, DEGREE + 1): powers of the times of the other poses. Returns the squared distances
+    (k,) from the predictions in units of their variance, and the mean squared distances (k,) of the
+    other poses from the polynomials, per component and degree of freedom.
     """
     base, weights = _weights(powers)
     along = base.transpose(0, 2, 1) @ values

@@ -43,10 +43,10 @@ CLOCK_DRIFT = "clock.drift_s/s"
 START = "start"
 
 OF_RECORD = ("clock", START)
-"""Kinds of errors that each record has for itself, while records share the others."""
+"""Kinds of errors that differ from record to record. Records share all other kinds."""
 
 ASSUMPTIONS = ("centres", "products", "passive_friction")
-"""Kinds of errors of bodies and passive joints that a model has in a simpler form."""
+"""Kinds of errors of a model with simplified bodies and passive joints."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class CommonErrors:
     covariance : ndarray, shape (k, k)
         Covariance of the true values about the known values.
     loop_std : dict of str to float
-        Standard deviations of errors in the loop by name: of the mean latency of the frames, s, of
-        the zero of each joint, and of the scale of the commands. Their effect on the poses needs a
-        model of the loop.
+        Standard deviations of errors in the loop by name, such as those of the mean latency of the
+        frames, s, of the zero of each joint, and of the scale of the commands. A model of the loop
+        is needed to compute their effect on the poses.
     geometry : GeometryErrors, optional
-        Errors of the robot's geometry. Their effect needs a model of the loop, too. None if the
-        geometry is exact.
+        Errors of the robot's geometry. A model of the loop is needed to compute their effect. None
+        if the geometry is exact.
     body_std : dict of str to float
-        Standard deviations of errors of bodies and passive joints by name, with the same need. See
+        Standard deviations of errors of bodies and passive joints by name. See
         `identify.model.body_errors`.
     whitener : ndarray, shape (6, 6), optional
         Whitener of the noise of the poses. It determines the noticed directions of the errors. If
@@ -106,7 +106,7 @@ class CommonErrors:
         return np.array([kind_of(name) in OF_RECORD for name in self.all_names], dtype=bool)
 
     def known_as(self, other: "CommonErrors") -> bool:
-        """Return whether other errors, beside those `of_record`, have the same covariances."""
+        """Return whether other errors, except those `of_record`, have the same covariances."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
@@ -263,5 +263,5 @@ def kind_of(name: str) -> str:
     """Return the kind of a common error, as `identification.nuisances` names it."""
     same = ("exposure", "geometry", "zeros", "scale", FRICTION, "clock", START, *ASSUMPTIONS)
     kinds = {"taught": "teaching", "timing": "latency", **dict(zip(same, same, strict=True))}
-    # Each start of a record has its number.
+    # The name of each start in a record has a number.
     return kinds.get(name.split(".")[0].rstrip("0123456789"), "rig")

@@ -1,8 +1,8 @@
-"""Units, frames and joints of telemetry that are likely wrong, by what would fit instead.
+"""Likely mistakes in the units, frames and joints of telemetry, found by trying alternatives.
 
-A pose and the commands at its time tell the same joint coordinates, but for the lag of the drives
-and the errors of the geometry. Where they do not, the poses are tried in other units, with other
-axes and mirrored, and the commands in other units, directions, orders and zeros.
+A pose and the commands at its time give the same joint coordinates, except for the lag of the
+drives and the errors of the geometry. If they do not, the poses are tried in other units, with
+other axes and mirrored, and the commands in other units, directions, orders and zeros.
 """
 
 from collections.abc import Iterator
@@ -23,13 +23,16 @@ TRIED = 200
 """Number of poses with which other units and axes are tried."""
 
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
-"""Lags, s, of the motion behind the commands with which they are tried."""
+"""Lags, s, of the motion behind the commands that are tried with other units and axes."""
 
 IN_REACH = 0.5
-"""Smallest share of poses in reach, and of those that fit with other units or axes 0.9."""
+"""Smallest share of poses in reach. With a smaller share, other units and axes are tried."""
 
 FITS = 0.9
-"""Smallest correlation of a joint with its command that counts as the same motion."""
+"""Smallest correlation of a joint with its command that counts as the same motion.
+
+It is also the smallest share of poses in reach with units and axes that fit.
+"""
 
 OPPOSES = -0.8
 """Largest correlation of a joint with its command that counts as the opposite direction."""
@@ -184,7 +187,7 @@ def _of_joints(
 
 
 def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]) -> str:
-    """Say that poses are out of reach, with the row of the first, and what would fit."""
+    """Return a message that poses are out of reach, with the first row and what would fit."""
     poses = telemetry.poses
     row = int(np.flatnonzero(poses.ok)[np.argmin(reached)])
     place = poses.rows.place(row)
@@ -199,9 +202,9 @@ def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]
 
 
 def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
-    """Return in which units, and with which axes, the poses would move as the commands do.
+    """Return the units and axes with which the poses would move as the commands do, as a hint.
 
-    Returns an empty string if they fit in none, or not better than now (mean correlation `alike`).
+    Returns an empty string if none fit better than the present ones (mean correlation `alike`).
     """
     poses = telemetry.poses
     rows = np.flatnonzero(poses.ok)
@@ -234,7 +237,7 @@ def _commands_at(telemetry: Telemetry, time: Array) -> Array:
 
 
 def _all_axes() -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Yield names and matrices (3, 3) of all axes, first those that change less."""
+    """Yield names and matrices (3, 3) of all choices of axes, those with fewer changes first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         matrix = np.zeros((3, 3))

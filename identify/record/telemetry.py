@@ -69,8 +69,8 @@ class CommandLog:
     written: Array | None = None
     """(M,): times at which the commands were written to the drives, NaN where none was.
 
-    None if they are not logged. A command then acts the latency of the timing after its row. In a
-    table of commands alone, these are the times of the rows.
+    None if they are not logged. A command then acts after its row by the latency of the timing. In
+    a table of commands alone, these are the times of the rows.
     """
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """Records whose poses and commands have times of their own.
 
-A pose has the time at which it was seen, and a command the time at which it began to act. Both can
-be at any times, and begin in motion. Neither a frame grid nor a reference is needed.
+A pose has the time at which it was seen, and a command the time at which it began to act. These can
+be any times, and a record can begin in motion. Neither a frame grid nor a reference is needed.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ def build_timed_record(
 def _stretches(times: Array, ok: NDArray[np.bool_], acting: Array, gaps: Array) -> NDArray[np.int_]:
     """Return the number of the stretch of each pose (N,), from 1, and 0 for poses in none.
 
-    A stretch begins with a measured pose, once two of its commands act, and ends with the last
-    pose before the command of a gap is replaced.
+    A stretch begins with a measured pose, once two of its commands act. It ends with the last pose
+    before the missing command after its last known command.
     """
     usual = float(np.median(np.diff(acting))) if len(acting) > 1 else 0.0
     known_from = [-np.inf, *gaps[:, 1]]

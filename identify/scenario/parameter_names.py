@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
     """Check that names are parameters of a robot, which is given by name or path.
 
-    Raises ValueError, with the valid names, for another name, and if there is no such robot.
+    Raises ValueError for any other name (with the valid names), or if there is no such robot.
     """
     if not known:
         return

@@ -134,7 +134,7 @@ class Scenario(Section):
                 )
 
     def _complete_from_the_sensor(self) -> None:
-        """Fill in the timing and the note that the scenario does not state from its sensor."""
+        """Fill in, from the sensor, the timing and the note that the scenario does not state."""
         whole = (
             self.timing.model_fields_set.issuperset(IN_FILE)
             and "sensor_note" in self.model_fields_set
@@ -191,9 +191,9 @@ class Scenario(Section):
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
         """Return a copy with values replaced by dotted path.
 
-        An example is ``{"timing.frame_rate_hz": 30.0}``. None restores the default. A path as a
-        value is relative to the current folder, and the copy has it as an absolute path, as for
-        files. Values that this scenario has from its sensor come from the sensor of the copy.
+        An example is ``{"timing.frame_rate_hz": 30.0}``. None restores the default. A value that is
+        a path is relative to the current folder, and becomes an absolute path in the copy. Values
+        that this scenario has from its sensor come from the sensor of the copy.
 
         Raises ScenarioError if a dotted path does not exist (with the valid names) or a value is
         not valid.

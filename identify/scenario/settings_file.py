@@ -59,8 +59,7 @@ class SettingsFiles(Generic[Settings]):
         return self.from_toml(text, source, path.parent)
 
     def text(self, name_or_path: str | Path) -> tuple[str, Path]:
-        """Return the text and the path of a built-in file by name, or of a file of the user by
-        path.
+        """Return the text and the path of a built-in file (by name) or a user's file (by path).
 
         Raises the same errors as `load`.
         """
@@ -79,8 +78,8 @@ class SettingsFiles(Generic[Settings]):
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
         """Read settings from TOML text.
 
-        ``source`` names it in messages. Its paths are relative to ``folder``. Raises the same
-        errors as `load`.
+        ``source`` names the text in messages. Paths in the text are relative to ``folder``. Raises
+        the same errors as `load`.
         """
         return self.from_dict(parse_toml(text, source, self.error), source, folder)
 

@@ -102,9 +102,7 @@ class Timing(Section):
             raise ValueError(f"timing: {error.errors()[0]['ctx']['error']}") from error
 
     def in_sensor_file(self, sensor: str, changes: Mapping[str, Any]) -> "SensorFile":
-        """Return a sensor file, given by name or path, with changes by dotted key and with
-        this timing.
-        """
+        """Return a sensor file (by name or path) with changes by dotted key and this timing."""
         from cmmsim.files import read_sensor_file
 
         file = read_sensor_file(sensor, changes)

@@ -247,7 +247,7 @@ def examination(
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
     groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
-    # The relative error of an almost vanishing difference is meaningless.
+    # The relative error of a base parameter that is almost zero is meaningless.
     shown: NDArray[np.bool_] = groups.identifiable & (
         groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate)
     )

@@ -29,14 +29,14 @@ MOTION = "motion"
 REPETITIONS = 48
 """Number of repeated experiments per motion.
 
-With NEIGHBOURS, they determine the standard deviation of a frame by noise to about 6 %.
+With NEIGHBOURS, they determine the standard deviation due to noise in a frame to about 6 %.
 """
 
 NEIGHBOURS = 5
-"""Number of frames over which the covariance by noise is averaged."""
+"""Number of frames over which the covariance due to noise is averaged."""
 
 SHRINKAGE = 0.02
-"""Weight of the mean over the motion in the covariance by noise of a frame.
+"""Weight of the mean over the motion in a frame's covariance due to noise.
 
 Without it, the covariance would be zero while the platform still rests at the start.
 """
@@ -142,8 +142,8 @@ class _Basis:
     """Predicted poses (N, 6), and what their covariance is made of.
 
     slopes (N, 6, p + k): derivatives of the poses with respect to the parameters and to the numbers
-    of `_known_in_common`, whose covariance is known (p + k, p + k). by_noise (N, 6, 6): covariance
-    of the motion by the sensor's noise.
+    of `_known_in_common`. known (p + k, p + k): covariance of these parameters and numbers.
+    by_noise (N, 6, 6): covariance of the motion due to the sensor's noise.
     """
 
     poses: Array
@@ -152,7 +152,7 @@ class _Basis:
     by_noise: Array
 
     def spread(self, covariance: Array) -> Array:
-        """Return the covariance (N, 6, 6) of the poses by one (p + k, p + k)."""
+        """Return the poses' covariance (N, 6, 6) for one of parameters and numbers like `known`."""
         return np.asarray(self.slopes @ covariance @ self.slopes.transpose(0, 2, 1))
 
 
@@ -184,7 +184,7 @@ def _basis(
 def covariance_by_noise(deviations: Array) -> Array:
     """Return the covariance (N, 6, 6) of the poses of a motion from repeated deviations (r, N, 6).
 
-    Deviations by noise have mean zero, so their second moment is the covariance. It is averaged
+    Deviations due to noise have mean zero, so their second moment is the covariance. It is averaged
     over neighbouring frames, and shrunk towards its mean over the motion.
     """
     each = np.einsum("rni,rnj->nij", deviations, deviations) / len(deviations)
@@ -266,9 +266,9 @@ def predicted_variances(
 ) -> dict[str, Array]:
     """Return the parts (N, 6) of the variance of a prediction by the sources of its uncertainty.
 
-    `sources` (p + k, p + k) are the parts of the covariance by their names. The motion by the
+    `sources` (p + k, p + k) are the parts of the covariance by their names. The motion due to the
     sensor's noise is another source, MOTION, and so are common errors of which the record of the
-    identification tells nothing. `number` of the record, from one on, and `seed` select the noise,
+    identification tells nothing. `number` (of the record, from one on) and `seed` select the noise,
     as in `predicted_runs`. Raises LoopFailure or TooFewFramesError if nothing can be predicted.
     """
     run, rng = _predicting(side, record, seed, number)

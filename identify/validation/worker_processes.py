@@ -28,9 +28,9 @@ def mapped(
     count : int, optional
         Number of processes. None means one process per core.
     function : callable
-        Function of one item of each of the tasks.
+        Function that is called with one item of each of the `tasks`.
     *tasks : iterables
-        Arguments of the function.
+        Items for each argument of the function.
     start : callable, optional
         Function that each process calls first.
     """

@@ -1,6 +1,6 @@
 """Messages of a bag as columns of numbers.
 
-Another process runs these functions, within limits. What they import is therefore little.
+Another process runs these functions, within limits. They therefore import few modules.
 """
 
 import re
@@ -55,7 +55,7 @@ def read_messages(
     Times are seconds, as text with all their digits. Raises the exceptions of rosbags.
     """
     paths = [_steps(name) for name in names]
-    # Each message has a time.
+    # Times tell nothing, because each message has one.
     telling = [place for place, name in enumerate(names) if not _is_time(name)]
     numbers: list[int] = []
     columns: list[list[Entry]] = [[] for _ in names]
@@ -157,5 +157,5 @@ def _columns(message: Any, value: Any, path: str = "") -> Iterator[str]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a number of an array as Python's own."""
+    """Return an entry of an array, with a NumPy number converted to a Python number."""
     return value.item() if hasattr(value, "item") else value

@@ -1,7 +1,7 @@
 """Bags of ROS 2: folders, or files as MCAP or SQLite, read by the package rosbags.
 
-A column is a path in a message, such as ``pose.position.x``. An entry of an array has its number in
-brackets, and that of a joint or of a frame its name: ``position[crank1]``,
+A column is a path in a message, such as ``pose.position.x``. An entry of an array is given by its
+number in brackets, or by the name of its joint or frame: ``position[crank1]``,
 ``transforms[plate].transform.rotation.w``. The column ``log_time`` is the time at which a message
 was written into the bag.
 """
@@ -39,7 +39,7 @@ def is_bag(path: Path) -> bool:
 class Bag:
     """Bag whose topics can be read by name.
 
-    Another process reads it, within limits, because a stranger can have made it.
+    Another process reads it, within limits, because it can come from an untrusted source.
     """
 
     path: Path

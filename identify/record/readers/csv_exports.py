@@ -140,7 +140,7 @@ def _vicon(path: Path, lines: Sequence[Line]) -> dict[str, Part]:
 
 
 def _component_line(path: Path, lines: Sequence[Line]) -> int:
-    """Return the place of the line with the components, which begins with the frames."""
+    """Return the place of the line with the components, which begins with the word Frame."""
     for place, (_, cells) in enumerate(lines):
         if cells[0] == FRAME:
             return place

@@ -76,7 +76,7 @@ class Body:
 
     @property
     def label(self) -> str:
-        """Name for the choice between several."""
+        """Name by which a user chooses one of several bodies."""
         return " ".join(filter(None, (self.place.topic or "", self.stem))) or "the only one"
 
 
@@ -90,7 +90,7 @@ class Joints:
 
     @property
     def label(self) -> str:
-        """Name for the choice between several."""
+        """Name by which a user chooses one of several groups of commands."""
         return " ".join(filter(None, (self.place.topic or "", self.stem))) or self.names[0]
 
 
@@ -138,7 +138,7 @@ def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
 
 
 def joints_of(place: Place, robot: Robot) -> Iterator[Joints]:
-    """Yield the groups of columns, one a joint, that a header names."""
+    """Yield the groups of columns in a header that have one column for each joint."""
     groups: dict[str, dict[str, str]] = {}
     for name in place.header.names:
         if has_word(name, OTHERWISE) or re.search(r"[wxyz]$", without_unit(name).lower()):
@@ -171,7 +171,7 @@ def words_of(name: str) -> list[str]:
 
 
 def has_word(text: str, words: Sequence[str]) -> bool:
-    """Return whether a text has one of some words."""
+    """Return whether a text contains at least one of the words."""
     return bool(set(re.split(r"[^a-z]+", text.lower())) & set(words))
 
 

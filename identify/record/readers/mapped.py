@@ -1,8 +1,8 @@
-"""Telemetry from a log whose columns are called otherwise, as ``[columns]`` says.
+"""Telemetry from a log whose columns have other names, which ``[columns]`` states.
 
-A pose of the log is (R, p) in the log's own frame. Axes that are called otherwise turn it into
-(A R A^T, A p), where A has one entry of 1 or -1 in each row. A with the determinant -1 makes a
-left-handed system right-handed.
+A pose of the log is (R, p), a rotation and a position in the log's own frame. With our names of the
+axes it is (A R A^T, A p), where A has one entry of 1 or -1 in each row. A with the determinant -1
+makes a left-handed system right-handed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ UNIT_LENGTH = 0.01
 """Largest deviation of a quaternion's length from one, and of a matrix from a rotation."""
 
 MOST_RADIANS = 2 * np.pi + 0.1
-"""Largest Euler angle, rad, that is believed. Angles beyond are degrees."""
+"""Largest plausible Euler angle, rad. Larger angles are probably degrees."""
 
 
 def open_log(path: Path) -> LoggedFile:
@@ -127,7 +127,7 @@ class _Reader:
         return ReferenceLog(time, _near_home(poses, robot), stream.rows)
 
     def _stream(self, log: Log, names: list[str], events: bool) -> Stream:
-        """Return the rows of columns: those with a time, and of events those with any cell."""
+        """Return the rows with a time. If rows are events, they also have a cell of the names."""
         path = self.path if log.file is None else self.path.parent / log.file
         file = self.opened.setdefault(path, open_log(path))
         topic = checked_topic(file.headers, log.topic, str(path))
@@ -157,7 +157,7 @@ class _Reader:
 
 
 def _shared(own: Log, measured: PoseColumns) -> Log:
-    """Return where the columns are that stand in the rows of the measured poses."""
+    """Return the place and time of columns that share the rows of the measured poses."""
     place: Mapping[str, object] = {name: getattr(measured, name) for name in Log.model_fields}
     return own.model_copy(update=place)
 
@@ -206,7 +206,7 @@ def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -> Array | None:
-    """Return the covariances (N, 6, 6) of poses (N, 6), NaN where lost. None: no columns have them.
+    """Return the covariances (N, 6, 6) of poses (N, 6), NaN where lost, or None if there are none.
 
     Small shifts and turns of the tracked body, in axes of the log, move the platform as twists do.
     """
@@ -322,7 +322,7 @@ def _from_matrices(matrices: Array, named: str, rows: Rows) -> Rotation:
 
 
 def _near_home(poses: Array, robot: Robot) -> Array:
-    """Return poses (N, 6) whose angles begin in the half turn about home, and do not jump."""
+    """Return poses (N, 6) whose angles begin within half a turn of home, and do not jump."""
     good = np.isfinite(poses).all(axis=1)
     angles = np.unwrap(poses[good, 3:], axis=0)
     turns = np.round((robot.home_pose[3:] - angles[0]) / (2 * np.pi))

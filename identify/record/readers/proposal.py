@@ -2,8 +2,8 @@
 
 Names tell which columns belong together, and units at the end of a name are taken as they stand.
 What a header does not tell, such as the sequence of three angles, is left to the user as a key with
-the value "?", which is refused with the choices until it is answered. What several bodies or
-several groups of columns could be is refused at once, with their names.
+the value "?". This value is refused, with the choices, until the user replaces it. If several
+bodies or several groups of columns are possible, the proposal is refused with their names.
 """
 
 import json
@@ -111,7 +111,7 @@ def propose(
 
 
 def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, robot: Robot) -> None:
-    """Add the table of a pose. `rows` is the place of the measured poses, None for themselves."""
+    """Add the table of a pose. `rows` is the place of the measured poses, or None for their own."""
     header = body.place.header
     made.lines += ["", f"[columns.{table}]"]
     cells = _propose_rows(made, table, body.place, rows, [*body.position, *body.orientation])
@@ -127,7 +127,7 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, ro
     choices = EULER_CHOICES if len(body.orientation) == 3 else "quaternion_xyzw or quaternion_wxyz"
     rotated = "rotation_vector, " if len(body.orientation) == 3 else ""
     why = f"{rotated}{choices}{stated}"
-    # The names of a record of our own say all about its poses.
+    # The names in a record of our own also determine the convention of its poses.
     own = columns_of(robot)
     is_own = (*body.position, *body.orientation) == own[table].names
     convention = "euler_XYZ" if is_own else body.convention
@@ -181,7 +181,7 @@ def _propose_rows(
     found = [name for name in header.names if has_word(without_unit(name), TIMES)]
     if table == "measured":
         found = [name for name in found if not has_word(name, COMMANDED)]
-    # The time in a message is that of the pose, and not that of its way into the bag.
+    # The time in a message is that of the pose. Its log time is when it was written to the bag.
     times = [name for name in found if name != LOG_TIME] or found
     if not times and FRAME in header.names:
         made.lines += [f"time = {_text(FRAME)}", f"time_unit = {_text(FRAMES)}"]
@@ -201,7 +201,7 @@ def _propose_rows(
 
 
 def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> Any:
-    """Return the one that is meant. Raises RecordError with those that there are."""
+    """Return the only entry, or that with a label. Raises RecordError with the labels found."""
     labels = [one.label for one in found]
     if label is None and len(found) == 1:
         return found[0]
@@ -231,7 +231,7 @@ def _unit(header: Header, names: Sequence[str], allowed: Sequence[str]) -> str |
 
 
 def _range(cells: Stream, names: Sequence[str]) -> str:
-    """Say between which numbers the columns lie."""
+    """Return text with the smallest and the largest number in the columns."""
     values = np.concatenate([cells.numbers(name) for name in names])
     if np.isnan(values).all():
         return "all cells are empty"

@@ -39,13 +39,13 @@ class Header:
 
 @dataclass(frozen=True)
 class Stream:
-    """Cells of the columns that were asked for, and the places of their rows."""
+    """Cells of the requested columns, and the places of their rows."""
 
     columns: Mapping[str, Sequence[Cell]]
     rows: Rows
 
     def filled(self, names: Sequence[str]) -> list[int]:
-        """Return the rows in which any of some columns is not empty."""
+        """Return the rows in which at least one of these columns is not empty."""
         columns = [self.columns[name] for name in names]
         cells = zip(*columns, strict=True)
         return [row for row, some in enumerate(cells) if any(c not in (None, "") for c in some)]
@@ -83,8 +83,8 @@ class Stream:
     def moments(self, name: str, unit: str, rate_hz: float) -> list[Decimal]:
         """Return the times (N,) of a column in seconds, exactly.
 
-        Times since 1970 in a float have steps of a quarter of a microsecond. Raises RecordError
-        with the row.
+        A float would round times since 1970 to a quarter of a microsecond. Raises RecordError with
+        the row.
         """
         factor = Decimal(1) / Decimal(rate_hz) if unit == FRAMES else Decimal(TIMES[unit])
         found = []
@@ -109,7 +109,7 @@ class LoggedFile(Protocol):
 
     @property
     def headers(self) -> Mapping[str, Header]:
-        """Headers by topic, or by section of an export; a table has one without a name."""
+        """Headers by topic, or by section of an export. A table has one header named ``""``."""
 
     def read(self, topic: str, names: Sequence[str]) -> Stream:
         """Read columns of a topic. Raises RecordError, and names the columns that there are."""
