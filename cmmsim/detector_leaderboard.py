@@ -326,9 +326,7 @@ def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: in
 def _ratio_interval(
     squared: Array, bounds: Array, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """Return the root of the ratio of mean squared error to mean bound, and its 95 % bootstrap
-    interval.
-    """
+    """Return the root of mean squared error / mean bound, and its 95 % bootstrap interval."""
     if len(squared) == 0:
         return np.inf, np.inf, np.inf
     drawn = rng.integers(len(squared), size=(RESAMPLES, len(squared)))

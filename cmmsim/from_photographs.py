@@ -42,7 +42,7 @@ def sensor_for(name: str | Path) -> Sensor:
 def photographs_for(
     sensor: Sensor, left: Source, right: Source, colour: str | None = None
 ) -> Photographs:
-    """Return pairs of photographs that must fit a sensor. Raises PhotographError."""
+    """Return pairs of photographs, to be checked against a sensor. Raises PhotographError."""
     rate = sensor.timing.frame_rate
     return Photographs(left, right, Format(sensor.rig, sensor.noise, rate, colour))
 
@@ -118,7 +118,7 @@ def measure(
     Returns
     -------
     iterator of MeasuredPair
-        Name, time and measurement of each pair. Its images are read when it is requested.
+        Name, time and measurement of each pair. A pair is read when it is requested.
 
     Raises
     ------

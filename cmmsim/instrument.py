@@ -155,7 +155,7 @@ class Instrument:
 
     @property
     def taught(self) -> Taught:
-        """Result of teaching; teaches on first use."""
+        """Result of teaching, which takes place on first use."""
         return self.teach()
 
     @property

@@ -68,7 +68,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
     rngs = frames.rngs
     expected = frames.expected
     half = 0.5 * camera.exposure * rates
-    # The platform is assumed to move from the expected pose as it truly moves during the exposure.
+    # The platform is assumed at its expected pose in mid-exposure. Its movement is the true one.
     back = expected @ invert(transforms_of(poses))
     first = back @ transforms_of(poses - half)
     last = back @ transforms_of(poses + half)

@@ -55,7 +55,7 @@ LARGEST_GAP = 1e-4
 # Largest rms distance between the two rays of a sticker of the base, in standard deviations. It is
 # 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
-# Distance of a sticker from its place that errors by print may cause, in deviations of these.
+# Distance of a sticker from its place that errors by print may cause, in standard deviations.
 PRINT_REACH = 20.0
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
@@ -179,7 +179,7 @@ class Teacher:
             )
 
     def _constant(self, points: Array) -> Array:
-        """Return the covariances (n, 3, 3) of points that are the same in all views."""
+        """Return the covariances (n, 3, 3) of points due to errors that all views share."""
         return self.observer.settings.allowed.constant_covariances(self.observer.rig, points)
 
     def _look_at(

@@ -1,7 +1,7 @@
 """Stickers of the platform that both cameras see at a pose, and the stated accuracy at that pose.
 
-A sticker counts as visible if it lies in both images, at least a detection window from their edges,
-and neither camera sees it at grazing incidence. Obstacles are not considered.
+A sticker counts as visible if it lies in both images, at least the width of a detection window away
+from their edges, and neither camera sees it at grazing incidence. Obstacles are not considered.
 """
 
 from collections.abc import Mapping

@@ -42,8 +42,8 @@ FIRST_FROM_SECOND = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 StickerRow = tuple[ArrayLike, ArrayLike]
 """Places of the stickers of one side: along (n,) and across (n,) the artefact, m.
 
-Along is counted from the middle of the artefact. Across is counted from the middle line of side A,
-or on sides B and C from the edge to side A.
+Along is counted from the middle of the artefact. Across is counted from the middle line on side A,
+and from the edge that is shared with side A on sides B and C.
 """
 
 
@@ -93,8 +93,8 @@ def _side(
 ) -> StickerPlane:
     """Return one side with its stickers.
 
-    The axis u runs along the artefact, and v = n x u points to +y on all sides. On side C, the
-    ``sign`` is -1, because places across are counted towards -y.
+    The axis u runs along the artefact. With the side's normal n, v = n x u points towards +y on all
+    sides. On side C, ``sign`` is -1, because places across are counted towards -y.
     """
     stickers = [(float(u), sign * float(v)) for u, v in np.column_stack(row)]
     return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0), stickers=stickers)

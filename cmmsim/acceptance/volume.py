@@ -32,7 +32,7 @@ FEWEST_LENGTHS = 5
 SMALLEST_LENGTH_RATIO = 2.0 / 3.0
 # Ratio of a line to its diagonal. The rest leaves space for the ends of the artefact.
 LINE_RATIO = 0.9
-# Test lengths of a line over its longest test length.
+# Test lengths of a line, as shares of its longest test length.
 TEST_LENGTHS = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
 # Ends of the lines, in half sides of the volume.
 LINES = {

@@ -37,11 +37,11 @@ class Board(Section):
     rows        points along y
     spacing     distance between neighbouring points, m; for asymmetric_dots the distance between
                 rows, while dots of the same row are twice as far apart
-    radius      radius of the dots, m; of dots only
+    radius      radius of the dots, m; only for dots
     dark        True if dots are darker than the board
-    marker      side of the markers with their dark border, m; of charuco only
-    dictionary  OpenCV's name of the markers' dictionary, such as "5X5_100" or "APRILTAG_36h11"; of
-                charuco only
+    marker      side of the markers with their dark border, m; only for charuco
+    dictionary  OpenCV's name of the markers' dictionary, such as "5X5_100" or "APRILTAG_36h11";
+                only for charuco
     """
 
     model_config = ConfigDict(strict=True)

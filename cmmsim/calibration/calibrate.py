@@ -46,7 +46,7 @@ LARGEST_UNUSED = 1.0 / 3.0
 # A right camera that stands to the left of the left camera by more than this fraction of the
 # baseline is reported.
 LARGEST_LEFTWARD = 0.5
-# Largest standard deviations without a warning, over the focal length and over the image width.
+# Largest standard deviations without a warning, as shares of focal length and of image width.
 LARGEST_FOCAL_STD = 0.003
 LARGEST_CENTRE_STD = 0.005
 # Smallest angle without a warning between the two board normals that differ most, rad (15 degrees).
@@ -203,7 +203,7 @@ def _with_true_centres(
 def _offsets(
     board: Board, seen: Sightings, state: RigState, side: int, size: tuple[int, int]
 ) -> Array:
-    """Return the eccentricities (m, 2) px: centre of a dot's image minus image of its centre."""
+    """Return the eccentricities (m, 2) px: a dot image's centre minus the dot centre's image."""
     moves = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
     places = (
         np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point])

@@ -62,7 +62,7 @@ class Distances:
 
     @property
     def normalised_error(self) -> float:
-        """Root mean square of the errors over their standard deviations; 1 if these are right."""
+        """Root mean square of errors divided by their standard deviations; 1 if these are right."""
         return float(np.sqrt(np.mean(self.errors**2 / self.variances)))
 
 

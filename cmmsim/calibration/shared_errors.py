@@ -11,10 +11,10 @@ is
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
-so with c common unknowns, Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v =
-N^-1/2 I_v N^-1/2. The ratio of Q to this mean estimates the mean eigenvalue of the true covariance
-relative to sigma² N^-1. This is the mean generalised design effect of Rao and Scott (1981, J. Am.
-Stat. Assoc. 76, 221-230), with a mean that is corrected for leverage.
+so with c common unknowns, Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), where W_v
+= N^-1/2 I_v N^-1/2. The ratio of Q to this mean estimates the mean eigenvalue of the true
+covariance relative to sigma² N^-1. This is the mean generalised design effect of Rao and Scott
+(1981, J. Am. Stat. Assoc. 76, 221-230), with a mean that is corrected for leverage.
 
 The sandwich estimator of Liang and Zeger (1986, Biometrika 73, 13-22) shows which directions are
 affected most. The whitened estimate is N^-1/2 (sum s_v s_v') N^-1/2. The rank of this matrix is the

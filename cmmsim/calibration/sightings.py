@@ -149,7 +149,7 @@ def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
 
 
 def _joined(views: dict[int, BoardView]) -> Sightings:
-    """Return the sightings in all views of one camera, by the index of the view."""
+    """Join the sightings in all views of one camera; the keys are the indices of the views."""
     return Sightings(
         np.concatenate([np.full(len(view.index), k) for k, view in views.items()]),
         np.concatenate([view.index for view in views.values()]),

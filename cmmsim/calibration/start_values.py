@@ -142,7 +142,7 @@ def _read_alike(
     from_left: dict[int, Array],
     from_right: dict[int, Array],
 ) -> tuple[list[PairView], dict[int, Array], Array]:
-    """Choose the order of each right image such that most pairs agree on right_from_left.
+    """Order the points of each right image such that most pairs agree on right_from_left.
 
     Return the pairs in this order, the poses right_from_board by the pair's index, and
     right_from_left (4, 4).

@@ -20,9 +20,9 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 
-# Threshold for the centroid, over the contrast.
+# Threshold for the centroid, as a share of the contrast.
 THRESHOLD = 0.1
-# Threshold that separates the spot from its surroundings, over the contrast.
+# Threshold that separates the spot from its surroundings, as a share of the contrast.
 CORE_THRESHOLD = 0.4
 
 

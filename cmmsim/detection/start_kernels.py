@@ -117,7 +117,7 @@ def moments(window: Array) -> tuple:
     yy = 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
-            # Most pixels fail this comparison, which avoids a division.
+            # This comparison excludes most pixels without a division.
             if window[row, column] - ground < 0.9 * CORE_THRESHOLD * contrast:
                 continue
             share = (window[row, column] - ground) / contrast

@@ -89,8 +89,9 @@ class Distortion:
     def undistort(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Return the undistorted points (..., 2) of distorted points, and whether each was found.
 
-        Newton's method ends at a distance of 1e-12. A point is not found if it is not the image of
-        an undistorted point inside the fold. Its value is then finite but meaningless.
+        Newton's method ends when the image of the result lies within 1e-12 of the given point. A
+        point is not found if it is not the image of an undistorted point inside the fold. Its value
+        is then finite but meaningless.
         """
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import undistort_points

@@ -146,7 +146,7 @@ def rigid_fits(
     """Fit transforms (f, 4, 4) that move known ``places`` (k, 3) to measured ``points`` (k, 3).
 
     ``transforms`` contain start values and are replaced. Points ``starts[j]`` to ``starts[j + 1]``
-    belong to fit j. All points have inverse covariances ``informations`` (k, 3, 3). Fills
+    belong to fit j. The points have inverse covariances ``informations`` (k, 3, 3). Fills
     covariances (f, 6, 6), and misfits (k,), which are squared residuals in units of the noise.
     """
     arm = np.empty(3)

@@ -16,8 +16,8 @@ class Painted(NamedTuple):
     to_stickers   (n, 3, 3), matrices that map pixels to places (u, v, 1) on stickers, in radii
     to_places     (n, 2, 2), derivatives d(u, v) / d(pixels)
     boxes         (n, 4), lowest x, y and highest x, y of the rings, px
-    slopes        (n, 2), movements in (u, v) of the lower edges of the rims
-    shifts        (n, 2), shifts in (u, v) of what is seen of the stickers
+    slopes        (n, 2), apparent shifts in (u, v) of the lower edges of the rims
+    shifts        (n, 2), apparent shifts in (u, v) of the stickers by retro-reflection
     lights        (n, 3), light at the centres, and its changes over a radius along u and v
     faces         (n,), levels of the stickers
     ring, rim     levels of the rings and of the rims

@@ -25,7 +25,7 @@ LARGEST_PASTED_SIZE = 96
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4
-# The same if stickers can be darker than their level.
+# Radiance above which a spot is drawn finely, if stickers can be darker than their level.
 DIM = 0.25
 # px: side of the pieces in which a whole image is distorted and blurred.
 TILE = 64

@@ -67,7 +67,7 @@ def centre_errors_px(file: SensorFile, radius_px: float) -> tuple[float, float]:
     """Return the rms of constant and of changing errors of centres by print, px.
 
     ``radius_px`` is the radius of a sticker in the image. The errors are those of a fit that allows
-    for light that rises.
+    for light that rises across the sticker.
     """
     sizes = print_sizes(file)
     both = np.array([sizes.unevenness, sizes.outline * radius_px])

@@ -41,7 +41,7 @@ class Observations:
     shapes       (2, m, 2, 2), symmetric matrices of the ellipses, px
     base         number of stickers of the base
     normals      (n, 3), of all stickers, in the axes of their places
-    radius       of a sticker, m
+    radius       radius of a sticker, m
     """
 
     pair: NDArray[np.int_]
@@ -59,7 +59,7 @@ class Observations:
         return np.asarray(self.sticker >= self.base)
 
     def selected(self, keep: NDArray[np.bool_]) -> Observations:
-        """Return only some of the observations."""
+        """Return the observations in the mask ``keep`` (m,)."""
         return replace(
             self,
             pair=self.pair[keep],
@@ -74,8 +74,8 @@ class Observations:
 class BundleState:
     """Values of the unknowns.
 
-    ``places`` (n, 3) of all stickers, m; ``poses`` (K, 4, 4) of the platform in each pair; and the
-    ``rig``, which differs from the known rig by ``rig_change`` (24,).
+    They are the ``places`` (n, 3) of all stickers, m, the ``poses`` (K, 4, 4) of the platform in
+    each pair, and the ``rig``. The rig differs from the known rig by ``rig_change`` (24,).
     """
 
     places: Array
@@ -90,7 +90,7 @@ class BundleState:
         )
 
     def _placed(self, seen: Observations, vectors: Array) -> Array:
-        """Return vectors (n, 3) of the observed stickers, turned into the axes of the camera."""
+        """Return, for each observation, the vector of its sticker in camera axes, as (m, 3)."""
         own = vectors[seen.sticker]
         turned = np.einsum("mij,mj->mi", self.poses[seen.pair, :3, :3], own)
         return np.where(seen.moves[:, None], turned, own)
@@ -135,7 +135,7 @@ class Bundle:
     residuals    (2, m, 2), px
     squares      (m,), squared residuals of both images in units of their noise
     factor       sum of ``squares`` per degree of freedom
-    freedom      number of observed numbers minus number of determined unknowns
+    freedom      number of observed coordinates minus number of determined unknowns
     """
 
     state: BundleState
@@ -223,8 +223,8 @@ def _rows(
 ) -> list[tuple[Array, Array, Array]]:
     """Return, for each pair, derivatives and residuals in units of their noise.
 
-    A pair has r observed numbers. Their derivatives are with respect to places and rig (r, 3 n +
-    f), and to the pose of the pair (r, 6).
+    A pair has r observed coordinates. Their derivatives are with respect to places and rig
+    (r, 3 n + f), and to the pose of the pair (r, 6).
     """
     points = state.points(seen)
     by_points, by_rig = state.rig.derivatives(points)

@@ -18,7 +18,7 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.photographs.matching import Spots, candidates, match, spots_in
 from cmmsim.photographs.pairs import Photograph
 
-# Both images of a pair are of one camera if this share of the spots is at the same place, px.
+# Both images of a pair count as images of one camera if this share of the spots agrees to SAME_PX.
 SAME_SHARE = 0.7
 SAME_PX = 1.5
 # Numbers of pairs by which the images of one folder may be late.
@@ -88,7 +88,7 @@ def _same(pair: Spots) -> bool:
 
 
 def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str:
-    """Return what is wrong with the stated noise or point spread, or an empty text.
+    """Return a text about a wrong noise or point spread in the sensor file, or an empty text.
 
     Measuring refuses stickers whose grey values differ too much from a blurred disc. The text names
     the point spread that fits best.

@@ -33,7 +33,7 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.measuring.pose_estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, TAUGHT_TOLERANCE
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# Smallest share of all pairs in which a sticker of the base has the same pixels. It can be hidden.
+# Smallest share of pairs in which a base sticker has the same pixels. It may be hidden in others.
 SHOWN_SHARE = 0.25
 # A point with the same pixels in this share of all pairs does not belong to the platform.
 STANDING_SHARE = 0.6
@@ -162,7 +162,7 @@ def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
         if not free[k] or len(set(owner[own])) < 2:
             continue
         members = np.full(len(pairs), NONE)
-        # Of two candidates of one pair, the one nearer to the point that most agree on is taken.
+        # Of two candidates of one pair, the one nearer to the median of all candidates is taken.
         order = np.argsort(-np.linalg.norm(flat[own] - np.median(flat[own], axis=0), axis=1))
         members[owner[own[order]]] = number[own[order]]
         free[own] = False

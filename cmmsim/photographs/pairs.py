@@ -226,6 +226,6 @@ def _frames_of(path: Path) -> int:
 
 
 def numbered(frames: Iterable[StereoFrame | StereoImages], rate: float) -> Iterator[Photograph]:
-    """Yield frames of a sensor as photographs with the times of a frame rate in Hz."""
+    """Yield frames of a sensor as photographs, with times that follow from a rate in Hz."""
     for number, images in enumerate(frames):
         yield Photograph(str(number), number / rate, images)

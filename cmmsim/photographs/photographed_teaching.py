@@ -66,7 +66,7 @@ class PhotographedTeaching:
     pairs : tuple of str
         Names of all pairs.
     rejected_pairs, rejected_stickers : dict of str to str
-        Reasons by the name of a pair or of a sticker that was not used.
+        Reasons, by the name of each pair or sticker that was not used.
     warnings : tuple of str
         Lines about doubtful results.
 
@@ -230,7 +230,7 @@ def doubts(
     lost: dict[str, str],
     observer: Observer,
 ) -> list[str]:
-    """Return lines about what a user should look at."""
+    """Return warnings about doubtful results, one line each."""
     lines = [f"not used: {one}: {reason}" for one, reason in (missing | lost).items()]
     if judged.bundle.factor > LARGEST_FACTOR:
         lines.append(

@@ -33,8 +33,8 @@ class TaughtFrames:
     base_from_camera  (4, 4)
     base_places       (k, 3), in base axes, m
     places            (n, 3), of the platform's stickers in platform axes, m
-    covariance        (6 + 3 n + 24,) squared: small error of base_from_camera, places, and the
-                      parameters of the rig
+    covariance        (N, N) with N = 6 + 3 n + 24, of the small error of base_from_camera, the
+                      places, and the parameters of the rig
     base_ids          (k,), names of the base's stickers
     platform_ids      (n,), names of the platform's stickers
     effect            (6, 3 n), small error of the platform frame that errors of places cause in a
@@ -146,8 +146,8 @@ def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array
 def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> Array:
     """Return the derivative (6, 3 n) of a registered frame by errors of the platform's places.
 
-    The places (n, 3) are in platform axes, into which ``turn`` (3, 3) turns the axes of the model.
-    Stickers have the mean weight that they have in the photographs.
+    The places (n, 3) are in platform axes. ``turn`` (3, 3) rotates the model's axes into these.
+    The weight of a sticker is its information in all photographs together.
     """
     own = seen.selected(seen.moves)
     by_points = bundle.state.rig.derivatives(bundle.state.points(own))[0]

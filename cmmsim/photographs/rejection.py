@@ -116,7 +116,7 @@ def _left_out(
 ) -> tuple[dict[int, str], dict[int, str]]:
     """Leave out pairs and stickers of which too many centres are left out; return the reasons.
 
-    ``kept`` (m,) is changed.
+    The mask ``kept`` (m,) of centres in use is changed in place.
     """
     pairs: dict[int, str] = {}
     stickers: dict[int, str] = {}

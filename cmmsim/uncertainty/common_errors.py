@@ -196,7 +196,7 @@ class MeasuringGeometry:
         return (view.registered(points) + view.levers @ frames) / np.where(std > 0.0, std, 1.0)
 
     def _taught_by_print(self, print_errors: PrintErrors) -> tuple[Array, Array]:
-        """Errors of teaching per standard deviation of the print's errors.
+        """Return the errors of teaching per standard deviation of the print's errors.
 
         The results (6, 2) and (2, n, 3) have the meaning of those of ``taught_by_rig``. They are
         zero if the sensor was not taught by images.
@@ -224,8 +224,8 @@ class MeasuringGeometry:
     def _teaching_points(self) -> tuple[Array, Array, Array]:
         """Stickers of the base, camera_from_platform on the path of teaching, and all points.
 
-        The shapes are (b, 3), (v, 4, 4) and (m, 3). All points that teaching sees are those of the
-        base, then those of each view.
+        The shapes are (b, 3), (v, 4, 4) and (m, 3). The m points are those of the base, then those
+        of the platform in each view.
         """
         path = self.camera_from_base @ transforms_of(teaching_path(self.home, TEACHING_POSES))
         base = apply(self.camera_from_base, self.taught.base_places)
@@ -293,7 +293,7 @@ class _View:
 
     @property
     def levers(self) -> Array:
-        """Matrices (N, 6, 6) from small errors of base_from_camera to those of base_from_platform.
+        """Matrices (N, 6, 6) that map errors of base_from_camera to errors of base_from_platform.
 
         Both errors are in base axes.
         """

@@ -26,7 +26,7 @@ class CentreErrors:
 
     @classmethod
     def of(cls, file: SensorFile, radius_px: float, count: int) -> CentreErrors:
-        """Draw the errors of m stickers, with the radius ``radius_px`` in the image."""
+        """Draw the errors of ``count`` stickers with the radius ``radius_px`` in the image."""
         constant, changing = centre_errors_px(file, radius_px)
         rng = np.random.default_rng([file.print.seed, PRINT_STREAM])
         return cls(constant * rng.standard_normal((2, count, 2)), changing)

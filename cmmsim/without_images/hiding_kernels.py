@@ -100,7 +100,7 @@ def hidden_stickers(
         for b in range(len(camera_from_bodies)):
             if b == owners[n] or hidden[n]:
                 continue
-            # Two cheap tests first: most solids are far from the line of sight.
+            # Two cheap tests come first, because most solids are far from the line of sight.
             if not reaches(camera, places[n], middles[b], solids.radii[b] + clear):
                 continue
             eye = eyes[b]

@@ -229,7 +229,7 @@ class StatisticalTracker:
         return MeasuredPoses(found, spreads, stickers)
 
     def _scene_of(self, camera: StatisticalStereoCamera) -> StereoScene:
-        """Return the cameras and their scene in the form of the kernels.
+        """Return the cameras and their scene as the kernels take them.
 
         If only the cameras have changed since the last frame, the scene is reused.
         """
@@ -261,7 +261,7 @@ class StatisticalTracker:
 
 
 def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoScene:
-    """Return the cameras and their scene in the form of the kernels."""
+    """Return the cameras and their scene as the kernels take them."""
     settings = estimator.settings
     taught = estimator.taught
     own = camera.scene.owners == 0
