@@ -1,6 +1,6 @@
 """Checked arguments of a run: times of its frames, commands, and directions of the commands.
 
-The poses of a run can be differentiated along directions of its commands.
+A direction is a change of all commands, along which the poses of a run can be differentiated.
 """
 
 import numpy as np
@@ -19,7 +19,8 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     robot : Robot
         Robot of the run.
     groups : RigidGroups, optional
-        As for `differentiate_servo`. Columns that they spare are free for directions.
+        Groups as for `differentiate_servo`. They need fewer columns than single parameters, which
+        leaves more columns for directions.
 
     Returns
     -------
@@ -41,17 +42,17 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     shown = len(layout.names)
     if groups is not None:
         shown -= len(layout.rigid_names) - len(groups.pivots)
-    # one column is for the length of a step that an event cuts
+    # one column is for the length of a step that an event shortens
     return layout.derivatives(len(robot.geometry.chart.freedoms)) - shown - 1
 
 
 def checked_directions(
     directions: object, before: object, shape: tuple[int, int], most: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (frames, n, k) of commands of a shape (frames, n), with k <= `most`.
+    """Checked directions (frames, n, k) of the commands of a run, and (n, k) of those before it.
 
-    The second array (n, k) has those of the commands from before the start, zero if `before` is
-    None. None as `directions` has k = 0. Raises SimulationError.
+    `shape` is (frames, n). If `directions` is None, k is 0. If `before` is None, the commands
+    before the start do not change. Raises SimulationError, also for k above `most`.
     """
     directions = np.zeros((*shape, 0)) if directions is None else directions
     given = np.asarray(directions)
@@ -80,9 +81,9 @@ def checked_times(times: object, frames: int) -> np.ndarray:
 def held_commands(
     commands: object, shape: tuple[int, int], before: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Commands (frames, n) with rows of NaN replaced by the command before, and which are given.
+    """Commands (frames, n), with rows of NaN replaced by the command before, and a mask (frames,).
 
-    Raises SimulationError for a row of which only a part is NaN.
+    The mask is True for given rows. Raises SimulationError for a row of which only a part is NaN.
     """
     given = floats("commands", commands, shape, error=SimulationError, finite=False)
     missing = np.isnan(given)

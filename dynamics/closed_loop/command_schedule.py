@@ -18,18 +18,17 @@ from dynamics.closed_loop.problem import LoopProblem
 Instant = tuple[int, float]
 """Frame, and time since that frame, s.
 
-In this form, equal delays give equal spans in all frames.
+Times are kept in this form so that equal delays give exactly equal spans in all frames.
 """
 
 
 class CommandSchedule(NamedTuple):
     """Spans of time in which one command acts. Each span ends with its frame at the latest.
 
-    The spans of frame k are first[k] to first[k + 1]. The other arrays have one entry per span.
-    `command` is the number of the frame that issued the command; it is negative before the start.
-    `ramp` is the fraction of the ramp from the previous command that is done at the beginning of
-    the span; at 1, the command is constant. `duration` is in s, and `steps` is the number of
-    integration steps.
+    The spans of frame k have the indices first[k] to first[k + 1] - 1. The other arrays have one
+    entry per span. `command` is the number of the frame that issued the command; it is negative
+    before the start. `ramp` is the fraction of the ramp that is done when the span begins. If it is
+    1, the command is constant. `duration` is in s, and `steps` is the number of integration steps.
     """
 
     first: np.ndarray
@@ -42,7 +41,8 @@ class CommandSchedule(NamedTuple):
 def command_schedule(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run.
 
-    Commands issued before the run have the latencies of the start state, or else of the timing.
+    Commands issued before the run have the latencies of the start state. If it has none, they have
+    the latency of the timing.
     """
     if problem.times is not None:
         return _schedule_at_times(problem)
@@ -69,7 +69,7 @@ def _schedule(
     steps_per_frame: int,
 ) -> CommandSchedule:
     earlier = [_delay(s, period) for s in before]
-    # the first command has a number so low that it arrives, and its ramp ends, before the run
+    # the oldest command is so old that it arrives before the run, and its ramp ends before the run
     oldest = -max(delay_frames for delay_frames, _ in earlier) - 2
     delays = [earlier[max(0, len(earlier) + n)] for n in range(oldest, 0)]
     delays += (
@@ -97,7 +97,7 @@ def _schedule(
         under_way = linear and begin < (arrived[0] + 1, arrived[1])
         since = (begin[0] - arrived[0]) * period + (begin[1] - arrived[1])
         ramp.append(since / period if under_way else 1.0)
-        # the last span of a frame is the rest of the period, so that the sum is exact
+        # the last span of a frame is the rest of the period, so that spans add up to one period
         duration.append(period - begin[1] if end[0] > begin[0] else end[1] - begin[1])
     return CommandSchedule(
         first=_fixed(
@@ -121,8 +121,8 @@ SAME_S = 1e-9
 def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run whose frames are at given times.
 
-    Commands from before the run are taken as one period apart, the last one a period before the
-    run.
+    It is assumed that commands from before the run are one period apart, and that the last of them
+    was issued one period before the run.
     """
     timing = problem.settings.timing
     times = problem.frame_times
@@ -144,7 +144,7 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     inside = np.concatenate([arrivals, arrivals + period] if linear else [arrivals])
     inside = inside[(inside > times[0]) & (inside < times[-1])]
     begins = np.unique(np.concatenate([times, inside]))
-    # of two instants that count as one, only a frame or the later one begins a span
+    # an instant that counts as one with the next begins no span, unless it is a frame
     kept = np.append(np.diff(begins) > SAME_S, True) | np.isin(begins, times)
     begins = begins[kept]
     newest = np.maximum(np.searchsorted(arrivals, begins, side="right") - 1, 0)
@@ -162,12 +162,12 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
 
 
 def acting_times(issued: np.ndarray, latencies: np.ndarray) -> np.ndarray:
-    """Times (frames,) at which commands act, from those at which they are issued, s."""
+    """Times (frames,) at which commands begin to act, s, from their times of issue, s."""
     return np.array(_in_order((issued + latencies).tolist()), dtype=float)
 
 
 def _in_order(arrivals: list[Any]) -> list[Any]:
-    """Arrivals of commands in order: none is before the previous one."""
+    """Arrivals of commands, delayed where needed so that none is before the previous one."""
     return list(accumulate(arrivals, max))
 
 

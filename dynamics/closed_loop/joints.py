@@ -1,12 +1,12 @@
 """Joints: laws of dry and viscous friction, and springs between motors and cranks.
 
-Friction (eq. 24) is, in N m,
+The friction of a joint with the velocity theta_dot is, in N m (eq. 24, where dry is the sign),
 
     torque = coulomb * dry(theta_dot) + viscous * theta_dot
 
 Elastic joints have a spring between each motor and the body that it drives, which is a crank or a
-slider (Spong, J. Dyn. Sys. Meas. Control 109, 1987). Let q be the pose, phi the motor angles as
-they turn the cranks, and theta(q) the crank angles. Then
+slider (Spong, J. Dyn. Sys. Meas. Control 109, 1987). Let q be the pose, M the mass matrix, b the
+bias, phi the motor angles referred to the cranks, and theta(q) the crank angles. Then
 
     spring torque = stiffness (phi - theta) + damping (phi_dot - theta_dot)
     M q_ddot + b = J_theta^T spring torque
@@ -53,8 +53,8 @@ class FrictionLaw:
     name : {"coulomb_viscous", "smoothed", "stribeck"}
         coulomb_viscous has the exact sign of eq. 24 and sticks up to the Coulomb torque. smoothed
         has tanh(theta_dot / smoothing_velocity) and never sticks. stribeck sticks up to
-        static_ratio times the Coulomb torque. When the joint slips, the excess fades as
-        exp(-(theta_dot / stribeck_velocity)^2).
+        static_ratio times the Coulomb torque. When the joint slips, the excess over the Coulomb
+        torque fades as exp(-(theta_dot / stribeck_velocity)^2).
     smoothing_velocity : float, optional
         Velocity over which the smoothed law changes its sign, rad/s.
     static_ratio : float, optional
@@ -93,7 +93,7 @@ class FrictionLaw:
         least: float | None = None,
         unit: str = "",
     ) -> None:
-        """Raise SimulationError unless a constant is given for its law, and for no other."""
+        """Raise SimulationError if a constant is missing, wrong, or given for another law."""
         value = getattr(self, constant)
         if self.name == law:
             real(
@@ -134,7 +134,7 @@ class FrictionLaw:
 
 
 LARGEST_STEP = 1.0
-"""Largest product of eigenvalue and step length. The Runge-Kutta method is unstable from 2.8 on."""
+"""Largest product of eigenvalue and step length. The Runge-Kutta method is unstable above 2.8."""
 
 
 @dataclass(frozen=True)
@@ -197,9 +197,9 @@ class JointElasticity:
     ) -> int:
         """Integration steps per frame that resolve the fastest motion near a pose (6,).
 
-        The fastest motion has the largest eigenvalue of joints and motors under joint PID and
-        friction, linearised at rest. Raises SimulationError if a motor has more inertia than its
-        crank.
+        The rate of the fastest motion is the largest eigenvalue of the joints and motors under
+        joint PID and friction, linearised at rest. Raises SimulationError if the inertia of a motor
+        is not below that of its crank.
         """
         self._check_motors(robot, parameters)
         basis = robot.geometry.chart.basis
@@ -227,7 +227,7 @@ class JointElasticity:
         )
 
     def _check_motors(self, robot: Robot, parameters: np.ndarray) -> None:
-        """Raise SimulationError if a motor has more inertia than the body that includes it."""
+        """Raise SimulationError if the inertia of a motor is not below that of its driven body."""
         layout = robot.layout
         bodies = layout.bodies_of(parameters)
         driven = [
@@ -245,7 +245,7 @@ class JointElasticity:
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """Matrix (2 n, 2 n) of stiffnesses, or of dampings, of the coordinates of bodies and motors.
+    """Matrix (2 n, 2 n) of stiffness, or of damping, for the coordinates of bodies, then motors.
 
     `spring` is the value between each body and its motor, and `at_motor` (n,) are the values
     between the motors and the base.

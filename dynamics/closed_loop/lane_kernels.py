@@ -73,7 +73,7 @@ def evaluate_lanes(
             hold_stuck(task, own, stage, 1)
         else:
             own.known.valid = False
-            # the evaluation of a single run finds the status of the failure
+            # the kernel for a single run finds out why the evaluation failed
             own.status = invoke(task.evaluate, task, own, stage, d, 0)
 
 
@@ -104,7 +104,7 @@ def take_lane(lanes: Record, lane: int, into: Record) -> None:
 
 @kernel
 def know_lane(now: Record, at: Record, lanes: Record, lane: int) -> None:
-    """Store the terms at the end of a span, where the next span begins."""
+    """Store the terms at the end of a span, because the next span begins with them."""
     known = now.known
     size = len(at.bias)
     copy(at.state[: 2 * size], known.inputs[: 2 * size])
@@ -131,8 +131,8 @@ def run_lanes(
 ) -> None:
     """Run all frames of several runs, one in each lane.
 
-    The rows of consecutive runs in `plan` and `record` follow each other. Each run has its own
-    status and frame.
+    In `record`, and in the noise of `plan`, the rows of each run follow those of the run before.
+    Each run has its own status and frame.
     """
     frames = len(plan.spans.first) - 1
     asked = lanes.asked

@@ -1,6 +1,6 @@
 """Small dense linear algebra, for vectors and for rows of derivatives.
 
-A row holds the derivatives of one unknown, and each column those with respect to one variable.
+Each row holds the derivatives of one unknown. Each column is for one variable.
 """
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part
@@ -41,7 +41,7 @@ def dot(row: Array, vector: Array) -> float:
 
 @part
 def copy(source: Array, into: Array) -> None:
-    """Copy a vector. The loop compiles a second faster than the assignment of a slice."""
+    """Copy a vector. Compiling this loop takes 1 s less than compiling a slice assignment."""
     for k in range(len(source)):
         into[k] = source[k]
 

@@ -118,10 +118,10 @@ class ServoGains:
             real(f"servo gain {name}", getattr(self, name), SimulationError, least=0)
 
     def demand(self, error: np.ndarray, rate_error: np.ndarray, integral: np.ndarray) -> np.ndarray:
-        """Demand (n,) of the servo in the coordinates of the platform, eq. 30.
+        """Demand (m,) of the servo in the coordinates of the platform, eq. 30.
 
-        It follows from the error (n,) of the pose, its rate and its integral. The compiled loop has
-        the same law in `visual_servo_kernels.serve`.
+        The arguments are the error (m,) of the pose, its rate and its integral. The compiled loop
+        has the same law in `visual_servo_kernels.serve`.
         """
         return self.kp * error + self.kd * rate_error + self.ki * integral
 
@@ -130,8 +130,8 @@ class ServoGains:
 class FrameTiming:
     """Timing of the frames and of the joint commands.
 
-    With either hold, U_dot in the joint PID is the difference of the last two commands divided by
-    the frame period.
+    The rate of the command in the joint PID, U_dot, is the difference of the last two commands
+    divided by the frame period, whether the command jumps or ramps.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class FrameTiming:
         check_choice("hold", self.hold, get_args(Hold), SimulationError)
 
     def check_latency(self, name: str, latency_s: float) -> None:
-        """Raise SimulationError for a latency that is negative or too many frames."""
+        """Raise SimulationError for a latency that is negative or too long."""
         if not 0 <= latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
             limit = f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
             raise SimulationError(f"{name} is {latency_s} s, must be >= 0 and at most {limit}")

@@ -55,7 +55,7 @@ def repeat_servo(
     Returns
     -------
     list of ClosedLoopRun or LoopFailure
-        One entry per noise. A run that leaves the reach of the robot is a LoopFailure.
+        One entry per noise, which is a LoopFailure for a run that ended early.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def repeat_commands(
     Returns
     -------
     list of ClosedLoopRun or LoopFailure
-        As from `repeat_servo`.
+        The same as from `repeat_servo`.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def prepare(robot: Robot) -> None:
     Raises
     ------
     SimulationError
-        If the argument is no Robot.
+        If `robot` is not a Robot.
 
     Examples
     --------
@@ -253,7 +253,7 @@ def _repeat(
     shape: Shape = ("N", problem.frames, 6)
     noises = floats("noises", noises, shape, error=SimulationError)
     use_kernels = flag("compiled", compiled, SimulationError)
-    # importing Numba takes time
+    # imported here, because the import of Numba takes time
     from dynamics.closed_loop.execution import run_repeats
 
     return run_repeats(problem, noises, use_kernels)
@@ -267,7 +267,7 @@ def _cores() -> int:
 
 
 def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[Item]:
-    """List of the items, or of the one item that is given. Raises SimulationError."""
+    """List of the given items, or of a single given item. Raises SimulationError."""
     if isinstance(given, kind):
         return [given]
     check_type(name, given, Sequence, SimulationError)

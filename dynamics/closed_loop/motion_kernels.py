@@ -19,7 +19,7 @@ OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
 
 @kernel
 def drive(task: Record, now: Record, at: Record) -> None:
-    """Compute the torques of the drives at an evaluation, whose angles and velocities are known."""
+    """Compute the torques of the drives from the angles and velocities of an evaluation."""
     state = at.state
     count = len(at.angle)
     first = 2 * len(at.bias)
@@ -74,7 +74,7 @@ def winds_up(task: Record, at: Record, joint: int) -> bool:
 
 @kernel
 def dry_level(friction: Record, velocity: float, mode: int) -> float:
-    """Ratio of dry friction to the Coulomb torque of a slipping joint at a velocity, rad/s."""
+    """Ratio of a slipping joint's dry friction to its Coulomb torque, at a velocity, rad/s."""
     if friction.law == SMOOTHED:
         return np.tanh(velocity / friction.smoothing_velocity)
     if friction.law == STRIBECK:
@@ -140,9 +140,9 @@ def all_finite(matrix: Array) -> bool:
 
 @kernel
 def know_motion(task: Record, known: Record, state: Array) -> int:
-    """Compute the equation of motion at coordinates and rates, unless it is already known there.
+    """Compute the equation of motion at a state, unless `known` already has its terms there.
 
-    It is often known, because consecutive steps and frames share a state.
+    It often has them, because consecutive steps and frames share a state.
     """
     size = len(known.bias)
     same = known.valid
@@ -157,13 +157,13 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
         known.valid = known.valid and 0 < known.factor[i, i] < np.inf
     if known.valid:
         return OK
-    # out of reach, entries are NaN; if they are finite, masses or inertias are wrong
+    # entries are NaN at a pose out of reach; if all are finite, masses or inertias are wrong
     return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
 
 
 @entry
 def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Compute all terms at the state and time of an evaluation that do not depend on the modes.
+    """Compute the terms of an evaluation that do not depend on the modes, at its state and time.
 
     `d` and `k` are not used: all kernels that are called by address have the same arguments.
     """
@@ -193,7 +193,7 @@ def hold_compliance(task: Record, at: Record, joints: Array, known: int) -> None
     """Compute the response of the platform and of some joints to torques at these joints.
 
     The response M^-1 J^T of the platform has a row (m,) for each joint. Its first `known` rows have
-    been computed before. The compliance J M^-1 J^T of the joints is factorised.
+    already been computed. The compliance J M^-1 J^T of the joints is factorised.
     """
     for s in range(len(joints)):
         if s >= known:
@@ -216,7 +216,8 @@ def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Arr
 def push(task: Record, now: Record, at: Record) -> None:
     """Compute the net torques in the present modes, without the torques that stop stuck joints.
 
-    All entries of the slope of the state are set, except for the acceleration of the platform.
+    The slope is the time derivative of the state. All its entries are set, except for the
+    acceleration of the platform.
     """
     size = len(at.bias)
     count = len(at.angle)
@@ -270,7 +271,7 @@ def hold_stuck(task: Record, now: Record, at: Record, known: int) -> None:
         for j in range(size):
             acceleration[j] -= at.response[s, j] * at.force[s]
     if len(stuck) == size:
-        # no joint moves, and rounding must not make the robot creep
+        # no joint moves: without this line, rounding errors would move the robot slowly
         fill(acceleration, 0.0)
 
 
@@ -325,7 +326,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     The friction torques are found by projected Gauss-Seidel iterations.
     """
     joints = now.stuck[: count_stuck(now)]
-    # the motors of elastic joints are not coupled
+    # the motors of elastic joints are not coupled, so each mode is decided by itself
     if task.stiffness > 0:
         for i in joints:
             remaining = at.torque[i] - at.spring[i]
@@ -363,9 +364,9 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
-    """Return the margin of the modes, and the joint with this margin, or -1.
+    """Return the least margin of the modes, at most 1, and the joint that has it.
 
-    The margin is >= 0 as long as all modes hold.
+    The margin is >= 0 as long as all modes hold. The joint is -1 if no joint has less than 1.
     """
     least = 1.0
     joint = -1

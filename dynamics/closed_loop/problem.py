@@ -41,9 +41,9 @@ class Sizes:
 
     `joints` and `coordinates` are the numbers of joints and coordinates of the robot, and `rigid`
     is the number of parameters of the rigid bodies. `geometry` is the space for geometric numbers,
-    which are the last inputs of functions (see `Robot.moved`); it is the same for most robots.
-    `filters` is the number of joints whose drives filter a rate. `gains` is the number of gains of
-    the joint PID.
+    which are the last inputs of functions (see `Robot.moved`). This space is the same for most
+    robots. `filters` is the number of joints whose drives filter a rate. `gains` is the number of
+    gains of the joint PID.
     """
 
     joints: int
@@ -99,7 +99,7 @@ class LoopProblem:
 
     @property
     def further_columns(self) -> int:
-        """Number of columns after those of the parameters: of the start state, or of directions."""
+        """Number of columns of the start state, or of directions, after those of the parameters."""
         return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property
@@ -124,7 +124,7 @@ class LoopProblem:
 
     @property
     def asked(self) -> bool:
-        """True if a sensor or a controller in Python is called at every frame."""
+        """True if the sensor or the controller is a Python function, called at every frame."""
         return self.ideal is None or self.controller is not None
 
     @cached_property
@@ -222,10 +222,11 @@ def with_derivatives(
     directions: np.ndarray | None = None,
     start_directions: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Problem with derivatives, also along k directions (frames, n, k) of its commands.
+    """Problem of a run that also computes derivatives.
 
-    `start_directions` (n, k) are those of the commands from before the start. Raises
-    SimulationError for elastic joints, and for directions of a wrong shape or number.
+    `directions` (frames, n, k) are k directions of the commands, and `start_directions` (n, k) of
+    the commands from before the start. Raises SimulationError for elastic joints, and for
+    directions of a wrong shape or number.
     """
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
@@ -256,7 +257,7 @@ def _problem(
     servo_robot: Robot | None = None,
     feedforward: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Check the arguments that all ways to drive the joints have in common."""
+    """Problem from the arguments that runs under servo, commands and controllers share."""
     check_type("robot", robot, Robot, SimulationError)
     check_type("reference", reference, Reference, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
@@ -266,7 +267,7 @@ def _problem(
     _check_reach(robot, reference)
     frames = len(reference.poses)
     parameters = checked_loop_parameters(robot, parameters, settings.drives.law)
-    # raises for zeros of another number of joints
+    # raises an error if the number of zeros is not the number of joints
     settings.drives.zeros(robot.layout.joints)
     feedforward = _rows("feedforward", feedforward, (frames, robot.layout.joints))
     if latencies is not None:
@@ -320,7 +321,7 @@ def _at_rest(
 ) -> StartState:
     """State of rest at a pose (6,).
 
-    It is cached, with read-only arrays, for further runs of a model.
+    The state is cached for further runs of a model. Hence its arrays are read-only.
     """
     values = np.frombuffer(parameters)
     start = equilibrium(
@@ -381,7 +382,7 @@ def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:
 
 
 def _check_elasticity(problem: LoopProblem) -> None:
-    """Raise SimulationError for elastic joints without motor states, or with too long steps."""
+    """Raise SimulationError for elastic joints if motor states are missing or steps too long."""
     settings = problem.settings
     elasticity = settings.elasticity
     start = problem.start

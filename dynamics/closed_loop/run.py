@@ -47,7 +47,7 @@ class ClosedLoopRun:
     motor_angle, motor_rate : ndarray, shape (frames, n)
         Coordinate of the motors of elastic joints, and its rate.
     filtered_rate : ndarray, shape (frames, n)
-        Rates of the errors in drives with a filter, after the filter.
+        Rate of the error of each drive after its filter.
     events : int
         Number of stick-slip events.
     start : StartState
@@ -97,9 +97,8 @@ class ClosedLoopRun:
         """State at a frame, from which a new run repeats the remaining frames of this run.
 
         If each frame has its own latency, the new run also needs the latencies of the earlier
-        commands.
-        Raises SimulationError for a frame that the run does not have, or that follows a lost
-        measurement.
+        commands. Raises SimulationError if the run does not have the frame, or if the measurement
+        before it was lost.
         """
         frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
         if frame == 0:
@@ -127,7 +126,7 @@ class ClosedLoopRun:
 class LoopFailure(SimulationError):
     """Early end of a run at a frame.
 
-    `saturated` is the number of frames before the failure with a saturated actuator.
+    `saturated` is the number of frames before the end in which an actuator was saturated.
     """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:

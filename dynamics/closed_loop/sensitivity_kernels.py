@@ -1,12 +1,13 @@
 """Kernels for sensitivities: exact derivatives of what the integrator computes.
 
-Each derivative is a row whose columns belong to variables. The variables are the parameters, the
-start state if wanted, and, while it is unknown, the length of a step that an event cuts. Of the
-parameters of rigid bodies, only the base parameters have a column.
+Each derivative is a row whose columns belong to variables. The variables are the parameters, then
+the start state or directions of the commands if requested. The length of a step that an event
+shortens is the last variable, until its derivative is known. If inertial parameters are in groups,
+only the pivots of the groups have a column.
 
 A Runge-Kutta step is differentiated stage by stage, and the equation of motion at each stage is
-differentiated implicitly. A step that an event cuts ends where a margin vanishes. The derivative of
-its length follows from the derivative of the margin. The next step becomes shorter by as much as
+differentiated implicitly. A step that an event shortens ends where a margin is zero. The derivative
+of its length follows from the derivative of the margin. The next step becomes shorter by as much as
 this step becomes longer. The impulse that stops joints is differentiated implicitly, too.
 """
 
@@ -40,7 +41,7 @@ from dynamics.compiled.kernel import (
 )
 from dynamics.parameters import LANES
 
-# Runge-Kutta: time of each stage over the step, weight of its slope, index of the end of the step
+# Runge-Kutta: time of each stage as a fraction of the step, weight of its slope, index of the end
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 END = 4
@@ -69,7 +70,7 @@ def differentiate_stages(task: Record, now: Record) -> None:
 
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
-    """Copy the values, beside the equation of motion, that all columns of a slope need."""
+    """Copy the values that all columns of a slope need, besides the derivatives of the motion."""
     stages = now.stages
     size = len(at.bias)
     for i in range(size):
@@ -114,7 +115,7 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
         if task.lx[i] > 0 or task.filter_time > 0:
             fill(row, 0.0)
-            # `by_error` has lp + lx, but lx does not act on the command: subtract that effect
+            # `by_error` is lp + lx, but lx does not act on the command: its effect is subtracted
             add_row(-law * task.lx[i], d.acting[i], row, now.width)
         if task.filter_time > 0:
             rate = at.state[first + count + i]
@@ -142,7 +143,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
     torque = d.k[k, first + count :]
     copy_rows(slopes, torque, width)
     clear(slopes, width)
-    # d(velocity)/d(pose) is half of `crank_by_rate`, d(acceleration)/d(rate)
+    # `crank_by_rate` is d(acceleration)/d(rate), which is twice d(velocity)/d(pose)
     for i in range(count):
         for j in range(size):
             add_row(
@@ -240,7 +241,7 @@ def move_tangent(
     moved: Array,
     first: int,
 ) -> None:
-    """Add fraction * (h * d_slope + d_length * slope) of a stage to unknowns from `first` on."""
+    """Add fraction * (h * d_slope + d_length * slope) of a stage, from row `first` on, to rows."""
     for i in range(len(moved)):
         add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:
@@ -265,10 +266,10 @@ def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Non
 
 @kernel
 def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
-    """Differentiate the length of a step that an event cuts.
+    """Differentiate the length of a step that an event shortens.
 
-    At this length, margin(end of the step, length) = 0. The margin is the velocity of a slipping
-    joint, or follows from the torque that holds a stuck joint.
+    At this length, the margin is zero at the end of the step. The margin is the velocity of a
+    slipping joint, or follows from the torque that holds a stuck joint.
     """
     size = len(end.bias)
     width = now.width
@@ -298,14 +299,14 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         add_row(-1 / approach, d.margin[:], d.length[:], width)
     d.length[column] = 0.0
     for i in range(len(d.x)):
-        # the length is no longer a variable: its column is added to all other columns
+        # the length now depends on the other variables: its effect is added to their columns
         add_row(d.x[i, column], d.length[:], d.x[i], width)
         d.x[i, column] = 0.0
 
 
 @kernel
 def whole_vectors(columns: int) -> int:
-    """Round a number of columns up to whole vectors. The additional columns are zero."""
+    """Round a number of columns up to whole vectors of the processor. Added columns are zero."""
     return -(-columns // LANES) * LANES
 
 
@@ -352,7 +353,7 @@ def step_tangent(
 def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Differentiate the stop of joints, which changed the pose rate by `now.change`.
 
-    M change = -J^T impulse (`at.force`), and J rate = 0 at the stopped joints, are differentiated.
+    The equations are M change = -J^T impulse (`at.force`), and J rate = 0 at the stopped joints.
     """
     size = len(at.bias)
     width = now.width
@@ -387,7 +388,7 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
-    """Differentiate the loss of velocity at joints that are stuck at the start."""
+    """Correct the derivatives of the pose rate at the start for stuck joints, which cannot move."""
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == size:

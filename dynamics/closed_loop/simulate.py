@@ -65,8 +65,8 @@ def simulate_servo(
     start : StartState, optional
         State at the first frame. The default is rest at the first reference pose.
     feedforward : ndarray, shape (frames, n), optional
-        Joint commands, rad or m, to which the servo adds its own commands. At rest they are equal
-        to the joint coordinates.
+        Joint commands, rad or m, to which the servo adds its own commands. At rest, the feedforward
+        is equal to the joint coordinates.
     latencies : ndarray, shape (frames,), optional
         Latency of each frame's command, s. The default is the latency of the timing.
     compiled : bool
@@ -80,9 +80,10 @@ def simulate_servo(
     Raises
     ------
     LoopFailure
-        If the robot leaves its reach during the run, or if the sensor raises a DynamicsError.
+        If the run ends early, because the robot leaves its reach, for example, or because the
+        sensor raises a DynamicsError.
     UnreachablePoseError, SingularPoseError
-        If the robot cannot have a pose of the reference or of the start.
+        If a pose of the reference or of the start is out of reach, or if the start is singular.
     ParameterError, SimulationError
         If another argument is not valid.
 
@@ -231,17 +232,17 @@ def differentiate_servo(
     groups : RigidGroups, optional
         Groups of inertial parameters on which the motion depends. Derivatives are then computed
         only for the pivots of the groups and for all other parameters, which is faster.
-        `groups.of_all` extends them to all parameters. Groups are not valid with a start whose own
-        sensitivities depend on more than the groups.
+        `groups.of_all` extends the derivatives to all parameters. Groups are not valid with a start
+        whose own sensitivities depend on more than the groups.
     directions : ndarray, shape (frames, n, k), optional
-        Directions of the feedforward along which the poses are also differentiated, at most
-        `most_directions`. They cannot be combined with `by_start`.
+        Directions of the feedforward along which the poses are also differentiated. Their number k
+        is at most `most_directions`. They cannot be combined with `by_start`.
 
     Returns
     -------
     ClosedLoopRun
-        Its fields `pose_sensitivity` and `end_sensitivity` are set. With `by_start`, so are the
-        sensitivities with respect to the start, and with directions `command_sensitivity`.
+        Record with `pose_sensitivity` and `end_sensitivity`. With `by_start`, it also has the
+        sensitivities with respect to the start. With directions, it has `command_sensitivity`.
 
     Raises
     ------
@@ -289,16 +290,16 @@ def differentiate_commands(
     sensor, by_start, groups
         As for `differentiate_servo`.
     directions : ndarray, shape (frames, n, k), optional
-        Directions of the commands along which the poses are differentiated, too, at most
-        `most_directions`. They cannot be combined with `by_start`. With `times`, the direction of a
-        row of NaN must be that of the command before.
+        Directions of the commands along which the poses are also differentiated. Their number k is
+        at most `most_directions`. They cannot be combined with `by_start`. With `times`, the
+        direction of a row of NaN must be that of the command before.
     start_directions : ndarray, shape (n, k), optional
-        The same for the last command from before the start. The default is zero.
+        Directions of all commands from before the start. The default is zero.
 
     Returns
     -------
     ClosedLoopRun
-        As from `differentiate_servo`. With directions, `command_sensitivity` is set.
+        The same as from `differentiate_servo`.
 
     Raises
     ------
@@ -324,7 +325,7 @@ def differentiate_commands(
 def _run(problem: LoopProblem, compiled: object) -> ClosedLoopRun:
     """Do a run, compiled or as plain Python."""
     compiled = flag("compiled", compiled, SimulationError)
-    # importing Numba takes time
+    # imported here, because the import of Numba takes time
     from dynamics.closed_loop.execution import run
 
     return run(problem, compiled)

@@ -38,14 +38,14 @@ def frame_map(
     """Map (s, s) of small deviations from rest at a pose (6,), from frame to frame.
 
     The state consists of the coordinates, their rates, the joint integrals, the coordinates
-    measured at the last frame, the servo integrals, and the commands that have not yet arrived, the
+    measured at the last frame, the servo integrals, and the past commands that can still act, the
     latest first. Raises the same errors as `closed_loop.equilibrium`.
     """
     return _state_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
 
 def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.ndarray) -> float:
-    """Magnitude, 1/s, of the fastest eigenvalue of the robot under its drives at a pose (6,).
+    """Largest magnitude, 1/s, of the eigenvalues of the robot under its drives at a pose (6,).
 
     Raises the same errors as `closed_loop.equilibrium`.
     """
@@ -58,8 +58,9 @@ def pose_response(
 ) -> Callable[[float], np.ndarray]:
     """Response of the coordinates to small oscillations of the desired ones about a pose (6,).
 
-    Returns a function of the angular frequency, rad/s. It gives the matrix (m, m) from the desired
-    to the true coordinates at the frames. Raises the same errors as `closed_loop.equilibrium`.
+    Returns a function of the angular frequency, rad/s. This function returns the matrix (m, m) from
+    the desired to the true coordinates at the frames. Raises the same errors as
+    `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
@@ -220,7 +221,8 @@ def _joint_loop(
 
     The state consists of q, q_dot, joint integrals, filtered rates if there are any, the command,
     its slope, and U_dot. The command changes with its slope, which can differ from the U_dot in the
-    law of the drive. An integral that the law does not use decays.
+    law of the drive. An integral that the law does not use is made to decay, because it would
+    otherwise count as not stable.
     """
     q = robot.coordinates(pose)
     joints = robot.layout.joints
@@ -307,8 +309,8 @@ def last_stable(
     """Limit of stability on the way from a start to one of two ends.
 
     It is the first value at which the radius passes 1. If the loop is stable at the start, the
-    search goes to `stable_end`, and returns it if the loop is stable all the way. Otherwise, it
-    goes to `other_end`, and returns NaN if the loop is stable nowhere.
+    search goes to `stable_end`, and returns that end if the loop is stable all the way. Otherwise,
+    it goes to `other_end`, and returns NaN if the loop is stable nowhere.
     """
     stable = radius(start) < 1
     value = start
@@ -320,7 +322,7 @@ def last_stable(
             low = value
             high = following
             for _ in range(30):
-                # Bisection of the logarithm.
+                # bisect the logarithm of the value
                 middle = (low * high) ** 0.5
                 low, high = (middle, high) if (radius(middle) < 1) == stable else (low, middle)
             return (low * high) ** 0.5

@@ -2,7 +2,7 @@
 
 Between changes of the modes the motion is smooth, and the classical Runge-Kutta method integrates
 it. A mode ends when a slipping joint comes to rest, or when a stuck joint reaches its breakaway
-torque (eq. 24). The step is cut at this event, to rounding.
+torque (eq. 24). The step is shortened to end at this event, up to rounding errors.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, solve
@@ -37,8 +37,8 @@ TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
 
 TAKEN: the last step was accepted, and no step is being tried. WHOLE: the step may be accepted.
 HALF: half the step, to see whether modes are broken in between. AGAIN: the whole step again, after
-half of it broke no mode. BRACKET: a step to the beginning of the bracket of an event. CROSSING: a
-step that ends at the estimated event.
+half of it broke no mode. BRACKET: a step in search of the beginning of the bracket of an event.
+CROSSING: a step that ends at the estimated event.
 """
 
 
@@ -100,7 +100,8 @@ def try_step(task: Record, now: Record, at: Record, d: Record) -> int:
 def crossing(now: Record, count: int) -> float:
     """Step length at which the margin is estimated to be zero.
 
-    It comes from the polynomial of length over margin through the last `count` steps tried.
+    A polynomial gives the length as a function of the margin. It passes through the last `count`
+    steps tried, and its value at zero is the estimate.
     """
     length = now.tried
     margin = now.tried_margin
@@ -149,9 +150,10 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float
 
 @kernel
 def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
-    """Request the next step of the search for an event, once its bracket begins with a margin.
+    """Request the next step of the search for an event.
 
-    If 40 halvings have found no such bracket, the last step tried is accepted.
+    The bracket is halved until it begins with a margin. If 40 halvings have found no such bracket,
+    the last step tried is accepted.
     """
     if now.low_margin < NO_MARGIN and now.trials < 40:
         ask(now, BRACKET, now.high / 2)
@@ -258,7 +260,7 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
         return OK
     if len(stuck) == 0:
         return OK
-    # with as many stuck joints as coordinates nothing moves, not even by rounding
+    # if as many joints stick as there are coordinates, nothing may move, not even by rounding
     if len(stuck) == size:
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
@@ -303,7 +305,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 
 @kernel
 def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, held: bool) -> int:
-    """Accept the step that was tried, which ends at its target or is cut by an event.
+    """Accept the step that was tried, which ends at its target or at an event.
 
     For `held` see `after_event`.
     """
@@ -338,7 +340,8 @@ def begin_span(
 ) -> None:
     """Begin a span of a duration, s, with one command, whose torques have been computed.
 
-    Torques jump at its start. The modes are therefore decided again, unless all stuck joints hold.
+    Torques jump at the start of a span. The modes are therefore decided again, unless all stuck
+    joints hold.
     """
     start = at[0]
     now.moved = 0
