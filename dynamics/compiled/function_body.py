@@ -82,7 +82,7 @@ class FunctionBody:
         self._write(self._quickened(graph_of(last)), parts)
 
     def text(self) -> str:
-        """Code of the function, and of the function that calls it for many rows."""
+        """Code of the function, and of the function that calls it for many rows of inputs."""
         lines = "\n".join(self._lines)
         signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
         body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"

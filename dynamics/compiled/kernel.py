@@ -150,9 +150,9 @@ def entry(function: Callable[..., Any]) -> Any:
 class _KernelCache:
     """Cache of an entry, with the methods that Numba calls.
 
-    Numba's own cache loads a file whoever wrote it, and renews the file only if the module of the
-    entry has changed. This cache loads only files that nobody but the user can have written, and
-    renews them if any kernel has changed.
+    Numba's own cache loads a file of any owner, and renews the file only if the module of the entry
+    has changed. This cache loads only files that nobody but the user can have written, and renews
+    them if any kernel has changed.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -173,7 +173,7 @@ class _KernelCache:
 
     def save_overload(self, signature: object, result: Any) -> None:
         """Save the code compiled for a signature."""
-        # connect it with the environments of the kernels linked into it, as Numba does at loading
+        # connect the code with the environments of the kernels in it, as Numba does at loading
         for environment in result._find_referenced_environments():
             result.codegen.set_env(environment.env_name, environment)
         save_object(self._file(signature, result.codegen), dumps(result._reduce()))
@@ -325,7 +325,7 @@ def _stamp() -> str:
 def plain(compiled: Any) -> Callable[..., Any]:
     """Ordinary Python function with the code of a kernel.
 
-    It calls other kernels in the same form.
+    The kernels that it calls are plain functions, too.
     """
     source = getattr(compiled, "py_func", compiled)
     names = {

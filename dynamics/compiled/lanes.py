@@ -100,7 +100,7 @@ class Node(NamedTuple):
     def of(self, operands: tuple[int, ...]) -> "Node":
         """Same operation on other operands.
 
-        `_replace` gives the same, and takes three times as long.
+        `_replace` would give the same node, but takes three times as long.
         """
         return Node(self.operation, operands, self.value, self.entry) if operands else self
 
@@ -156,7 +156,7 @@ def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Grap
     `constants` are the values of the last input, if given.
     """
     nodes: list[Node] = []
-    # CasADi's instructions reuse memory: number of the value that each place in memory holds now
+    # number of the value that each place in memory holds now, because instructions reuse memory
     held: dict[int, int] = {}
     outputs = [[-1] * function.nnz_out(k) for k in range(function.n_out())]
     for index in range(function.n_instructions()):

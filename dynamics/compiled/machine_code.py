@@ -33,7 +33,7 @@ from dynamics.compiled.operations import type_name
 class MachineFunction:
     """Compiled function.
 
-    `address` is the address of the code for a single evaluation (see `llvm_text`). It is valid as
+    `address` is the address of the code for a single evaluation (see the module). It is valid as
     long as the object exists. `constants` (c,) are the values of the last argument, which callers
     omit.
     """
@@ -125,7 +125,7 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     code of the hot functions.
 
     Optimising takes LLVM ten times as long as translating. Functions that are not hot are only
-    translated. They then take up to twice as long, and their results are the same.
+    translated. Their evaluation then takes up to twice as long, with the same results.
     """
     inner = [one for one in functions if one.name() in hot]
     others = [one for one in functions if one.name() not in hot]
@@ -191,7 +191,7 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
 def _machine(level: int = 2) -> llvm.TargetMachine:
     """Description of this processor for LLVM, with a level of optimisation from 0 to 3.
 
-    LLVM fuses and reorders nothing, so that a seed gives the same numbers on every processor.
+    LLVM fuses and reorders no operations, so that results are the same on every processor.
     """
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import platformdirs
 
-# number of bytes at the beginning of a file: a digest of its name and of its content
+# number of bytes of the digest of name and content, at the beginning of each file
 DIGEST = sha256().digest_size
 
 DAY = 24 * 3600.0  # s
@@ -42,7 +42,8 @@ def cache_folder() -> Path:
 def load_object(name: str) -> bytes | None:
     """Content that was saved under a name.
 
-    None if there is no such file, if it is damaged, or if another user may have written it.
+    The result is None if there is no such file, if it is damaged, or if another user may have
+    written it.
     """
     path = cache_folder() / name
     try:
@@ -104,7 +105,7 @@ def _note_use(path: Path, changed: float) -> None:
 def _remove_unused(folder: Path) -> None:
     """Remove files that have not been used for two months, once in each process.
 
-    Their sources have usually changed.
+    The sources of such files have usually changed.
     """
     oldest = time.time() - KEPT
     with suppress(OSError):  # the next process removes the remaining files

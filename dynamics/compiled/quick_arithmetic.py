@@ -1,10 +1,10 @@
 """Faster arithmetic for inner loops. Its results differ only by rounding.
 
 Sine, cosine and arctangent are replaced by arithmetic, so that vectors and parallel instructions
-compute several at once. The argument is reduced to a small interval, on which the function is a
-rational approximation (Moshier, Cephes Mathematical Library, sin.c and atan.c). Sine and cosine are
-correct to 3e-16 up to a hundred thousand radians, and lose digits beyond. The arctangent is correct
-to 3e-16 relative to the angle, and undefined if both arguments are zero.
+compute several at once. The argument is reduced to a small interval, on which a polynomial or a
+rational function approximates the result (Moshier, Cephes Mathematical Library, sin.c and atan.c).
+Sine and cosine are correct to 3e-16 up to a hundred thousand radians, and lose digits beyond. The
+arctangent is correct to 3e-16 relative to the angle, and undefined if both arguments are zero.
 
 Several quotients with the same divisor become products with its reciprocal, because a division
 takes as long as five products. A product and a sum are fused and rounded once. Processors since
@@ -51,7 +51,7 @@ LEAST_TURNED = 0.66
 
 
 def quickened(graph: Graph) -> Graph:
-    """Graph with the same values except for rounding, which is faster to compute."""
+    """Graph that has the same values, except for rounding, and is faster to compute."""
     return _once_each(_fused(_with_reciprocals(_with_approximations(graph))))
 
 

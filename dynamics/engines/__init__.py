@@ -1,1 +1,1 @@
-"""Export of robots to MuJoCo, and import of robots from MJCF and URDF files."""
+"""Export of robots to MJCF and URDF files, import from such files, and simulation in MuJoCo."""

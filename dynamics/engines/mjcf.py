@@ -1,11 +1,11 @@
 """MJCF of a robot: the text of a model that MuJoCo loads, with all bodies at home.
 
-The platform flies freely. The bodies of each leg hang on the base and on each other by the joints
-that the segments of the leg name. A `connect` equality joins the end of each leg to the platform,
-and the platform thus has only the degrees of freedom that the legs allow. Joint coordinates are
-those of `inverse_kinematics`. Motors act on the actuated joints. The viscous friction is written as
-joint damping, and the Coulomb friction as friction loss. A link that is two equal bars is written
-as two bodies.
+The platform has a free joint. The bodies of each leg form a chain from the base on, with the joints
+of the leg's segments. A `connect` equality joins the end of each leg to the platform, and the
+platform thus has only the degrees of freedom that the legs allow. Joint coordinates are those of
+`inverse_kinematics`. Motors act on the actuated joints. The viscous friction is written as joint
+damping, and the Coulomb friction as friction loss. A link that consists of two equal bars is
+written as two bodies.
 
 MuJoCo's ball joints let bodies spin freely about their own axes, which eq. 12 excludes. No torque
 causes this spin as long as Ixx = Iyy, and it stays zero. The export adds no damping against it,
@@ -344,5 +344,5 @@ def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
-    """Add a comment, without two hyphens side by side and characters that XML does not allow."""
+    """Add a comment, without adjacent hyphens and without characters that XML does not allow."""
     parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))

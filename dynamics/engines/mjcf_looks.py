@@ -84,5 +84,5 @@ def add_ball(parent: Xml.Element, centre: np.ndarray, radius: float) -> None:
 
 
 def numbers_text(values: ArrayLike) -> str:
-    """Numbers as MJCF writes them, with all their digits."""
+    """Numbers as text in the form of MJCF, with all their digits."""
     return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))

@@ -31,7 +31,7 @@ def import_mujoco() -> Any:
     """Import MuJoCo and return the module.
 
     MuJoCo sets up its renderer at import, which can fail with MUJOCO_GL=egl: pyrender requires a
-    version of PyOpenGL that does not support it.
+    version of PyOpenGL that does not support EGL.
 
     Raises MujocoMissingError, with the command that installs MuJoCo, or MujocoError if it does not
     load.
@@ -75,7 +75,7 @@ class MujocoRobot:
             self._bodies = [self.model.body(part.name) for part in self._parts.all]
         except KeyError as error:
             raise MujocoError(f"the model is no export of {robot.name}: {error.args[0]}") from None
-        # places of the actuated joints in the coordinates and in the rates of MuJoCo
+        # indices of the actuated joints in the coordinates and in the rates of MuJoCo
         self._coordinate_places = np.array([joint.qposadr[0] for joint in joints])
         self._rate_places = np.array([joint.dofadr[0] for joint in joints])
 
@@ -162,7 +162,7 @@ class MujocoRobot:
                 data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ axis_at_rest
                 data.qvel[rate] = spin @ axis
                 continue
-            # a universal joint turns about an axis of the part before it, then about x
+            # a universal joint turns about an axis of the part before it, then about its own x
             x_axis = turned[:, 0]
             angle = np.arctan2(np.cross(axis_at_rest, X) @ x_axis, x_axis[0])
             about_x = Rotation.from_rotvec(-angle * axis_at_rest).as_matrix() @ turned

@@ -1,8 +1,9 @@
 """Recognition of a mechanism from another program as a robot with legs of known kinds.
 
-The origin of the platform's frame is its centre of mass. The frame has the axes of the file if the
-inertia of the platform is diagonal in them, else its principal axes. If these tilt too far for the
-angles of a pose, they are reordered to be as near as possible to the axes of the base.
+The origin of the platform's frame is the platform's centre of mass. The frame has the axes of the
+file if the inertia of the platform is diagonal in them, else its principal axes. If the axes are
+tilted too far for the angles of a pose, they are reordered to be as near as possible to the axes of
+the base.
 """
 
 from collections import Counter
@@ -56,7 +57,7 @@ DEFAULT_TRAVEL = 0.5
 """Travel beyond the home coordinates if a file states no joint ranges, rad."""
 
 DEFAULT_TRAVEL_RATIO = 0.1
-"""Travel of sliding actuators if a file states no ranges, over the distance from B to A."""
+"""Ratio of the travel of sliding actuators to the distance from B to A, if a file has no ranges."""
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
@@ -152,7 +153,7 @@ def _bodies(
 def _meshes(
     geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]
 ) -> tuple[list[BodyMesh], list[str]]:
-    """Meshes of the bodies of the legs, and a remark on those of bars, which are left out."""
+    """Meshes of the bodies of the legs, and a remark on those of paired bars, which are omitted."""
     layout = geometry.layout
     meshes = []
     left_out = []

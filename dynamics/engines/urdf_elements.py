@@ -16,7 +16,7 @@ FOLDERS_ABOVE = 4
 def mesh_shapes(link: Xml.Element, place: np.ndarray, folder: Path) -> tuple[Shape, ...]:
     """Meshes among the visuals of a link with the frame `place` (4, 4) at home.
 
-    Paths are relative to a folder. Raises RobotFileError for a scale that differs by axis.
+    Paths are relative to `folder`. Raises RobotFileError if the scales of the axes differ.
     """
     shapes = []
     for visual in link.findall("visual"):
@@ -35,7 +35,7 @@ def mesh_shapes(link: Xml.Element, place: np.ndarray, folder: Path) -> tuple[Sha
 
 
 def _found(name: str, folder: Path) -> str:
-    """Path of a mesh. A name that begins with package:// is searched in the folders above."""
+    """Path of a mesh. A name that begins with package:// is searched for in the folders above."""
     scheme, _, rest = name.rpartition("://")
     if scheme != "package":
         return str(folder / rest)

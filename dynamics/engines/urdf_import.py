@@ -1,14 +1,14 @@
 """Import of a robot from a URDF file, and a YAML file with its closed loops.
 
-The convention is that of the public example-parallel-robots. A URDF file describes a tree, whose
-root is the fixed base. The YAML file has these keys:
+The convention is that of the public collection example-parallel-robots. A URDF file describes a
+tree, whose root is the fixed base. The YAML file has these keys:
 
 - closed_loop: pairs of frames that coincide. A frame is named by a link, or by a joint, which
   stands for the frame of its child.
 - type: for each pair, "3d" if only the points coincide, or "6d" if the axes coincide, too.
 - name_mot: the actuated joints.
-- joint_name and joint_type: joints with another type than in the URDF file: SPHERICAL, FIXED, or
-  UJOINT_XY (hinges about x, then y, of the frame of the joint).
+- joint_name and joint_type: joints with another type than in the URDF file, and these types. A type
+  is SPHERICAL, FIXED, or UJOINT_XY (hinges about x, then y, of the frame of the joint).
 
 Home is the position near zero coordinates in which the loops are closed.
 """
@@ -292,7 +292,7 @@ def _slices(joints: list[_Joint]) -> dict[str, slice]:
 def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]]) -> np.ndarray:
     """Coordinates at which all loops are closed.
 
-    Raises RobotFileError, with the gap that remains.
+    Raises RobotFileError, with the gap, if a gap remains.
     """
 
     def gaps(q: np.ndarray) -> np.ndarray:
@@ -348,7 +348,7 @@ def _freedoms(
 def _solid(link: Xml.Element, place: np.ndarray) -> Solid:
     """Body of a link. A link without an inertial element has no mass.
 
-    The rod that draws the body is the first cylinder among its visuals.
+    The drawn rod of the body is the first cylinder among its visuals.
     """
     name = str(link.get("name"))
     axes = place[:3, :3]
