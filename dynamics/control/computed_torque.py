@@ -3,17 +3,18 @@
     torque = mean over a frame of ID(p, p_dot, p_ddot),   p = r - e,   e_ddot + Kd e_dot + Kp e = 0
     Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-Here p is the way back: the motion from the present pose of the robot into the desired motion r. The
-torque is the mean over a frame period, because it acts for that time.
+ID is the inverse dynamics, r is the desired motion, and e is the error. p is the return motion: it
+leads from the present pose of the robot into r. The torque is the mean over a frame period, because
+it acts for that time.
 
-With an observer, the way back begins at the state predicted for the arrival of the torque. The
-estimated disturbance is subtracted. Dry friction has the signs of the way back. Near rest, joints
-often move against the desired motion, whose signs would make the torque wrong by twice the Coulomb
-torque.
+With an observer, the return motion begins at the state predicted for the arrival of the torque. The
+estimated disturbance is subtracted. Dry friction has the signs of the return motion. Near rest,
+joints often move against the desired motion. Its signs would then make the torque wrong by twice
+the Coulomb torque.
 
-Without an observer, the way back begins at the last measured pose. Its rate is the difference of
-the last two poses. An integral replaces the disturbance. Dry friction has the signs of the desired
-motion, because the sign of a rate that is half a frame old chatters.
+Without an observer, the return motion begins at the last measured pose. Its rate is the difference
+of the last two poses. An integral replaces the disturbance. Dry friction has the signs of the
+desired motion, because the sign of a rate that is half a frame old chatters.
 """
 
 from collections.abc import Callable
@@ -33,23 +34,23 @@ INTEGRAL_FACTOR = 0.2
 """Factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer."""
 
 FOLLOWING_RATE = 1.0
-"""Rate at which the subtracted disturbance follows the estimate, over the bandwidth.
+"""Ratio to the bandwidth of the rate at which the subtracted disturbance follows the estimate.
 
-Following faster would mainly pass noise on to the robot.
+A higher rate would mainly pass noise on to the robot.
 """
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
 
 
 def error_map(feedback: Feedback) -> np.ndarray:
-    """Matrix (2, 2) that maps an error and its rate, on the way back, to their time derivatives."""
+    """Matrix (2, 2) that maps an error and its rate, while it decays, to their time derivatives."""
     w = feedback.bandwidth
     return np.array([[0.0, 1.0], [-(w**2), -2 * feedback.damping * w]])
 
 
 @dataclass(frozen=True)
 class DecayingErrors:
-    """Motion along which errors (m,) decay.
+    """Return motion, along which errors (m,) decay.
 
     `error` and `rate` are the errors, m and rad, and their rates at the time `begin`, s. `map` is
     that of `error_map`. `correction` is an additional acceleration (m,), m/s^2 and rad/s^2.
@@ -102,7 +103,7 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
     """Controller with an observer, whose estimates are appended to `expected`."""
     observer = assignment.watched(drives)
-    # fraction of the way to the estimate in one frame
+    # fraction of the difference from the estimate that is made up in one frame
     fraction = 1 - np.exp(-FOLLOWING_RATE * assignment.feedback.bandwidth * assignment.period)
     subtracted = observer.disturbance
 
@@ -155,7 +156,7 @@ def _measured(assignment: Assignment) -> Command:
 def _decaying_errors(
     assignment: Assignment, time: float, coordinates: np.ndarray, rates: np.ndarray
 ) -> DecayingErrors:
-    """Way back from coordinates and rates (m,) at a time, s."""
+    """Return motion from coordinates and rates (m,) at a time, s."""
     chart = assignment.model.robot.geometry.chart
     pose, rate, _ = assignment.desired(time)
     errors = chart.coordinates(pose) - coordinates, chart.coordinates(rate) - rates
@@ -165,7 +166,7 @@ def _decaying_errors(
 def _torque(
     assignment: Assignment, way: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Mean torque (n,) over the first frame of a way back, N m or N.
+    """Mean torque (n,) over the first frame of a return motion, N m or N.
 
     Dry friction has the signs of the motion `dry`. `viscous` (n,) is friction that the model does
     not include.

@@ -10,7 +10,7 @@ equal to the torque of the inverse dynamics. With the linear hold, the torque of
 end of the ramp is equal to it. The servo adds its correction.
 
 Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
-at rest. An error of the torque at rest has an effect only by its change along the motion.
+at rest. An error of the torque at rest has an effect only if it changes along the motion.
 """
 
 from dataclasses import replace
@@ -72,7 +72,7 @@ def joint_commands(
 
 
 def feedforward(assignment: Assignment) -> LawInLoop:
-    """Law of the servo around the commands of `joint_commands`.
+    """Law in which the servo corrects the commands of `joint_commands`.
 
     With an observer, the servo corrects the pose predicted for the arrival of its correction.
     Raises the same errors as `joint_commands`.

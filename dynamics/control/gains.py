@@ -1,8 +1,8 @@
 """Design of gains: bandwidth and damping of a loop near rest, and gains for desired values.
 
-The bandwidth, rad/s, is the lowest frequency at which the error of an oscillating desired pose
-reaches 1/sqrt(2) of that pose, in the worst direction. The damping is the smallest damping ratio of
-the eigenvalues of the map from frame to frame. Both are computed for the linear loop
+The bandwidth, rad/s, is the lowest frequency of an oscillating desired pose at which the error
+reaches 1/sqrt(2) of the oscillation, in the worst direction. The damping is the smallest damping
+ratio of the eigenvalues of the map from frame to frame. Both are computed for the linear loop
 (`closed_loop.stability`), without dry friction.
 """
 
@@ -22,13 +22,13 @@ from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
 HALF_POWER = 2**-0.5
-"""Error over the desired motion at the frequency that is the bandwidth."""
+"""Ratio of the error to the desired motion at the frequency that is the bandwidth."""
 DECAYED = 1e-3
 """Magnitude of eigenvalues below which a motion has decayed within a frame."""
 SLOWEST = 1e-2
 """Lowest frequency, rad/s, in the search for a bandwidth."""
 DESIGN_TOLERANCE = 0.02
-"""Tolerance of a designed loop for the ratio of its error to HALF_POWER, and for its damping."""
+"""Tolerance of a design, both for the ratio of its error to HALF_POWER and for its damping."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,9 @@ def design_drives(
     """Gains of the joint PID that all joints share, for which the servo of each loop is stable.
 
     The largest inertia at home gets the natural frequency and the damping of the built-in robots.
-    Others are tried if the gain margin of a servo is below `WANTED_MARGIN`. `dynamic` are sets of
-    dynamic parameters (p,), the first one for the design. Raises SimulationError, with the largest
-    gain margin found, if there are no such gains.
+    Other values are tried if the gain margin of a servo is below `WANTED_MARGIN`. `dynamic` are
+    sets of dynamic parameters (p,), the first one for the design. Raises SimulationError, with the
+    largest gain margin found, if there are no such gains.
     """
     pose = robot.home_pose
     zero = np.zeros(len(robot.layout.joint_pid_names))
@@ -169,7 +169,7 @@ def design_drives(
             )
             if drives.margin >= WANTED_MARGIN:
                 return drives
-            # also replaces a best margin that is NaN
+            # this condition is also true for a best margin that is NaN
             if best is None or not best.margin >= drives.margin:
                 best = drives
     if best is None or not best.margin > 1:
@@ -227,7 +227,7 @@ def check_torque_gains(
     """Raise SimulationError if the law computed_torque is too fast. The error states the limit.
 
     The law is too fast if it is unstable near rest, or if its bandwidth exceeds half the frame
-    rate. A torque that acts for a whole frame then stops the platform, but hardly brings it back.
+    rate. A torque that acts for a whole frame then stops the platform, but hardly moves it back.
     """
     rate = settings.timing.frame_rate_hz
     radius = torque_radius(model, settings, pose, feedback)
@@ -281,7 +281,7 @@ def _torque_map(
     stiff = motion[size:, :size]
     damp = motion[size:, size:]
     to_torque = np.linalg.pinv(push)
-    # the mean acceleration along the way back over a frame
+    # the mean acceleration along the return motion over a frame
     mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
     by_place, by_rate = (
         to_torque @ (factor * (map_[1] @ along) * identity - along[0] * stiff - along[1] * damp)
@@ -342,7 +342,7 @@ def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float
 
 
 def _error_ratio(response: np.ndarray) -> float:
-    """Error over the desired motion in the worst direction, for a response (m, m)."""
+    """Ratio of the error to the desired motion in the worst direction, for a response (m, m)."""
     return float(np.abs(np.linalg.eigvals(np.eye(len(response)) - response)).max())
 
 

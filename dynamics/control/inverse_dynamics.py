@@ -10,7 +10,7 @@ from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Gauss-Legendre quadrature over a span.
+"""Nodes and weights of Gauss-Legendre quadrature over a span.
 
 The time of a reversal of friction is resolved to about an eighth of the span.
 """
@@ -138,8 +138,8 @@ class Spans:
     """Joint coordinates and torques of a motion over spans of time of equal length.
 
     `begin` and `end` (N, n) are joint coordinates at the ends of a span, and `mean` (N, n) is their
-    mean over it. `mean_integral` (N, n) is the mean of their integral since the beginning of the
-    span. `torque` (N, n) is the mean torque.
+    mean over the span. `mean_integral` (N, n) is the mean, over the span, of their integral since
+    its beginning. `torque` (N, n) is the mean torque.
     """
 
     begin: np.ndarray

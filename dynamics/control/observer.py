@@ -7,8 +7,8 @@ that all measured poses have in common. The measurements do not determine this o
 uncertainty is included.
 
 During the run, the observer estimates the rate of the random walk, and the ratio of the sensor's
-noise to its stated noise. Both are scales of covariances. They follow the exact gradient of the
-likelihood of the innovations.
+noise to its stated noise. Both are scales of covariances. They are adjusted along the exact
+gradient of the likelihood of the innovations.
 """
 
 from collections.abc import Callable
@@ -40,13 +40,13 @@ VISCOUS_DOUBT = 5.0
 TORQUE_COMMAND_FACTOR = 2.0
 """Ratio of the model error with torque commands to the model error with joint commands.
 
-With torque commands, the error of the common factor of all parameters has an effect, too.
+With torque commands, an error of a factor that all parameters share has an effect, too.
 """
 
 MEMORY_TIME = 2.0
 """Time constant, s, with which information from earlier innovations about the scales fades.
 
-The gradient differs far from the solution, and early information would slow down convergence.
+Far from the solution the gradient is different, so that old information slows down convergence.
 """
 
 PRIOR_INFORMATION = (0.3, 200.0)
@@ -148,18 +148,18 @@ class Observer:
 
     @property
     def disturbance(self) -> np.ndarray:
-        """Estimated torque (n,) at the joints that the model does not include."""
+        """Estimated torque (n,) at the joints, in addition to that of the model."""
         return self._state[self._prediction.blocks.torque].copy()
 
     @property
     def viscous(self) -> np.ndarray:
-        """Estimated viscous friction (n,) of the joints that the model does not include."""
+        """Estimated viscous friction (n,) of the joints, in addition to that of the model."""
         return self._state[self._prediction.blocks.viscous].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
-        """Go on to a frame, and update the state by its measured pose (6,), or None if lost.
+        """Advance to a frame, and update the state by its measured pose (6,).
 
-        Returns the estimate before the update.
+        `pose` is None at a lost frame. Returns the estimate before the update.
         """
         time = frame * self._period
         self._state, self._covariance = self._moved(

@@ -1,15 +1,15 @@
 """One time step of a robot with its drives, and of the covariance of its state.
 
 The state has coordinates q (m,), their rates (m,) and the integral of the joint PID (n,). It also
-has constant values: a torque (n,) and viscous friction (n,) of each joint that the model does not
-include, and an offset of the sensor (m,) that all measured poses have in common.
+has constant values. They are a torque (n,) and viscous friction (n,) at the joints, in addition to
+those of the model, and an offset of the sensor (m,) that all measured poses have in common.
 
 Without dry friction, a step uses the matrix exponential, which is exact for linear motion. Dry
 friction is then added implicitly, like contacts in time-stepping methods (Moreau, Unilateral
 contact and dry friction in finite freedom dynamics, 1988). Let u be the velocity of a joint at the
-end of the step without its own dry friction, and b the largest change of this velocity by its
-Coulomb torque. If |u| > b, the joint slips and loses b; otherwise, it comes to rest. Since u is
-uncertain, the torque is the expectation, over normally distributed u, of
+end of the step without its own dry friction, and b the largest change of u by the joint's Coulomb
+torque. If |u| > b, the joint slips, and |u| is reduced by b; otherwise, it comes to rest. Since u
+is uncertain, the torque is the expectation, over normally distributed u, of
 
     torque = coulomb sat(u / b),    sat(x) = min(1, max(-1, x))
 """
@@ -28,7 +28,7 @@ MOST_ITERATIONS = 12
 """Largest number of iterations of Newton's method for the friction of all joints."""
 
 FRICTION_TOLERANCE = 1e-6
-"""Error of a joint's friction, over the largest friction, below which the iterations end."""
+"""Ratio of a joint's friction error to the largest friction, below which the iterations end."""
 
 LEAST_WIDTH = 1e-9
 """Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly."""
@@ -37,7 +37,7 @@ SHORTEST_HALVED = 1.5e-3
 """Length, s, below which a step in which a joint reverses is not halved."""
 
 LEAST_REACH = 1e-3
-"""Smallest velocity change by dry friction in a step, over the standard deviation of the velocity.
+"""Smallest ratio of the velocity change by dry friction to the velocity's standard deviation.
 
 It is above zero because it is a divisor.
 """
@@ -55,7 +55,7 @@ class StateSlices(NamedTuple):
 
     @classmethod
     def of(cls, m: int, n: int) -> "StateSlices":
-        """StateSlices of a robot with m coordinates and n joints."""
+        """Slices for a robot with m coordinates and n joints."""
         ends = np.cumsum([m, m, n, n, n, m]).tolist()
         return cls(*(slice(begin, end) for begin, end in pairwise([0, *ends])))
 
@@ -96,8 +96,8 @@ class Prediction:
 
         Also returns the map (size, size) from errors of the state before to errors after. The
         covariance (size, size) of the state determines how well the velocities of joints are known.
-        A step in which a joint comes to rest or breaks away is halved until this changes its
-        velocity by less than the standard deviation of the velocity.
+        A step in which a joint comes to rest or breaks away is halved until this event changes the
+        joint's velocity by less than the standard deviation of the velocity.
         """
         after, errors, too_long = self._once(state, covariance, command, command_rate, length)
         if not too_long or length < SHORTEST_HALVED:
@@ -241,8 +241,8 @@ def expected_dry_friction(
 
     `velocity` (n,) is the velocity after the step without dry friction. Its errors are normal, with
     standard deviations `width` (n,). `velocity_by_torque` (n, n) is the change of the velocities by
-    a torque over the step, and `largest` (n,) is the largest torque. The torque changes its sign
-    over the velocity `smooth`.
+    a torque over the step, and `largest` (n,) is the largest torque. `smooth` is the velocity over
+    which the torque changes its sign.
 
     With this gain, propagated errors have the variance of the velocity after dry friction, which
     stops a part of the distribution. The slope of the expected torque would give another variance.
@@ -271,9 +271,10 @@ def expected_dry_friction(
 def expected_saturation(
     mean: np.ndarray, deviation: np.ndarray, reach: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Expectation of sat(u / reach) over normal u, its derivative by the mean, and its variance.
+    """Expectation of sat(u / reach) over normal u, its derivative, and the variance of sat.
 
-    Arrays have any shape. `deviation` and `reach` are > 0.
+    The derivative is with respect to the mean. Arrays have any shape. `deviation` and `reach` are
+    > 0.
     """
     low = (-reach - mean) / deviation
     high = (reach - mean) / deviation

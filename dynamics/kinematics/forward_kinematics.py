@@ -16,7 +16,8 @@ from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
 from dynamics.kinematics.platform import Chart
 
-# A smaller step ends the iteration. A smaller residual, rad or m, counts as solved.
+# A step below the first tolerance ends the iteration. A residual below the second, rad or m, counts
+# as solved.
 STEP_TOLERANCE = 1e-12
 ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
@@ -132,7 +133,7 @@ def search(
 def close_loops(
     closure: Closure, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 6) that close the loops best for joint coordinates (N, n), with steps (N,) needed.
+    """Poses (N, 6) that close the loops best for joint coordinates (N, n), and steps (N,) taken.
 
     Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
     negligible or reduces its gaps no further.
@@ -182,8 +183,8 @@ def _damped(
 def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solutions (N, m, 1) of linear systems.
 
-    That of a singular matrix is the least-squares solution of minimum norm. That of a matrix that
-    has overflowed is NaN.
+    For a singular matrix, the result is the least-squares solution of minimum norm. For a matrix
+    that has overflowed, it is NaN.
     """
     try:
         return np.linalg.solve(matrices, right)

@@ -1,4 +1,4 @@
-"""Platform: its coordinates, and its motion with the joints A of the legs, in CasADi.
+"""Coordinates of the platform, and its motion with the joints A of the legs, in CasADi.
 
 For every robot, the pose has the six entries [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta)
 Rz(gamma) (eq. 1). The coordinates of a platform with fewer degrees of freedom are the entries that

@@ -24,13 +24,13 @@ It allows for numbers that are written with few digits.
 class Chain(NamedTuple):
     """Joints of a leg at home, in order from the base to A. Vectors are in the axes of the base, m.
 
-    `joints` are their kinds (k): "hinge", "slide", "universal" or "ball", with * after the actuated
+    `joints` are the k kinds: "hinge", "slide", "universal" or "ball", with * after the actuated
     joint. `points` (k, 3) are their positions; the last one is A, or the point midway between two
     parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second axis of a universal
     joint. `coordinate` is the coordinate of the actuated joint. `platform_joint` is A in the axes
     of the platform. `across` (3,) is the vector from the first of two bars to the second, or zero.
     `centres` (k - 1, 3) are the centres of mass of the bodies. `rods` are the lengths and radii of
-    the rods that draw the bodies, or None.
+    the drawn rods of the bodies, or None.
     """
 
     joints: tuple[str, ...]
@@ -180,7 +180,7 @@ def _telescopic(chain: Chain) -> dict[str, Any]:
 
 
 def _drawn(chain: Chain, *names: str) -> dict[str, float]:
-    """Radii of the rods that draw the bodies."""
+    """Radii of the drawn rods, as fields of a leg."""
     return {
         f"{name}_radius": rod[1]
         for name, rod in zip(names, chain.rods, strict=True)

@@ -1,12 +1,12 @@
 """Force and mass of a crank and a link that does not spin, if they are full bodies (CasADi).
 
-Of the crank, only the rotation about its axis z does work. With its length r, its angle theta, and
-the axes x along it and y = z x x, its first moments m_x and m_y add to the torque about its axis
+Of the crank, only the rotation about its axis z does work. Let r be its length, theta its angle, x
+the axis along it, y = z x x, and g gravity. Its first moments m_x and m_y add to the torque
 
     m_x (r theta_ddot - y . g) + m_y x . g
 
-The rates of rotation of the link have no component along its length. In its own axes they are (p,
-q, 0), and only the components x and y of its moment do work.
+The angular velocity of the link has no component along its length. In the axes of the link, it is
+(p, q, 0), and only the components x and y of the moment do work.
 """
 
 from collections.abc import Sequence

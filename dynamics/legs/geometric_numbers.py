@@ -1,9 +1,9 @@
 """Geometric numbers of a leg: the numbers that determine its kinematics.
 
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
-its joints and lengths, m, and small rotations of its axis, rad. Rotations are relative to the leg
-itself. The rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank, `u`
-is about its zero direction, and `crank_zero` is about the crank axis.
+its joints, m, its lengths, m, and small rotations of its axis, rad. Rotations are relative to the
+leg itself. The rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank,
+`u` is about its zero direction, and `crank_zero` is about the crank axis.
 
 A leg can be described by another leg and a vector of deviations of the geometric numbers. The
 deviations can be symbols, with respect to which the leg then has derivatives.
@@ -98,7 +98,7 @@ def _is_turn(number: str) -> bool:
 
 
 def _value(leg: Leg, number: str) -> float:
-    """Number of a leg."""
+    """Value of a geometric number of a leg, m. It is zero for a rotation."""
     field, _, entry = number.partition(".")
     if _is_turn(number):
         return 0.0

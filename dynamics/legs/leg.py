@@ -8,8 +8,8 @@ columns). This form needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
 work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
-method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, and A is given
-by its position (3,) in them. Units are SI. The actuated coordinate is in rad for a rotating
+method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, also the
+position (3,) of A. Units are SI. The actuated coordinate is in rad for a rotating
 actuator, and in m for a sliding one.
 """
 
@@ -105,8 +105,8 @@ class Segment(NamedTuple):
     before to this joint, in the same axes.
 
     The frame of the body is at its joint, with the axes of its `Placement`. Three places are in
-    this frame, m: `centre` (3,) is the centre of mass, `rod` (2, 3) are the ends of the rod of
-    `radius` that draws the body, and `end` (3,) is A on the last body.
+    this frame, m: `centre` (3,) is the centre of mass, `rod` (2, 3) are the ends of the drawn rod,
+    which has the radius `radius`, and `end` (3,) is A on the last body.
 
     `actuated` is True if the coordinate of this joint is the coordinate of the leg. `copies` are
     the offsets (bars, 3) of the joints of several equal bars from `origin`, in the same axes. The
@@ -165,9 +165,9 @@ class Leg(BaseModel, ABC):
     def assembled(self, joint: np.ndarray, number: int) -> Self:
         """Leg whose branch is selected for the position (3,) of A at home.
 
-        Raises RobotFileError, with the number of the leg, reach and lengths, if the leg cannot
-        reach A, or if a body is parallel to the axis from which its rotation is measured, such as
-        the axis of a universal joint.
+        Raises RobotFileError, with the number of the leg, if the leg cannot reach A. Raises it also
+        if a body is parallel to the axis from which its rotation is measured, such as the axis of a
+        universal joint.
         """
         margin = float(self.reach(ca.SX(joint)))
         if not margin > 0:
@@ -212,7 +212,7 @@ class Leg(BaseModel, ABC):
 
     @abstractmethod
     def shifted(self, by: float) -> Self:
-        """Leg whose coordinate is smaller by a value, rad or m."""
+        """Leg whose coordinate at each position of A is smaller by a value, rad or m."""
 
     @abstractmethod
     def coordinate(self, position: ca.SX) -> ca.SX:
@@ -320,7 +320,7 @@ class Leg(BaseModel, ABC):
         return symmetric_from_lower(_replaced(total, (at, *parameters), (position, *bodies)))
 
     def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        """Matrix C (3, 3). C velocity is the Coriolis and centrifugal force at A.
+        """Matrix C (3, 3), which times the velocity is the Coriolis and centrifugal force at A.
 
         It is the sum of J^T (M_body J_dot + C_body J) over the bodies (eq. 21, 22).
         """

@@ -65,7 +65,7 @@ class PssLeg(Leg):
 
     @property
     def across_from(self) -> np.ndarray:
-        """Direction (3,) that the x of the link is perpendicular to."""
+        """Direction (3,) to which the x axis of the link is perpendicular."""
         return self.slider_axis
 
     def lengths(self) -> str:
@@ -177,7 +177,7 @@ class PusLeg(PssLeg):
 
     @property
     def across_from(self) -> np.ndarray:
-        """Direction (3,) that the x of the link is perpendicular to."""
+        """Direction (3,) to which the x axis of the link is perpendicular."""
         return self.joint_axis
 
     def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:

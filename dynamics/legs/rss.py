@@ -45,8 +45,8 @@ Z = np.array([0.0, 0.0, 1.0])
 class LegVectors:
     """Vectors of one leg in the axes of the base, m.
 
-    `angle` is the crank angle, rad. `axis` is s, `crank` is w = T - B and `link` is l = A - T, (3,)
-    each. The lengths of crank and link are constants of the robot.
+    `angle` is the crank angle, rad. `axis` is the crank axis s, `crank` is w = T - B and `link` is
+    l = A - T, (3,) each. T is the tip of the crank. The lengths are constants of the robot.
     """
 
     angle: ca.SX
@@ -142,8 +142,8 @@ class RssLeg(Leg):
     def vectors(self, position: ca.SX) -> LegVectors:
         """Vectors of the leg for a position of A.
 
-        The crank angle solves along cos(theta) + across sin(theta) = chord, on the branch of the
-        leg.
+        The crank angle theta solves along cos(theta) + across sin(theta) = chord, on the branch of
+        the leg. The three coefficients come from `_chord`.
         """
         zero = self.crank_zero_direction
         axis = self.crank_axis

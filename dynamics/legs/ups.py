@@ -56,7 +56,8 @@ class UpsLeg(Leg):
     def stroke(self) -> tuple[float, float]:
         """Shortest and longest distance of A from B, m.
 
-        In this range, no end protrudes backwards, and the rod remains in the cylinder.
+        In this range, the rod does not protrude beyond B, the cylinder does not protrude beyond A,
+        and the rod remains in the cylinder.
         """
         return max(self.cylinder_length, self.rod_length), self.cylinder_length + self.rod_length
 

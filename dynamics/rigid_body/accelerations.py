@@ -1,8 +1,8 @@
 """Acceleration from the equation of motion, and derivatives of the slope of the state (CasADi).
 
-Both use a factor of the mass matrix (see `factored`). Derivatives are columns, one for each
-variable. A variable is a parameter or an entry of the start state. All columns solve the same
-equations.
+The slope of a state is its time derivative. Both use a factor of the mass matrix (see `factored`).
+Derivatives are columns, one for each variable. A variable is a parameter or an entry of the start
+state, for example. All columns solve the same equations.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ STAGES = 4
 def free_acceleration(size: int, joints: int) -> ca.Function:
     """Function of the acceleration under torques, if no joint sticks.
 
-    (factor of M (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,), for m coordinates
-    (`size`) and n joints.
+    It maps (factor of M (m, m), b (m,), J_theta (n, m), torque (n,)) to q_ddot (m,). m is `size`,
+    the number of coordinates, and n is `joints`.
     """
     factor = ca.SX.sym("factor", size, size)
     bias = ca.SX.sym("bias", size)
@@ -59,16 +59,16 @@ def acceleration_in_lanes(free: ca.Function, responding: ca.Function) -> ColumnF
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Function for the derivatives of the slope of a state, and of the net joint torques.
 
-    No joint sticks here, and the platform has m coordinates. All columns share the following inputs
-    of one stage (stages are side by side in memory): the outputs of `motion_derivatives`; J_theta
-    (n, m), and the same with zeros for stuck joints; the factor of M (m, m); and the derivatives
-    (n,) of the torque of a joint with respect to its velocity (with opposite sign), its error, the
-    integral of the error, and the rate of the command.
+    The torques that hold stuck joints are not included. The platform has m coordinates. All columns
+    share the inputs of one stage; stages are side by side in memory. These inputs are the outputs
+    of `motion_derivatives`; J_theta (n, m), and J_theta with zeros for stuck joints; the factor of
+    M (m, m); minus the derivatives (n,) of joint torques with respect to joint velocities; and
+    their derivatives (n,) with respect to the error, its integral, and the rate of the command.
 
-    The inputs of each column are the derivatives of pose and rate (m,), of joint integral, command
-    and command rate (n,), and, at a fixed state, of -M q_ddot - b (m,), here `push`, and of the
-    torque (n,), here `direct`. The outputs of a column are the derivatives of rate, acceleration
-    (m,), command error and torque (n,).
+    The inputs of each column are the derivatives of pose and rate (m,), and of joint integral,
+    command and command rate (n,). Two more are derivatives at a fixed state: `push` (m,) of -M
+    q_ddot - b, and `direct` (n,) of the torque. The outputs of a column are the derivatives of
+    rate, acceleration (m,), command error and torque (n,).
     """
     n = layout.joints
     by_pose, by_rate, factor = (ca.SX.sym(name, m, m) for name in ("by_pose", "by_rate", "factor"))

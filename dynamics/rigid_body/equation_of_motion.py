@@ -6,7 +6,7 @@ the chart leaves free. The balance of wrenches is multiplied by T^T (twist = T q
     M(q) q_ddot + b(q, q_dot) = J_theta^T (torque - friction)
 
 Legs contribute only through the motion of their platform joints A. Derivatives are therefore
-computed leg by leg with respect to three vectors of length 3, and multiplied by dA/dq.
+computed leg by leg with respect to the motion of A, and multiplied by dA/dq.
 """
 
 from collections.abc import Callable, Sequence
@@ -145,10 +145,10 @@ def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """Function (q, rate, acceleration (m,), torque (n,), rigid (p,)) of derivatives.
 
-    Acceleration and net joint torque are fixed. It returns the derivatives of M q_ddot + b -
-    J_theta^T torque with respect to q (m, m), rate (m, m) and rigid (m, p), and the derivatives of
-    the joint accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot.
-    The solution for q_ddot itself is never differentiated.
+    Acceleration and net joint torque are fixed. The function returns the derivatives of M q_ddot +
+    b - J_theta^T torque with respect to q (m, m), rate (m, m) and rigid (m, p), and those of the
+    joint accelerations with respect to q (n, m) and rate (n, m). The last one is 2 J_theta_dot. The
+    solution for q_ddot itself is never differentiated.
     """
     q, rate, acceleration = _coordinates(geometry, "q", "rate", "acceleration")
     motion = _poses(geometry, q, rate, acceleration)
@@ -160,8 +160,9 @@ def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
 def stop_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """Function (q, change of rate (m,), impulse (n,), rigid (p,)) of derivatives at a stop.
 
-    It returns the derivatives of M change - J_theta^T impulse with respect to q (m, m), rate (m,
-    m), which are zero, and rigid (m, p). The motion starts from rest, without gravity.
+    It returns the derivatives of M change - J_theta^T impulse with respect to q (m, m), rate (m, m)
+    and rigid (m, p). Those with respect to the rate are zero. They are derivatives of a motion that
+    starts from rest, without gravity, with the acceleration `change`.
     """
     q, change = _coordinates(geometry, "q", "change")
     motion = _poses(geometry, q, 0 * q, change)
@@ -207,7 +208,7 @@ def _derivatives(
     of_platform = layout.body_slices[0]
     wrench = platform @ rigid[of_platform]
     passive = ca.SX.zeros(6, 0)
-    # at a stop nothing turns that friction could act on
+    # a stop is treated as a motion from rest, in which passive friction is zero
     if layout.passive_names and count > 3:
         to_twist = pose_rate_to_twist(joints.pose)
         passive = to_twist.T @ passive_friction_columns(

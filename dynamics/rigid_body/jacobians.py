@@ -68,7 +68,7 @@ def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
         places_and_spins = zip(
             leg.placements(position), leg.angular_velocities(position, velocity), strict=True
         )
-        # vec goes by columns, and the columns of the transpose are the rows
+        # `vec` lists a matrix by columns, and the columns of the transpose are the rows
         rows += [
             ca.vertcat(place.centre, ca.vec(place.axes.T), spin).T
             for place, spin in places_and_spins

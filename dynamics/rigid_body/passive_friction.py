@@ -1,9 +1,10 @@
 """Friction of the passive joints of the legs, from the relative angular velocity of their bodies.
 
 Let w (3,) be the angular velocity of the outer body of a joint relative to the inner one, and W
-(3, 6) its derivatives with respect to the twist of the platform. Friction with the moment c w takes
-the power c |w|^2, and is thus the wrench c W^T w at the platform. Dry friction has the moment
-c w / |w|. It fades over the angular velocity `SLOW`, so that the equation of motion stays smooth:
+(3, 6) its derivatives with respect to the twist of the platform. Viscous friction with the moment
+c w dissipates the power c |w|^2, and is thus the wrench c W^T w at the platform. Dry friction has
+the moment c w / |w|. It fades below the angular velocity `SLOW`, so that the equation of motion
+stays smooth:
 
     viscous   c W^T w
     coulomb   c W^T w / sqrt(|w|^2 + SLOW^2)
@@ -18,7 +19,7 @@ from dynamics.parameter_units import PASSIVE_JOINT
 from dynamics.rigid_body.jacobians import platform_arms
 
 SLOW = 0.02
-"""Relative angular velocity, rad/s, over which dry friction of a passive joint fades."""
+"""Relative angular velocity, rad/s, below which dry friction of a passive joint fades."""
 
 
 def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:

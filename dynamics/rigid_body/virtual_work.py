@@ -72,7 +72,7 @@ def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
 
 
 def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
-    """Matrix C (6, 6) of eq. 23. C twist is the Coriolis and centrifugal wrench."""
+    """Matrix C (6, 6) of eq. 23, which times the twist is the Coriolis and centrifugal wrench."""
     omega = twist[3:6]
     layout = geometry.layout
     frame = rotation_matrix(pose[3:6])
@@ -148,8 +148,8 @@ def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
 def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """Functions M, C, G, friction, regressor (eq. 23-26), and dynamics (eq. 17, 40).
 
-    Wrenches have six entries. The legs balance the entries along which the platform cannot move,
-    and these have no effect on the torques.
+    Wrenches have six entries. The legs balance the entries along which the platform cannot move.
+    These entries have no effect on the torques.
     """
     layout = geometry.layout
     pose = ca.SX.sym("pose", 6)
