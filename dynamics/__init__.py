@@ -5,7 +5,7 @@ Robots
     load_robot(name_or_path)                    built-in robot, or robot of a TOML file
     built_in_robots()                           names of the built-in robots
     Robot                                       kinematics and dynamics, one pose or a batch
-    RobotModel(robot)                           torques, CasADi, MJCF and URDF with fixed numbers
+    RobotModel(robot)                           torques, CasADi, MJCF and URDF, parameters fixed
     fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops
     workspace.check_motion(robot, pose, times)  travel, reach and singularities along a motion
 
@@ -19,7 +19,7 @@ and Numba take a second to load, and the help of the command line does not need 
 
 Conventions: SI units and rad. A pose is [x y z alpha beta gamma] with
 R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. A wrench is
-[force, moment]; the paper uses this word for the crank.
+[force, moment]. In the paper, the word wrench means the crank.
 """
 
 from importlib import import_module

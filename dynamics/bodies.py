@@ -34,7 +34,7 @@ class Part(NamedTuple):
 
 
 BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-"""Row of the base, as the rows of `rigid_body.jacobians.placements`: origin, axes, spin."""
+"""Row of the base in the form of `rigid_body.jacobians.placements`: origin, axes, spin."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Frames:
 
 
 class DrawnParts(NamedTuple):
-    """Numbers from which the ends of the drawn parts are computed.
+    """Numbers from which the ends of the parts' rods are computed.
 
     `body` and `before` (parts,) are the rows of each part and of the part before it in the
     placements; the base is -1. `offset` (parts, 3) is in the axes of the part before, m. `centre`
@@ -136,11 +136,11 @@ class Parts:
         return Frames(origin, axes, rows[:, 12:])
 
     def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
-        """Ends (parts, 2, 3) of the rods that draw the parts, in the axes of the base, m.
+        """Ends (parts, 2, 3) of the rods by which parts are drawn, in the axes of the base, m.
 
         Raises the same errors as `frames`.
         """
-        # importing Numba takes time
+        # imported here, because the import of Numba takes time
         from dynamics.compiled.kernel import chosen
         from dynamics.rod_kernels import place_parts
 
@@ -159,7 +159,7 @@ class Parts:
         ends = np.empty((len(self.all), 2, 3))
         inputs = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
         if not chosen(place_parts, True)(*inputs, self._drawn, buffers, ends):
-            # raises the error with the reason
+            # this call raises the error, with the reason
             robot.check_reach(at)
         return ends
 

@@ -1,6 +1,6 @@
 """Meshes of the bodies of a robot's legs, as a robot file states them.
 
-A mesh is drawn and hides stickers. It has no effect on the motion of the robot.
+A mesh is drawn, and it hides stickers from cameras. It has no effect on the motion of the robot.
 """
 
 from typing import Annotated

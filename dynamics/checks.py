@@ -4,8 +4,8 @@ Arguments are converted to numbers and arrays, or an error with the name, value 
 Arrays are never transposed or padded. Text, complex numbers and truth values are never converted.
 
 Entries of files must be in the ranges of machines, from robots on a chip to cranes, in SI units. A
-number outside its range is usually a typing error or a wrong unit. Schemas for editors include the
-ranges.
+number outside its range usually comes from a typing error or a wrong unit. Schemas for editors
+include the ranges.
 """
 
 from collections.abc import Mapping, Sequence
@@ -208,7 +208,7 @@ INERTIA_FORMS = ("centred", "full")
 
 
 def check_inertia_forms(value: object) -> object:
-    """Return a form of all bodies, or a table of forms by body or kind of body.
+    """Return the value, a form of all bodies or a table of forms by body or kind of body.
 
     Raises ValueError, with the valid forms, for anything else.
     """

@@ -1,7 +1,7 @@
 """Poses that close the loops of a robot whose geometry deviates, and their derivatives.
 
 The gaps of the loops (`rigid_body.jacobians.loop_closure`) depend on the coordinates q of the
-platform and on the geometric numbers. They are zero at a closed pose, from which follows
+platform and on the geometric numbers. They are zero at a closed pose. Hence
 
     dq/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 

@@ -21,7 +21,7 @@ class RobotFileError(DynamicsError):
 
 
 class ParameterError(DynamicsError):
-    """Dynamic parameters of the wrong number, or outside their physical range."""
+    """Dynamic parameters in the wrong number, or outside their physical range."""
 
 
 class ShapeError(DynamicsError):
@@ -49,4 +49,4 @@ class ConvergenceError(DynamicsError):
 
 
 class SimulationError(DynamicsError):
-    """A closed-loop run that cannot be set up."""
+    """A closed-loop run that cannot be set up, or that ends early."""

@@ -77,7 +77,7 @@ Name = Annotated[
 
 
 def is_file(path: str | PathLike[str]) -> bool:
-    """Return True if there is such a file. An invalid path, such as one with NUL, is no file."""
+    """Return True if a path is a file. An invalid path, such as one with NUL, is no file."""
     try:
         return Path(path).is_file()
     except (OSError, ValueError):
@@ -126,7 +126,7 @@ def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str
         )
     deep = f"{source} has keys, tables or lists more than {DEEPEST} deep"
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
-    # the time of tomllib grows with the square of the number of parts
+    # the time of tomllib grows with the square of the number of parts of a dotted key
     if any(key.count(".") >= DEEPEST for key in bare):
         raise error_class(deep)
     try:
@@ -136,7 +136,7 @@ def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str
     except RecursionError:
         raise error_class(deep) from None
     except ValueError:
-        # int() refuses more than some thousand digits
+        # int() refuses numbers with more than some thousand digits
         raise error_class(f"{source} has an integer beyond 64 bits, or an invalid date") from None
     fault = _fault(content)
     if fault:

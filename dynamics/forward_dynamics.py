@@ -15,12 +15,12 @@ StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 def fast_forward_dynamics(
     robot: Robot, parameters: np.ndarray | None = None
 ) -> StateToAcceleration:
-    """Make a function with the result of `Robot.forward_dynamics`, for inner loops.
+    """Make a function that computes the same as `Robot.forward_dynamics`, for inner loops.
 
     The function is about 80 times faster than the method, because it does not check reach and
     conditioning. It always returns the same array, which the next call overwrites, and is
-    therefore not thread safe. In a pose in which the platform can move although all cranks are
-    locked, eq. 40 holds, and the function returns the acceleration. `Robot.forward_dynamics`
+    therefore not thread safe. At a pose at which the platform can move although all cranks are
+    locked, eq. 40 still holds, and the function returns the acceleration. `Robot.forward_dynamics`
     refuses such a pose, because no controller can hold it.
 
     Parameters

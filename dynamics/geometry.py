@@ -34,8 +34,8 @@ class RobotGeometry:
     `parameters.parameter_layout`). `own_gains` is True if each joint has its own gains, and False
     if all joints share them. `passive_friction` are the names of the parameters of passive joints
     (see `parameters.passive_parameters`). `unstated` has the standard deviations of the differences
-    between real bodies and joints and this model of them. `meshes` are the meshes that draw bodies
-    of the legs in place of rods.
+    between this model and the real bodies and joints. `meshes` are drawn in place of the rods of
+    bodies of the legs.
 
     Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
     of actuators, if two legs coincide, or if a leg cannot reach the home pose.
@@ -120,7 +120,7 @@ class RobotGeometry:
     def digest(self) -> bytes:
         """Digest of all that compiled functions depend on, for caches.
 
-        It has all numbers except the travel limit.
+        It does not depend on the travel limit, the gains, `unstated` and the meshes.
         """
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         if any(self.layout.full):
@@ -160,8 +160,8 @@ class RobotGeometry:
     def body_lengths(self) -> np.ndarray:
         """Length (bodies,), m, of each body in the order of the layout.
 
-        It is the characteristic length for the platform, and the length of the rod that draws it
-        for a body of a leg.
+        For the platform, it is the characteristic length. For a body of a leg, it is the length of
+        its drawn rod.
         """
         found = np.full(len(self.layout.bodies), self.characteristic_length)
         for leg, of_leg in zip(self.legs, self.layout.of_leg, strict=True):
@@ -171,7 +171,7 @@ class RobotGeometry:
 
     @property
     def body_reaches(self) -> np.ndarray:
-        """Distance (bodies,), m, that the drawing of each body reaches from its reference point.
+        """Largest distance (bodies,), m, between each drawn body and its reference point.
 
         The platform reaches to its farthest joint, and a body of a leg to the end of its rod.
         """
@@ -224,7 +224,7 @@ class RobotGeometry:
         )
 
     def shifted(self, joints: np.ndarray) -> "RobotGeometry":
-        """Geometry whose joint coordinates are smaller by values (n,), rad or m."""
+        """Geometry whose joint coordinates at each pose are smaller by values (n,), rad or m."""
         return replace(
             self,
             legs=tuple(leg.shifted(float(by)) for leg, by in zip(self.legs, joints, strict=True)),

@@ -1,19 +1,20 @@
 """Inertias that a rigid body can have, and the effect of changed inertias on the motion.
 
-A rigid body has a positive mass, and no principal moment of inertia larger than the sum of the
-other two (`moments_fault`). Published tables break this rule, as the cranks and links in Table 1 of
-the paper do, and multibody engines refuse such bodies. `physical_inertias` names these bodies, or
-changes them as little as possible. If it can, it changes only values without effect on the motion:
+A rigid body has a positive mass, and none of its principal moments of inertia is larger than the
+sum of the other two (`moments_fault`). Published tables break this rule, for example for the cranks
+and links in Table 1 of the paper. Multibody engines refuse such bodies. `physical_inertias` names
+them, or changes them as little as possible. If it can, it changes only values without effect on the
+motion:
 
-- If one moment of a body does work, this moment is kept. An example is a crank that rotates about
-  its own z, with Izz.
-- If two moments of a body do work, both are kept, and the third is changed. An example is a link
+- If one moment of a body affects the motion, this moment is kept. An example is a crank that
+  rotates about its own z, with Izz.
+- If two moments affect the motion, both are kept, and the third is changed. An example is a link
   without spin, with Ixx and Iyy.
-- If all three moments do work, as on the platform, they are changed to the nearest valid moments in
-  the least-squares sense.
+- If all three moments affect the motion, as for the platform, they are changed to the nearest valid
+  moments in the least-squares sense.
 
 A full body keeps its mass and its centre of mass. The second moments of its mass are changed to the
-nearest positive ones.
+nearest positive definite ones.
 
 `acceleration_changes` measures the effect on the motion of the robot at random states.
 """
@@ -58,7 +59,7 @@ def physical_inertias(
 ) -> BodyInertias:
     """Inertias of parameters (p,) that a multibody engine accepts.
 
-    Raises UnphysicalInertiaError, with bodies and values, if one must be changed and
+    Raises UnphysicalInertiaError, with bodies and values, if a body must be changed and
     `allow_changes` is False.
     """
     stated = layout.bodies_of(np.array(parameters, dtype=float))
@@ -97,7 +98,7 @@ def grouped(texts: dict[str, str]) -> list[str]:
 def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
     """Mass and moments (4,) of a centred body, changed as little as possible."""
     mass = max(row[0], SMALLEST)
-    # sums of three of the largest floats overflow
+    # a quarter of each, because sums of three of the largest floats overflow
     moments = np.maximum(row[1:], SMALLEST) / 4
     working = [MOMENTS.index(name) for name in body.moments]
     if len(working) in (1, 2):
@@ -192,8 +193,8 @@ def travel_states(
     at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
     while len(pose) < STATES:
-        # Far from home, poses from this linear map are out of reach. The random factor makes some
-        # of the poses nearer to home.
+        # Far from home, poses from this linear map are out of reach. The first random factor brings
+        # some of the poses nearer to home.
         angles = (
             robot.travel_limit
             * rng.uniform(0, 1, (STATES, 1))

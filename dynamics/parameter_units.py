@@ -5,9 +5,9 @@ import re
 from dynamics.spatial_inertia import FIRST_MOMENTS, MOMENTS, PRODUCTS
 
 PASSIVE_JOINT = "{}_joint"
-"""Name of a passive joint: that of the body outwards from it, such as link_joint.
+"""Name of a passive joint, from the next body towards the platform, such as link_joint.
 
-It is the name of the joints of all legs. The joint of a single leg has the number of the leg, such
+This name is for the joints of all legs. The name for a single leg has the number of the leg, such
 as link3_joint.
 """
 
@@ -29,13 +29,13 @@ PRISMATIC = {"coulomb": "N", "viscous": "N s/m", "lp": "N/m", "li": "N/(m s)", "
 def of_all_legs(name: str) -> str:
     """Name of a parameter of passive joints for all legs, such as `link_joint.viscous`.
 
-    The parameter may be that of a single leg, such as `link3_joint.viscous`.
+    `name` may be the parameter of a single leg, such as `link3_joint.viscous`.
     """
     return re.sub(r"\d+(?=_joint\.)", "", name)
 
 
 def unit_of(name: str, prismatic: bool = False) -> str:
-    """Unit of a parameter name such as `crank1.mass` or `joint_pid.lp`."""
+    """Unit of the parameter with a name such as `crank1.mass` or `joint_pid.lp`."""
     joint, _, entry = name.rpartition(".")
     if joint.endswith(PASSIVE_JOINT.format("")):
         # passive joints turn, whatever the actuators do

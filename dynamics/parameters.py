@@ -1,6 +1,6 @@
 """Dynamic parameters of a robot: names, order, units and physical range (Xi of eq. 25).
 
-The driven arm of a leg, which the paper calls wrench, is the crank.
+The driven arm of a leg is called the crank. In the paper, it is called the wrench.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,16 @@ SIGNED = (*FIRST_MOMENTS, *PRODUCTS)
 """Inertial parameters that may be negative."""
 
 ALL_TEN = list(range(len(FULL_INERTIAL)))
-"""Places of all parameters of a full body."""
+"""Indices of all parameters of a full body."""
 
 CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
-"""Places of the parameters of a centred body among those of a full body."""
+"""Indices of the parameters of a centred body among those of a full body."""
 
 PASSIVE_LAWS = ("coulomb", "viscous")
 """Kinds of friction of a passive joint, each with one parameter."""
 
 LANES = 8
-"""Number of derivatives that are computed at once."""
+"""Number of derivatives, or of runs, that are computed at once."""
 
 
 def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:
@@ -220,7 +220,7 @@ class ParameterLayout:
         return np.concatenate(rows, axis=-1)
 
     def converted(self, dynamic: np.ndarray, other: "ParameterLayout") -> np.ndarray:
-        """Dynamic parameters (..., p) in the layout of the same robot in another form.
+        """Dynamic parameters (..., p) in another layout of the same robot.
 
         Parameters that this layout does not have are zero. If friction of passive joints becomes
         shared, it is the mean over the legs.
@@ -243,7 +243,7 @@ class ParameterLayout:
         return np.broadcast_to(rows, (*gains.shape[:-1], self.joints, len(JOINT_PID)))
 
     def converted_gains(self, gains: np.ndarray, other: "ParameterLayout") -> np.ndarray:
-        """Gains in the layout of the same robot with shared gains, or with gains of each joint.
+        """Gains in another layout of the same robot, whose joints share them or have their own.
 
         Gains that become shared are the mean of those of all joints.
         """
@@ -310,7 +310,7 @@ class ParameterLayout:
 
 
 def may_be_absent(name: str) -> bool:
-    """Return True for a parameter that some layouts of a robot do not have, where it is zero.
+    """Return True for a parameter that a layout can lack, because its value is then zero.
 
     These are first moments and products of inertia, and the friction of passive joints.
     """
@@ -319,7 +319,7 @@ def may_be_absent(name: str) -> bool:
 
 
 def passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Names of the parameters of the friction of passive joints that all legs can share."""
+    """Names of the friction parameters of passive joints that all legs can share."""
     bodies = [
         body.name
         for leg in legs
@@ -331,7 +331,7 @@ def passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
 
 
 def own_passive_parameters(legs: Sequence[Leg]) -> tuple[str, ...]:
-    """Names of the parameters that passive joints of single legs can have instead."""
+    """Names of the friction parameters that passive joints of single legs can have instead."""
     return tuple(
         name.replace("_joint.", f"{number}_joint.")
         for number, leg in enumerate(legs, start=1)
@@ -352,8 +352,8 @@ def parameter_layout(
     link, or "all". `own_gains` is True if each joint has its own gains. `passive` are the names of
     parameters of passive joints (see `passive_parameters` and `own_passive_parameters`).
 
-    Raises ParameterError for an unknown name, and for a passive joint with its own friction and
-    that of all legs.
+    Raises ParameterError for an unknown name, and for a passive joint with both its own parameter
+    and that of all legs.
     """
     leg_bodies: list[tuple[int, Body]] = []
     for place in range(max(len(leg.bodies) for leg in legs)):

@@ -1,15 +1,15 @@
 """Pseudo-inertia of a rigid body, which shows whether the body can exist.
 
-With the second moments Sigma (3, 3) of the mass, the first moment s and the mass m, the
-pseudo-inertia is
+Let m be the mass, s its first moment (3,), Sigma its second moments (3, 3), and I the inertia
+(3, 3). The pseudo-inertia is
 
     [[Sigma, s], [s^T, m]],    Sigma = tr(I) / 2 - I
 
 A body with the ten inertial parameters exists if, and only if, this matrix is positive definite
 (Wensing, Kim and Slotine, "Linear matrix inequalities for physically consistent inertial parameter
-identification", RA-L 2018). Its Cholesky factor with exponentials on the diagonal makes every real
-vector of ten numbers a body (Rucker and Wensing, "Smooth parameterization of rigid-body inertia",
-RA-L 2022).
+identification", RA-L 2018). If the diagonal of its Cholesky factor is written as exponentials,
+every real vector of ten numbers gives a body (Rucker and Wensing, "Smooth parameterization of
+rigid-body inertia", RA-L 2022).
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ import numpy as np
 
 from dynamics.spatial_inertia import MOMENTS
 
-# Places of the products Ixy, Ixz, Iyz and of the entries of the Cholesky factor above its diagonal.
+# Row and column of the products Ixy, Ixz, Iyz, and of the Cholesky factor above its diagonal.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -116,9 +116,9 @@ def is_centred(body: np.ndarray) -> bool:
 
 
 def body_fault(body: np.ndarray, smallest: float = 0.0) -> str:
-    """Text on the reason why no rigid body has ten inertial parameters, or an empty text.
+    """Text on the reason why no rigid body has the parameters (10,), or an empty text.
 
-    Mass and principal moments must be above `smallest`, kg and kg m^2.
+    The mass must be above `smallest`, kg, and the principal moments at least `smallest`, kg m^2.
     """
     if not body[0] > smallest:
         return f"mass = {body[0]:g} is below {smallest:g}"
@@ -147,7 +147,7 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
     """
     largest = max(moments, key=moments.__getitem__)
     others = [name for name in moments if name != largest]
-    # sums of two of the largest floats overflow
+    # halves are compared, because the sum of two of the largest floats overflows
     halves = sum(moments[name] / 2 for name in others)
     if moments[largest] / 2 <= (1 + rounding) * halves:
         return ""

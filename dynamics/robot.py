@@ -52,8 +52,8 @@ class Robot(RobotDynamics):
 
     A pose (6,) is [x y z alpha beta gamma] of the platform in the frame of the base (eq. 1). A
     twist (6,) is [h_dot, omega] in the axes of the base. The m coordinates are the entries of the
-    pose that the platform can change. Joint coordinates are angles. If the actuators slide, they
-    are lengths, and N and N s/m replace N m and N m s/rad. All units are SI.
+    pose that the platform can change. Joint coordinates are angles. If the actuators slide, joint
+    coordinates are lengths, and N and N s/m replace N m and N m s/rad. All units are SI.
 
     Every method also accepts batches with a leading axis, such as (N, 6), and its results then have
     this axis, too. If `parameters` is None, a method uses `nominal_parameters`.
@@ -137,8 +137,8 @@ class Robot(RobotDynamics):
     def moved(self, deviations: ArrayLike) -> Robot:
         """Robot with changed geometric numbers.
 
-        All robots made from one robot by this method share its functions. These are compiled once,
-        and are a third slower than the functions of a robot file.
+        All robots that this method makes from one robot share functions, which are compiled once.
+        They are a third slower than the functions of a robot loaded from a file.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ class Robot(RobotDynamics):
 
     @lru_cache(maxsize=64)  # noqa: B019 - users ask for the same few forms of a few robots
     def _in_form(self, **form: Any) -> Robot:
-        """Robot with another form of its parameters. `form` are fields of its geometry.
+        """Robot with another form of its parameters. `form` has the changed fields of its geometry.
 
         The robot is cached, because results such as base parameters are cached by robot.
         """
@@ -281,9 +281,9 @@ class Robot(RobotDynamics):
     def with_passive_friction(self, names: Sequence[str]) -> Robot:
         """Robot whose passive joints have friction, with one parameter for each name.
 
-        A passive joint has the name of the body that follows it on the way to the platform. A name
-        such as "link_joint.viscous" is a parameter that the joints at this place of all legs share,
-        and "link3_joint.viscous" is that of one leg. The friction is viscous or dry, see
+        A passive joint has the name of the body that follows it on the way to the platform. The
+        parameter "link_joint.viscous" is shared by the joints of all legs, and the parameter
+        "link3_joint.viscous" is for one leg. The friction is viscous or dry, see
         `rigid_body.passive_friction`. The robot moves as before: a parameter of one leg begins with
         the value that all legs shared, and a new parameter with zero.
 
@@ -326,7 +326,7 @@ class Robot(RobotDynamics):
         Raises
         ------
         RobotFileError
-            If the argument is no geometry.
+            If the argument is not a RobotGeometry.
 
         Examples
         --------

@@ -136,7 +136,7 @@ class RobotDynamics(RobotKinematics):
         return self._call("friction_wrench", poses, twist, self._parameters(parameters))[..., 0]
 
     def regressor(self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike) -> np.ndarray:
-        """Regressor Gamma, with tau_g = Gamma parameters (eq. 25).
+        """Regressor Gamma of eq. 25. Its product with the parameters is the wrench tau_g.
 
         Parameters
         ----------
@@ -269,7 +269,7 @@ class RobotDynamics(RobotKinematics):
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
     def _regular(self, pose: ArrayLike) -> np.ndarray:
-        """Poses as an array, checked to be in reach and not singular."""
+        """Poses as an array, after a check that they are in reach and not singular."""
         poses = self._poses(pose)
         jacobian = self._call("joint_jacobian", poses) @ self.geometry.chart.basis
         condition = np.atleast_1d(np.linalg.cond(jacobian))

@@ -96,7 +96,7 @@ class RobotFile(Strict):
     @model_validator(mode="before")
     @classmethod
     def _by_family(cls, values: Any) -> Any:
-        """Complete the legs and the chart by those of the family. Raises ValueError."""
+        """Complete the types of the legs, and the chart, from the family. Raises ValueError."""
         if not isinstance(values, dict) or "legs" not in values:
             return values
         name = values.get("family")

@@ -1,8 +1,9 @@
 """Robot with other lengths than a given robot.
 
 Seen from above, joints keep their directions from the middle of the robot. Cranks and sliders keep
-their axes. All joint coordinates are zero at home. There, a crank with a vertical axis is seen at
-right angles to its link, where it moves the platform best. All other cranks keep their direction.
+their axes. All joint coordinates are zero at home. There, a crank with a vertical axis is at right
+angles to its link, as seen from above, because it then moves the platform best. All other cranks
+keep their direction.
 
 Bodies keep their material. A platform is scaled as a plate of the same thickness, and the bodies of
 the legs as bars of the same section.
@@ -48,7 +49,7 @@ MOMENT_ABOUT_LENGTH = {"crank": "Ixx", "link": "Izz", "cylinder": "Izz", "rod": 
 """Moment of inertia of each body of a leg about the axis along its length."""
 
 DIGITS = 9
-"""Digits of the coordinates of joints, of which the first is that of the radius of their circle."""
+"""Number of digits of joint coordinates, from the first digit of the radius of their circle on."""
 
 SAMPLES = 2000
 """Number of random positions of the joints within the travel limit."""
@@ -123,7 +124,7 @@ def _at_rest_at_home(geometry: RobotGeometry, new: Mapping[str, float]) -> Robot
         heights = [_height(leg, new) for leg in legs]
         home[2] = float(_shortened(np.array(heights), new["base_radius"]).mean())
     chart = Chart(geometry.chart.name, tuple(home.tolist()))
-    # without a branch, a leg takes the one whose coordinate is zero at home
+    # a leg without a branch takes the one whose coordinate is nearest to zero at home
     without_branch = tuple(leg.model_copy(update={"branch": None}) for leg in legs)
     return replace(geometry, legs=without_branch, chart=chart)
 
@@ -160,7 +161,7 @@ def _on_circle(joint: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _shortened(values: np.ndarray, size: float) -> np.ndarray:
-    """Values with `DIGITS` digits, of which the first is that of a size."""
+    """Values rounded to `DIGITS` digits, counted from the first digit of a size on."""
     return np.round(values, DIGITS - 1 - int(np.floor(np.log10(size))))
 
 

@@ -1,4 +1,4 @@
-"""Model of a robot with fixed numbers: torques of a motion, CasADi functions, MJCF and URDF."""
+"""Model of a robot with fixed parameters: torques of a motion, CasADi functions, MJCF and URDF."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dynamics.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """Robot that always has its nominal dynamic parameters, such as an identified robot.
+    """Robot whose dynamic parameters are fixed to its nominal ones, such as an identified robot.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class RobotModel:
         basis = self.robot.geometry.chart.basis
         jacobian = self.robot.joint_jacobian(pose) @ basis
         twist = _solved(jacobian, rate) @ basis.T
-        # a CasADi function has one motion per column
+        # a CasADi function takes one motion per column
         bias = self._bias_acceleration(pose.T, twist.T).full().T.reshape(acceleration.shape)
         return pose, twist, _solved(jacobian, acceleration - bias) @ basis.T
 
@@ -132,7 +132,7 @@ class RobotModel:
         return ca.Function("bias", [pose, twist], [ca.jtimes(rates, pose, pose_rate)])
 
     def casadi(self, name: str) -> ca.Function:
-        """CasADi function with the numbers of this model in place of the input `parameters`.
+        """CasADi function with the parameters of this model in place of the input `parameters`.
 
         Parameters
         ----------

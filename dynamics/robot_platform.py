@@ -21,7 +21,7 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions
 
 CONDITION_LIMIT = 1e10
-"""Condition number of a Jacobian beyond which digits are lost. Usual robots have about 1e2."""
+"""Condition number beyond which a Jacobian counts as singular. Usual robots have about 1e2."""
 
 CHART_TOLERANCE = 1e-9
 """Largest deviation of a pose or twist from the allowed ones that counts as rounding.
@@ -279,7 +279,7 @@ class RobotPlatform:
         )
 
     def charted(self, pose: ArrayLike, name: str = "pose") -> np.ndarray:
-        """Poses as an array, checked that the platform can have them.
+        """Poses as an array, after a check that the platform can have them.
 
         Parameters
         ----------
@@ -310,17 +310,17 @@ class RobotPlatform:
     def _margins(self, poses: np.ndarray) -> np.ndarray:
         """Reach margins of poses that the platform can have."""
         margin = self._call("inverse_kinematics", poses, output=1)[..., 0]
-        # comparisons with NaN are False, and a leg with a NaN margin does not reach
+        # a leg with a NaN margin does not reach, but comparisons with NaN are always False
         return np.where(np.isnan(margin), -np.inf, margin)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
-        """Poses as an array, checked to be in reach."""
+        """Poses as an array, after a check that all legs reach them."""
         poses = rows("pose", pose, 6)
         self.check_reach(poses)
         return poses
 
     def _twists(self, name: str, value: ArrayLike) -> np.ndarray:
-        """Twists as an array, checked that the platform can have them."""
+        """Twists as an array, after a check that the platform can have them."""
         twists = rows(name, value, 6)
         basis = self.geometry.chart.basis
         self._check_chart(name, twists, twists - twists @ basis @ basis.T)

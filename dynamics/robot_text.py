@@ -20,7 +20,7 @@ from dynamics.spatial_inertia import FULL_INERTIAL, INERTIAL
 def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     """TOML text of a robot, with comments in separate lines at the beginning.
 
-    Reading it gives the same robot, to the last digit.
+    A robot that is read from this text is the same, to the last digit.
     """
     geometry = robot.geometry
     layout = robot.geometry.layout

@@ -14,7 +14,7 @@ def place_parts(
     buffers: Record,
     ends: Array,
 ) -> bool:
-    """Compute the ends (parts, 2, 3) of the drawn parts at a pose (6,), m, in the axes of the base.
+    """Compute the ends (parts, 2, 3) of the drawn rods at a pose (6,), m, in the axes of the base.
 
     `kinematics` and `placements` are addresses of functions of the robot. `drawn` and `buffers`
     have the fields of `DrawnParts` and `FunctionBuffers`. `fixed` (6,) has the entries of the pose

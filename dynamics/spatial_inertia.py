@@ -1,8 +1,8 @@
 """Inertial parameters of a rigid body, and the forces that its motion needs, in CasADi.
 
-A body moves with the velocity v of its reference point and the angular velocity omega, in the axes
-of the base. With its mass m, the first moment s = m c of the mass about the reference point, and
-its inertia I about this point, Newton's and Euler's equations are
+A body moves with the velocity v and acceleration a of its reference point and the angular velocity
+omega, in the axes of the base. Let m be its mass, s = m c the first moment of the mass about the
+reference point, I the inertia about this point, and g gravity. Newton's and Euler's equations are
 
     force  = m (a - g) + omega_dot x s + omega x (omega x s)
     moment = s x (a - g) + I omega_dot + omega x I omega

@@ -4,9 +4,9 @@
 - Reach is the reach margin of a leg. For a crank, it is sin^2 of the angle between the crank and
   the direction to the platform joint in the plane of the crank. At 0, the leg is stretched or
   folded.
-- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank, it is
-  |(w x l) . s| / (|w| |l|). If it is zero, the actuator does not move the platform. For a crank, it
-  is zero if the reach margin is zero.
+- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank w with
+  the axis s and the link l, it is |(w x l) . s| / (|w| |l|). If it is zero, the actuator does not
+  move the platform. For a crank, it is zero if the reach margin is zero.
 - The platform side (J_a2) is the condition number of J_a2 for the motions that the platform can
   make. The rows of J_a2 are unit vectors along the forces of the legs. Its angular columns are
   divided by the characteristic length, so that all entries have no unit. If the condition number is
@@ -46,7 +46,7 @@ Below it, the force along the leg is more than 20 times the force of the actuato
 MOST_CONDITION = 20.0
 """Largest condition number for `check_motion`.
 
-rss6 is below 5 (J_a2) and 10 (J_ad) within its travel.
+Within the travel of rss6, it is below 5 for J_a2, and below 10 for J_ad.
 """
 
 
@@ -55,7 +55,7 @@ class WorkspaceMeasures:
     """Measures of N poses. All except the reach margins are NaN if a leg cannot reach the pose.
 
     `theta` (N, n) is in rad or m. `reach_margin` (N, n) is negative out of reach. `leverage` (N, n)
-    is from J_a1. `platform_rows` (N, n, n) is J_a2 without unit. `travel_limit` is in rad or m.
+    is from J_a1. `platform_rows` (N, n, n) is the scaled J_a2. `travel_limit` is in rad or m.
     """
 
     theta: np.ndarray
@@ -88,7 +88,7 @@ class WorkspaceMeasures:
 
     @property
     def travel_share(self) -> np.ndarray:
-        """Largest joint coordinate over the travel limit (N,)."""
+        """Ratio (N,) of the largest joint coordinate, in magnitude, to the travel limit."""
         return np.asarray(np.abs(self.theta).max(axis=1) / self.travel_limit)
 
 
@@ -141,8 +141,8 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
     """Measures of poses for random joint coordinates within the travel limit.
 
-    Each pose is searched from home. Coordinates without a pose are omitted, so that there can be
-    fewer rows than samples.
+    The search for each pose begins at home. If none is found, the joint coordinates are omitted, so
+    that there can be fewer rows than samples.
     """
     limit = robot.travel_limit
     # the seed is fixed, because a report of a robot must not change from run to run
@@ -164,10 +164,10 @@ def check_motion(
     """Check a motion against all limits, and return its points nearest to them.
 
     The motion is poses (N, 6) at times (N,), s, with N >= 1. Each error states the time or row, the
-    leg, the value and the limit. Raises UnreachablePoseError; TravelError beyond the travel limit
-    minus `travel_margin` (rad or m); SingularPoseError for a leverage (J_a1) below `least_leverage`
-    or a condition number of the scaled J_a2 above `most_condition`; ShapeError for a wrong shape,
-    or for times that do not increase.
+    leg, the value and the limit. Raises UnreachablePoseError out of reach, and TravelError beyond
+    the travel limit minus `travel_margin` (rad or m). Raises SingularPoseError for a leverage
+    (J_a1) below `least_leverage`, or a condition number of the scaled J_a2 above `most_condition`.
+    Raises ShapeError for a wrong shape, or for times that do not increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):
