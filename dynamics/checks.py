@@ -208,7 +208,7 @@ INERTIA_FORMS = ("centred", "full")
 
 
 def check_inertia_forms(value: object) -> object:
-    """Return the value, a form of all bodies or a table of forms by body or kind of body.
+    """Return the value if it is a form of all bodies, or a table of forms by body or kind of body.
 
     Raises ValueError, with the valid forms, for anything else.
     """

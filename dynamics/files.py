@@ -1,4 +1,4 @@
-"""Reading of files from users, within limits. Files beyond them are refused with a short message.
+"""Reading of files from users. Files beyond some limits are refused with a short message.
 
 The limits far exceed what a person writes. They are low enough that any file of at most a megabyte
 is read or refused within seconds.
@@ -36,7 +36,7 @@ NAME = r"^\w[\w .+-]*$"
 """Pattern of the names of robots, sensors, scenarios and studies, which are used as file names."""
 
 LONGEST_NAME = 60
-"""Largest number of characters of such a name. The file name then has at most 255 bytes."""
+"""Largest number of characters of these names. The file name then has at most 255 bytes."""
 
 _YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
@@ -145,7 +145,7 @@ def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Text on the first entry of a content that exceeds the limits, or an empty text."""
+    """Text on an entry that exceeds the limits, or an empty text if there is none."""
     pending: list[tuple[Any, int]] = [(content, 0)]
     while pending:
         value, depth = pending.pop()

@@ -198,7 +198,7 @@ class RobotGeometry:
 
     @property
     def number_units(self) -> tuple[str, ...]:
-        """Units of the geometric numbers (g), m or rad."""
+        """Units of the g geometric numbers, m or rad."""
         return tuple(unit_of(name) for leg in self.legs for name in leg.numbers)
 
     @property

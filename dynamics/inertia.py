@@ -183,7 +183,7 @@ def acceleration_changes(
 def travel_states(
     robot: Robot, parameters: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random poses within the travel limit, twists, both (STATES, 6), and torques (STATES, n).
+    """Random poses (STATES, 6) within the travel limit, twists (STATES, 6), torques (STATES, n).
 
     The states are the same at every call.
     """

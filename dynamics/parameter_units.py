@@ -5,7 +5,7 @@ import re
 from dynamics.spatial_inertia import FIRST_MOMENTS, MOMENTS, PRODUCTS
 
 PASSIVE_JOINT = "{}_joint"
-"""Name of a passive joint, from the next body towards the platform, such as link_joint.
+"""Name of a passive joint: link_joint is the joint between the link and the body before it.
 
 This name is for the joints of all legs. The name for a single leg has the number of the leg, such
 as link3_joint.

@@ -136,7 +136,7 @@ class ParameterLayout:
 
     @cached_property
     def joint_pid_names(self) -> tuple[str, ...]:
-        """Names of the gains of the joint PID: lp, li, ld of all joints, or of joint by joint."""
+        """Names of the gains of the joint PID: lp, li, ld for all joints, or joint by joint."""
         owners = self.joint_names if self.own_gains else ("joint_pid",)
         return tuple(f"{owner}.{gain}" for owner in owners for gain in JOINT_PID)
 

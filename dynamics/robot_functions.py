@@ -24,7 +24,7 @@ HOT = (
     "acceleration_in_lanes",
     "servo_jacobian",
 )
-"""Names of the functions that inner loops evaluate."""
+"""Names of the functions that inner loops evaluate, and that are therefore optimised."""
 
 CASADI = {
     "inverse_kinematics": ("pose", "theta reach_margin"),

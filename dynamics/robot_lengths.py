@@ -58,7 +58,7 @@ TRAVEL_FACTOR = 0.95
 """Factor by which the travel limit is reduced until no pose within it is near a singularity."""
 
 LEAST_TRAVEL = 0.1
-"""Smallest ratio of the reduced travel limit to the travel limit."""
+"""Smallest ratio of the reduced travel limit to the original one."""
 
 VERTICAL_TOLERANCE = 1e-9
 """Largest difference from 1 of the vertical component of a vertical axis."""

@@ -4,13 +4,13 @@
 - Reach is the reach margin of a leg. For a crank, it is sin^2 of the angle between the crank and
   the direction to the platform joint in the plane of the crank. At 0, the leg is stretched or
   folded.
-- The actuator side (J_a1) is the leverage of an actuator on its leg, in 0..1. For a crank w with
-  the axis s and the link l, it is |(w x l) . s| / (|w| |l|). If it is zero, the actuator does not
-  move the platform. For a crank, it is zero if the reach margin is zero.
-- The platform side (J_a2) is the condition number of J_a2 for the motions that the platform can
-  make. The rows of J_a2 are unit vectors along the forces of the legs. Its angular columns are
-  divided by the characteristic length, so that all entries have no unit. If the condition number is
-  infinite, the platform can move although all actuators are locked.
+- On the actuator side (J_a1), the measure is the leverage of an actuator on its leg, in 0..1. For a
+  crank w with the axis s and the link l, it is |(w x l) . s| / (|w| |l|). If it is zero, the
+  actuator does not move the platform. For a crank, it is zero if the reach margin is zero.
+- On the platform side (J_a2), the measure is the condition number of J_a2 for the motions that the
+  platform can make. The rows of J_a2 are unit vectors along the forces of the legs. Its angular
+  columns are divided by the characteristic length, so that all entries have no unit. If the
+  condition number is infinite, the platform can move although all actuators are locked.
 
 The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m
 for rss6). `rigid_body.jacobians.singularity_measures` has the measures as CasADi expressions.

@@ -1,8 +1,8 @@
 """Sampled closed loop: visual servo (eq. 30), joint PID (eq. 31) and robot (eq. 40).
 
-A sensor measures the pose at every frame. The servo, logged commands or a controller then issue a
-joint command. The command arrives after the latency, and acts until the next one arrives. A run
-begins at rest at the first reference pose, unless a start state is given.
+A sensor measures the pose at every frame. Then a joint command is issued by the servo, by a
+controller, or from a log. The command arrives after the latency, and acts until the next one
+arrives. A run begins at rest at the first reference pose, unless a start state is given.
 
 Functions
 

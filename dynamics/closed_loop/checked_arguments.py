@@ -66,7 +66,7 @@ def checked_directions(
 
 
 def checked_times(times: object, frames: int) -> np.ndarray:
-    """Times (frames,) of frames, s, which increase. Raises SimulationError."""
+    """Checked times (frames,) of frames, s, which must increase. Raises SimulationError."""
     checked = floats("times", times, (frames,), error=SimulationError)
     back = np.flatnonzero(np.diff(checked) <= 0)
     if len(back):

@@ -115,7 +115,7 @@ def _schedule(
 
 
 SAME_S = 1e-9
-"""Difference, s, up to which two instants of a run at given times count as one."""
+"""Difference, s, up to which two instants count as one if the times of frames are given."""
 
 
 def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:

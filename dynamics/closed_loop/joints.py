@@ -58,7 +58,7 @@ class FrictionLaw:
     smoothing_velocity : float, optional
         Velocity over which the smoothed law changes its sign, rad/s.
     static_ratio : float, optional
-        Static torque over the Coulomb torque, at least 1.
+        Ratio of the static torque to the Coulomb torque, at least 1.
     stribeck_velocity : float, optional
         Velocity over which the excess fades, rad/s.
 
@@ -195,7 +195,7 @@ class JointElasticity:
         frame_period: float,
         friction: FrictionLaw,
     ) -> int:
-        """Integration steps per frame that resolve the fastest motion near a pose (6,).
+        """Number of integration steps per frame that resolves the fastest motion near a pose (6,).
 
         The rate of the fastest motion is the largest eigenvalue of the joints and motors under
         joint PID and friction, linearised at rest. Raises SimulationError if the inertia of a motor
@@ -212,7 +212,7 @@ class JointElasticity:
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
         _, coulomb, viscous, gains = robot.layout.split(parameters)
         lp, _, ld = gains.T
-        # slope of dry friction at rest, over the Coulomb torque
+        # ratio of the slope of dry friction at rest to the Coulomb torque
         slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0
         stiffness = _coupled(self.stiffness, lp)
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)

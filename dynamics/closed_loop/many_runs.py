@@ -170,7 +170,7 @@ def simulate_batch(
     Raises
     ------
     LoopFailure
-        For the first run that leaves the reach of the robot.
+        For the first run that ends early.
     UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
         As for `closed_loop.simulate_servo`.
 
@@ -214,7 +214,7 @@ def simulate_batch(
             )
         return simulate_servo(robot, vector, reference, settings, start=start)
 
-    # the compiled loop releases Python's global lock, and threads can use all cores
+    # the compiled loop releases Python's global lock, so that threads can use all cores
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, range(count)))
 

@@ -295,7 +295,7 @@ def _problem(
 
 
 def _checked_sensor(sensor: Sensor, frames: int) -> Sensor:
-    """Check the sensor of a run with a number of frames. Raises SimulationError."""
+    """Checked sensor of a run with a number of frames. Raises SimulationError."""
     if isinstance(sensor, IdealSensor):
         lost = sensor.lost
         return IdealSensor(

@@ -23,7 +23,7 @@ class ClosedLoopRun:
     time : ndarray, shape (frames,)
         Time, s.
     pose, pose_rate : ndarray, shape (frames, 6)
-        True pose and its time derivative per second.
+        True pose and its time derivative.
     torque : ndarray, shape (frames, n)
         Actuator torque or force, N m or N.
     command : ndarray, shape (frames, n)

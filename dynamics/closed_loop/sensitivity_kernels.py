@@ -241,7 +241,7 @@ def move_tangent(
     moved: Array,
     first: int,
 ) -> None:
-    """Add fraction * (h * d_slope + d_length * slope) of a stage, from row `first` on, to rows."""
+    """Add fraction * (h * d_slope + d_length * slope) of a stage, from `first` on, to `moved`."""
     for i in range(len(moved)):
         add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:

@@ -129,7 +129,7 @@ def simulate_commands(
         of NaN issues no command.
     times : ndarray, shape (frames,), optional
         Increasing times of the frames, s. The default is equal periods from zero on. In the drives,
-        the rate of a command is its change from the one before, over one period of the timing.
+        the rate of a command is its change from the one before, divided by the period of `timing`.
 
     Returns
     -------

@@ -182,7 +182,7 @@ def ask_between(now: Record, length: float) -> None:
 
 @kernel
 def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Make the step that was tried, half as long as the bracket, an end of the bracket."""
+    """Replace an end of the bracket by the step that was tried, which is half as long."""
     now.trials += 1
     if margin > 0:
         now.low = now.length

@@ -106,8 +106,8 @@ def compiled_functions(
 def _without_garbage_collection() -> Iterator[None]:
     """Suspend the search for unused cycles of objects.
 
-    A graph has a million objects and no cycles. Searching them takes a third of the time in which a
-    function is translated.
+    A graph has a million objects and no cycles. Searching them for cycles takes a third of the time
+    in which a function is translated.
     """
     enabled = gc.isenabled()
     gc.disable()

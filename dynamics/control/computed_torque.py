@@ -3,18 +3,18 @@
     torque = mean over a frame of ID(p, p_dot, p_ddot),   p = r - e,   e_ddot + Kd e_dot + Kp e = 0
     Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-ID is the inverse dynamics, r is the desired motion, and e is the error. p is the return motion: it
-leads from the present pose of the robot into r. The torque is the mean over a frame period, because
-it acts for that time.
+ID is the inverse dynamics, r is the desired motion, and e is the error. p is the recovery motion:
+it leads from the present pose of the robot into r. The torque is the mean over a frame period,
+because it acts for that time.
 
-With an observer, the return motion begins at the state predicted for the arrival of the torque. The
-estimated disturbance is subtracted. Dry friction has the signs of the return motion. Near rest,
-joints often move against the desired motion. Its signs would then make the torque wrong by twice
-the Coulomb torque.
+With an observer, the recovery motion begins at the state predicted for the arrival of the torque.
+The estimated disturbance is subtracted. Dry friction has the signs of the recovery motion. Near
+rest, joints often move against the desired motion. Its signs would then make the torque wrong by
+twice the Coulomb torque.
 
-Without an observer, the return motion begins at the last measured pose. Its rate is the difference
-of the last two poses. An integral replaces the disturbance. Dry friction has the signs of the
-desired motion, because the sign of a rate that is half a frame old chatters.
+Without an observer, the recovery motion begins at the last measured pose. Its rate is the
+difference of the last two poses. An integral replaces the disturbance. Dry friction has the signs
+of the desired motion, because the sign of a rate that is half a frame old chatters.
 """
 
 from collections.abc import Callable
@@ -50,7 +50,7 @@ def error_map(feedback: Feedback) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DecayingErrors:
-    """Return motion, along which errors (m,) decay.
+    """Recovery motion, along which errors (m,) decay.
 
     `error` and `rate` are the errors, m and rad, and their rates at the time `begin`, s. `map` is
     that of `error_map`. `correction` is an additional acceleration (m,), m/s^2 and rad/s^2.
@@ -156,7 +156,7 @@ def _measured(assignment: Assignment) -> Command:
 def _decaying_errors(
     assignment: Assignment, time: float, coordinates: np.ndarray, rates: np.ndarray
 ) -> DecayingErrors:
-    """Return motion from coordinates and rates (m,) at a time, s."""
+    """Recovery motion from coordinates and rates (m,) at a time, s."""
     chart = assignment.model.robot.geometry.chart
     pose, rate, _ = assignment.desired(time)
     errors = chart.coordinates(pose) - coordinates, chart.coordinates(rate) - rates
@@ -166,10 +166,10 @@ def _decaying_errors(
 def _torque(
     assignment: Assignment, way: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Mean torque (n,) over the first frame of a return motion, N m or N.
+    """Mean torque (n,) over the first frame of a recovery motion, N m or N.
 
-    Dry friction has the signs of the motion `dry`. `viscous` (n,) is friction that the model does
-    not include.
+    Dry friction has the signs of the motion `dry`. `viscous` (n,) is viscous friction in addition
+    to that of the model.
     """
     span = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
     return np.asarray(span.torque[0] + viscous * (span.end[0] - span.begin[0]) / assignment.period)

@@ -88,7 +88,7 @@ def design_servo(
         )
 
     period = 1 / settings.timing.frame_rate_hz
-    # a servo that is stable on most robots, in logarithms because gains are positive
+    # a servo that is stable on most robots; its logarithms are varied, because gains are positive
     start = np.log([0.3, 0.06 * period, bandwidth])
     best = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
@@ -281,7 +281,7 @@ def _torque_map(
     stiff = motion[size:, :size]
     damp = motion[size:, size:]
     to_torque = np.linalg.pinv(push)
-    # the mean acceleration along the return motion over a frame
+    # the mean acceleration along the recovery motion over a frame
     mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
     by_place, by_rate = (
         to_torque @ (factor * (map_[1] @ along) * identity - along[0] * stiff - along[1] * damp)

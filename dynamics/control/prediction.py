@@ -149,7 +149,7 @@ class Prediction:
         return after, errors, bool((np.minimum(speed, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
-        """Largest dry friction (n,) at joint velocities, and the velocity of its change of sign."""
+        """Largest dry friction (n,) at joint velocities, and the smoothing velocity of the law."""
         law = self._friction
         largest = self._coulomb
         if law.name == "stribeck":

@@ -152,8 +152,8 @@ def mjcf_text(
 class _Chain:
     """Parts of a robot at home.
 
-    `ends` maps the number of each last part to the point (3,) of the platform that it is joined to,
-    m, in the axes of the platform.
+    `ends` maps the number of each last part to the point (3,) at which it is joined to the
+    platform, m, in the axes of the platform.
     """
 
     def __init__(self, robot: Robot) -> None:

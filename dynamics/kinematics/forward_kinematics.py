@@ -64,7 +64,7 @@ class ForwardSolution:
 def solve(
     functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> ForwardSolution:
-    """Poses with joint coordinates theta (n,) or (N, n), searched from a start (6,) or (N, 6).
+    """Poses with joint coordinates theta (n,) or (N, n), found from a start (6,) or (N, 6).
 
     Raises ConvergenceError, with row, leg and residual, if no pose is found.
     """

@@ -24,8 +24,8 @@ It allows for numbers that are written with few digits.
 class Chain(NamedTuple):
     """Joints of a leg at home, in order from the base to A. Vectors are in the axes of the base, m.
 
-    `joints` are the k kinds: "hinge", "slide", "universal" or "ball", with * after the actuated
-    joint. `points` (k, 3) are their positions; the last one is A, or the point midway between two
+    `joints` are the kinds of the k joints: "hinge", "slide", "universal" or "ball", with * for the
+    actuated one. `points` (k, 3) are their positions. The last is A, or the middle between two
     parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second axis of a universal
     joint. `coordinate` is the coordinate of the actuated joint. `platform_joint` is A in the axes
     of the platform. `across` (3,) is the vector from the first of two bars to the second, or zero.

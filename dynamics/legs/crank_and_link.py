@@ -88,7 +88,7 @@ def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca
     reflected = izz + mx * radius + (mass + link_mass) * (radius**2 / 4)
     half = gradient @ (link_mass / 4 * tangent).T
     total = reflected * (gradient @ gradient.T) + link_mass / 4 * ca.SX.eye(3) + half + half.T
-    # rows of the rates of rotation p and q, and of the velocity of the middle, in the link's axes
+    # rows of the angular velocities p and q, and of the velocity of the middle, in the link's axes
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
     by_crank = [ca.dot(tangent, axes[:, k]) for k in range(3)]
     moving = [(axes[:, k] + by_crank[k] * gradient) / 2 for k in range(3)]

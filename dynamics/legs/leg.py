@@ -231,7 +231,7 @@ class Leg(BaseModel, ABC):
 
     @abstractmethod
     def direction(self, position: ca.SX) -> ca.SX:
-        """Unit vector (3,) of the force at A from the actuator."""
+        """Unit vector (3,) along the force at A that is due to the actuator."""
 
     @abstractmethod
     def leverage(self, position: ca.SX) -> ca.SX:
@@ -320,7 +320,7 @@ class Leg(BaseModel, ABC):
         return symmetric_from_lower(_replaced(total, (at, *parameters), (position, *bodies)))
 
     def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        """Matrix C (3, 3), which times the velocity is the Coriolis and centrifugal force at A.
+        """Matrix C (3, 3). C times the velocity is the Coriolis and centrifugal force at A.
 
         It is the sum of J^T (M_body J_dot + C_body J) over the bodies (eq. 21, 22).
         """

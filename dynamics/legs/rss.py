@@ -1,8 +1,8 @@
 """Legs with a crank on the base: RSS, whose link has two spherical joints (S), and RUS.
 
 The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
-Their rates (Appendix A of the paper) are computed by automatic differentiation, because eq. A5 and
-A6 are wrong as printed. The vector a from the platform origin to joint A is in the axes of the
+Rates of Jacobians (Appendix A of the paper) are computed by automatic differentiation, because eq.
+A5 and A6 are misprinted. The vector a from the platform origin to joint A is in the axes of the
 base: eq. 3 and 5 need R a, although the text defines a in platform axes. Centres of mass are at
 mid-length. Forces follow by virtual work, as for any `Leg`, but here in closed form, which is
 faster.
@@ -297,8 +297,8 @@ class RssLeg(Leg):
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Components of the vector from B to A along and across the zero direction, and the chord.
 
-        The chord is the component of the vector along the crank, as the lengths require. All are in
-        m.
+        The chord is the component along the crank that the lengths of crank and link require. All
+        are in m.
         """
         reach = position - self.base_joint
         zero = self.crank_zero_direction

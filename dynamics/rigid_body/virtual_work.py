@@ -72,7 +72,7 @@ def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
 
 
 def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
-    """Matrix C (6, 6) of eq. 23, which times the twist is the Coriolis and centrifugal wrench."""
+    """Matrix C (6, 6) of eq. 23. C times the twist is the Coriolis and centrifugal wrench."""
     omega = twist[3:6]
     layout = geometry.layout
     frame = rotation_matrix(pose[3:6])
