@@ -7,10 +7,10 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.run import Experiment
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed
+from identify.runtime import mapped
 from identify.setup import Setup
 from identify.trajectory import FourierTrajectory
 from identify.validation.unseen import run_unseen
-from identify.validation.worker_processes import mapped
 
 
 def designed_runs(

@@ -35,9 +35,8 @@ from identify.model.model_side import ModelSide
 from identify.progress import Advance, Progress
 from identify.record.conditions import SERVO, logged_latencies, recorded_law
 from identify.record.recording import is_timed, recorded_reference
-from identify.runtime import cores
+from identify.runtime import cores, mapped
 from identify.trajectory import FourierTrajectory
-from identify.validation.worker_processes import mapped
 
 POLL_S = 0.2
 """Interval at which the progress of the workers is read, s."""

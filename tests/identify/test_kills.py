@@ -460,7 +460,7 @@ def test_processes_that_share_work_end_with_the_command_that_a_signal_ends_and_s
     (tmp_path / "waiting.py").write_text(
         "import time\n"
         "from pathlib import Path\n"
-        "from identify.validation.worker_processes import mapped\n"
+        "from identify.runtime import mapped\n"
         "def work(name):\n"
         "    Path(name).touch()\n"
         "    time.sleep(600)\n"
