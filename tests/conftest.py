@@ -8,11 +8,13 @@ import platform
 import re
 import signal
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer.main
 
 from identify.accuracy.figure import PROPERTY
 from identify.files.atomic import write_text
@@ -30,6 +32,10 @@ os.environ.setdefault("CMMSIM_PLUGINS", "tests")
 # A job that a shell began in the background ignores Ctrl-C, which tests send to themselves.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# A process has one command line. Each call of it in a test would build it anew, 25 ms of processor.
+typer.main.get_command = cache(typer.main.get_command)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

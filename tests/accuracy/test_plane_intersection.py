@@ -64,6 +64,7 @@ def point_covariances(sight, pose, pixel_std):
     return pixel_std**2 * np.linalg.inv(jacobian.transpose(0, 2, 1) @ jacobian)
 
 
+@pytest.mark.slow
 def test_goal_of_plane_intersection():
     """Stickers seen just as well as the detector's goal asks make the goal of the poses.
 

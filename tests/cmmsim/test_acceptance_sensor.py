@@ -39,6 +39,7 @@ def errors_along(volume, line, seed=0, changes=None, shift_px=0.0):
     return np.array([length.error for length in measure_line(sensor, volume, line, 1)])
 
 
+@pytest.mark.slow
 def test_noise_free_lengths_are_right_to_two_microns(volume):
     found = length_test(under_test(changes=NOISE_FREE), volume, exposures=1)
     assert len(found.lengths) == 35

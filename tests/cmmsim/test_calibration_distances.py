@@ -32,6 +32,7 @@ def halves(noise, print_m, seed):
     return measured_distances(calibrate(BOARD, first, SIZE), first, second)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "print_m"), [(0.05, 0.0), (0.02, 1e-4)])
 def test_stated_deviations_of_distances_are_true_and_told_apart_by_their_causes(noise, print_m):
     found = [halves(noise, print_m, seed) for seed in range(4)]

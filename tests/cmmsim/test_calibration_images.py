@@ -136,6 +136,7 @@ def test_dots_are_found_to_hundredths_of_a_pixel(rig, board, count, seed, psf_px
     assert np.abs(errors.mean(axis=0)).max() < 0.004
 
 
+@pytest.mark.slow
 def test_chessboard_corners_are_found_to_a_tenth_of_a_pixel_by_the_older_search_too(monkeypatch):
     """Which is taken where the newer one fails."""
     drawn = rendered(PERFECT, CHESSBOARD, 2)

@@ -112,6 +112,7 @@ def coverage(errors, covariances):
     return np.mean(np.abs(errors) < 1.96 * np.sqrt(np.einsum("nii->ni", covariances)), axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["field", "bent"])
 def test_intervals_hold_although_points_of_a_view_err_alike(kind):
     errors, covariances, independent, solved = repeated(kind, 40, 10)

@@ -104,6 +104,7 @@ def test_pattern_is_recovered_from_averaged_images():
     assert np.sqrt(spatial[200] - spatial[0]) / GAIN / electrons == pytest.approx(0.02, rel=0.04)
 
 
+@pytest.mark.slow
 def test_pattern_stays_and_belongs_to_the_camera():
     """The same in windows and whole images and for other noise; another one for the other camera
     and pattern seed.

@@ -79,6 +79,7 @@ def test_groups_and_images_that_have_moved_are_mostly_noticed(studio):
     assert wrong_share(studio, MOVED, 8, 3) <= WRONG_IF_MOVED
 
 
+@pytest.mark.slow
 def test_clean_frames_lose_nothing(studio):
     """Eighty are measured with all stickers, and state the error that they have."""
     found = outcomes(studio, "clean", 80, 2)

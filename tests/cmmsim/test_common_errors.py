@@ -131,22 +131,22 @@ def test_draws_of_a_rig_spread_as_its_covariance_says_and_what_is_none_is_refuse
 def test_the_common_part_is_that_of_many_calibrations_and_is_added_to_the_noise_only_when_asked(
     geometry,
 ):
-    """Poses of 150 rigs that one covariance draws, each of which taught itself: their mean squared
-    error is 6 in units of the common part, with a deviation of 0.28; one with noise beside it is 6
+    """Poses of 60 rigs that one covariance draws, each of which taught itself: their mean squared
+    error is 6 in units of the common part, with a deviation of 0.45; one with noise beside it is 6
     in units of both."""
     rng, pose = np.random.default_rng(4), geometry.home + 0.5 * BOX
     covariance = 1e-2 * PHOTOGRAPHED
     stated = geometry.pose_covariance(pose, covariance)
-    rigs = [KnownRig.drawn(geometry.rig, covariance, rng).rig for _ in range(150)]
+    rigs = [KnownRig.drawn(geometry.rig, covariance, rng).rig for _ in range(60)]
     errors = np.array([measured(geometry, rig, pose[None])[0] - pose for rig in rigs])
     assert np.mean(
         np.einsum("ni,ij,nj->n", errors, np.linalg.inv(stated), errors)
-    ) == pytest.approx(6.0, abs=0.9)
+    ) == pytest.approx(6.0, abs=1.4)
     sensor = exact()
     one = replace(sensor.measure(pose), common_at=lambda _: stated)
     noisy = errors + rng.multivariate_normal(np.zeros(6), one.covariance, len(errors))
     weights = np.linalg.inv(one.single_covariance)
-    assert np.mean(np.einsum("ni,ij,nj->n", noisy, weights, noisy)) == pytest.approx(6.0, abs=0.9)
+    assert np.mean(np.einsum("ni,ij,nj->n", noisy, weights, noisy)) == pytest.approx(6.0, abs=1.4)
 
 
 def test_a_measurement_states_what_is_known_of_its_common_part(geometry):

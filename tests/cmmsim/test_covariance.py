@@ -90,8 +90,8 @@ def drawn(pose, count):
 @pytest.mark.parametrize(
     ("method", "count"),
     [
-        ("registration", 2000),
-        ("planes", 300),
+        ("registration", 600),
+        ("planes", 150),
         pytest.param("planes", 2000, marks=pytest.mark.thorough),
     ],
 )

@@ -139,6 +139,7 @@ def test_scene_with_other_noise_keeps_contrast_and_ground_and_cannot_have_less_t
     )
 
 
+@pytest.mark.slow
 @EVERY
 def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(
     detector, taught, moving_path

@@ -224,6 +224,7 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
     return (y * area) @ x.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("psf_px", "limit"),
     [(0.2, 1e-7), (0.3, 1e-7), (0.5, 1e-7), (1.0, 1e-6), (1.5, 1e-7), (2.0, 1e-7)],

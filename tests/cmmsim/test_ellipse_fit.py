@@ -240,8 +240,8 @@ def test_light_that_rises_across_a_sticker_is_fitted_with_it():
     """By 6 % a px, half of it across a radius. The error is that which the covariance states; even
     light would put the centres six deviations off.
     """
-    windows, centres = rising(2, 400, 0.06)
-    corners = np.zeros((400, 2), dtype=int)
+    windows, centres = rising(2, 150, 0.06)
+    corners = np.zeros((150, 2), dtype=int)
     even, lit = (fit_ellipses(windows, corners, NOISE, FIT, lit=lit) for lit in (False, True))
     assert lit.good.all()
     require_true(squares(lit.centres - centres, lit.covariances), 2)
@@ -253,11 +253,11 @@ def test_a_fit_tells_how_light_would_move_its_centre():
     """The shift is that of the fit with light, for little of it; without light it is as large as
     its own covariance says.
     """
-    windows, _ = rising(3, 400, 0.01)
-    corners = np.zeros((400, 2), dtype=int)
+    windows, _ = rising(3, 150, 0.01)
+    corners = np.zeros((150, 2), dtype=int)
     even, lit = (fit_ellipses(windows, corners, NOISE, FIT, lit=lit) for lit in (False, True))
     shifts = lit.centres - even.centres
     assert np.std(even.lights[:, :2] - shifts) < 0.1 * np.std(shifts)
-    windows, _ = rising(4, 400, 0.0)
+    windows, _ = rising(4, 150, 0.0)
     lights = fit_ellipses(windows, corners, NOISE, FIT).lights
     require_true(squares(lights[:, :2], lights[:, [[2, 3], [3, 4]]]), 2)

@@ -139,6 +139,7 @@ def test_whole_frame_faults_are_lost_with_the_reason(sensor, kind):
         assert "needed" in m.reason or "two poses" in m.reason or "contradict" in m.reason, m.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=PYRENDER)])
 def test_lost_frames_and_jumps_are_found_again(renderer):
     """After ten lost frames, and after a jump of up to 10 mm and 40 mrad in each coordinate, the

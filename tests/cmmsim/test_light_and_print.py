@@ -79,6 +79,7 @@ def moved_centres(sensor, pose, move):
     return np.stack(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)]
 )
@@ -169,6 +170,7 @@ def test_a_point_out_of_focus_becomes_a_circle_of_stated_size():
     )
 
 
+@pytest.mark.slow
 def test_a_cluttered_background_is_bright_and_lies_behind_the_bodies():
     plain, cluttered = (
         exact("perfect", FINE | more).capture(exact("perfect", FINE).home).left.astype(int)

@@ -260,6 +260,7 @@ DARK = {
 SIXTEEN_BIT = {"camera.bit_depth": 16, "camera.gain": 33.28, "camera.black_level": 4096.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [DARK, SIXTEEN_BIT], ids=["dark discs", "16 bit"])
 def test_other_kinds_of_images_are_taught_and_measured_with_a_true_covariance(changes):
     sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=4, changes=changes)
@@ -324,6 +325,7 @@ def test_the_radius_of_stickers_is_taken_from_the_images():
     assert not cmmsim.measure_frame(frames[0], stated.estimator).ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

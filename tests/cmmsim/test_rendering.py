@@ -256,6 +256,7 @@ def test_a_renderer_of_one_s_own_draws_by_its_module_and_name():
         exact(renderer=f"{__name__}:CAMERA")
 
 
+@pytest.mark.slow
 def test_layers_are_laid_as_plain_numpy_lays_them():
     """Two discs over a ground, the second behind a solid that covers the left half of the
     window."""

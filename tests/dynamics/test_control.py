@@ -179,6 +179,7 @@ def test_a_torque_held_for_a_frame_brings_the_rates_where_the_way_back_has_them(
     assert np.abs(run.pose_rate[1] - wanted).max() < 0.01 * np.abs(wanted).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", ["pd", "cascade", "pi"])
 def test_feedforward_and_observer_know_the_law_of_the_drives(robot, drive):
     """The true model of the plant, against the servo alone; and the observer's prediction against
@@ -390,6 +391,7 @@ def test_the_linear_response_is_that_of_the_simulated_loop(robot):
     assert np.abs(found - said).max() < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.slow)])
 def test_designed_gains_give_the_bandwidth_and_damping_that_were_asked_for(name):
     robot = dynamics.load_robot(name)

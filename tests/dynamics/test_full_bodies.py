@@ -61,6 +61,7 @@ def full(request):
     return robot, values, (robot.home_pose + away, twist, gain)
 
 
+@pytest.mark.slow
 def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
     """Every column to 1e-9 of its size over all states; accelerations to 1e-9 of theirs."""
     pytest.importorskip("pinocchio")
@@ -100,6 +101,7 @@ def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
     assert (worst <= 1e-9 * size + 1e-13 * size.max()).all()
 
 
+@pytest.mark.slow
 def test_mass_and_coriolis_matrix_and_equation_of_motion_are_one_dynamics(full):
     """M twist_dot + C twist + G is the wrench of the regressor; M_dot - 2 C is skew-symmetric; the
     equation of motion of the integrator has the same forces; its derivatives are differences.
@@ -195,6 +197,7 @@ def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(f
             np.testing.assert_allclose(ours, power, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", ["delta3", "rss6"], indirect=True)
 def test_a_passive_joint_of_one_leg_has_its_share_of_the_friction_of_all_legs(full):
     """The friction of all legs is the sum of that of single legs, which begin with its value."""

@@ -82,6 +82,7 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, name):
     """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with

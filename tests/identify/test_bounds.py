@@ -194,6 +194,7 @@ def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
     assert held.active_bounds == free.active_bounds == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moment", "refused"), [(0.34, False), (0.37, True)])
 def test_a_full_body_that_the_data_refuse_is_flat_and_keeps_the_estimate_without_bounds(
     moment, refused

@@ -81,6 +81,7 @@ def test_the_squares_sum_up_to_every_variance_that_is_stated(identified):
     assert CORRELATED not in budget.sources
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_picture_and_numbers_that_agree(identified, capfd):
     assert command("budget", identified.path) == 0
     said = capfd.readouterr().out

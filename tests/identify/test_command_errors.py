@@ -161,6 +161,7 @@ def test_zeros_and_scale_with_a_prior_are_estimated_and_intervals_hold(method):
     assert set(result.common_share) == {"zeros", "scale"}
 
 
+@pytest.mark.slow
 def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
     """The remedy of the diagnosis is the setting that mends it."""
     true = quick(**{"plant.joint_zero_error_rad": [0, 3e-4, 0, 0, 0, 0]})

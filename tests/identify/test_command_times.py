@@ -111,6 +111,7 @@ def test_models_of_all_kinds_run_as_the_plant_did(hold):
     assert np.abs(blind.simulate(truth()).pose - run.pose).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_spans_of_torques_miss_a_record_by_its_noise():
     """With the true parameters; the log that the experiment left is what the law knew of each
     frame's latency.

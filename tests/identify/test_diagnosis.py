@@ -125,6 +125,7 @@ def test_the_cause_that_was_injected_is_named_first_with_its_size(name, monkeypa
     assert not found.left.significant
 
 
+@pytest.mark.slow
 def test_static_friction_is_named_with_its_ratio_and_its_velocity_and_as_a_line_to_type():
     true = {
         "plant.friction": "stribeck",
@@ -143,6 +144,7 @@ def test_static_friction_is_named_with_its_ratio_and_its_velocity_and_as_a_line_
     assert "--set model.stribeck_velocity_rad_s=0.0" in only.remedies[1]
 
 
+@pytest.mark.slow
 def test_another_law_of_the_drives_is_named_as_a_line_to_type():
     found = diagnosed(record_of(18, scenario=quick(**{"plant.drive": "cascade"})))
     first = found.findings[0]
@@ -162,6 +164,7 @@ def test_several_zeros_are_named_as_a_group_with_the_size_of_each(monkeypatch):
     assert np.abs(off).max() < 3
 
 
+@pytest.mark.slow
 def test_causes_that_move_the_platform_alike_are_named_together(monkeypatch):
     """Over a small workspace a link that is longer acts as a zero that is off."""
     record = record_of(11, monkeypatch, with_numbers("link_length", 0, 0, 0, 0, 2e-5, 0))
@@ -174,6 +177,7 @@ def test_causes_that_move_the_platform_alike_are_named_together(monkeypatch):
     assert "lengths of the links" in (first.name, *first.alike)
 
 
+@pytest.mark.slow
 def test_of_two_causes_both_are_named(monkeypatch):
     record = record_of(7, monkeypatch, with_zeros(0, 0, 0, 0, 3e-4, 0))
     record["command"] /= 1.0017

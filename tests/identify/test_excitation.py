@@ -137,6 +137,7 @@ def designed(seed=3, **overrides):
     return design_trajectories(design_of(quick(**overrides)), seed)
 
 
+@pytest.mark.slow
 def test_a_run_too_short_to_show_every_parameter_has_no_index():
     """Six poses give 36 equations for the 37 base parameters, seven give enough."""
     chosen, alone = designed(), designed(candidates=1)
@@ -214,6 +215,7 @@ def test_worst_is_what_the_robot_says(robot, seed):
     assert (worst["travel"].who, worst["travel"].time_s) == (f"leg {leg + 1}", t[row])
 
 
+@pytest.mark.slow
 def test_broken_limits_no_feasible_start_and_a_run_that_cannot_end_at_rest_are_named_with_their_numbers(
     robot,
 ):

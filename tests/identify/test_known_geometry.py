@@ -64,6 +64,7 @@ def off_by(name, size, seed=0):
     return KnownGeometry(robot.moved(0 * drawn_errors), covariance), drawn_errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["command_driven", "closed_loop"])
 def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(method):
     known, errors = off_by("rrr3", 4e-6)
@@ -187,6 +188,7 @@ def written(folder, known):
     return folder / "robot.toml"
 
 
+@pytest.mark.slow
 def test_a_calibration_done_before_is_read_and_the_true_robot_is_drawn_about_it(tmp_path):
     known, errors = off_by("rrr3", 2e-5)
     known = replace(known, robot=known.robot.moved(5 * errors))

@@ -113,6 +113,7 @@ def test_base_parameters_of_torques_err_as_much_as_their_intervals_say():
     assert (np.mean(squares, axis=0) < 1.4).all(), squares
 
 
+@pytest.mark.slow
 def test_derivatives_of_fitted_spans_are_finite_differences():
     """Of the poses, by the platform's mass and the friction of a joint: each span's start
     follows."""

@@ -117,7 +117,7 @@ def test_a_mesh_that_cannot_be_used_is_refused_in_one_line(tmp_path, body, mesh,
     assert "\n" not in str(error.value)
 
 
-def test_a_mesh_of_a_urdf_that_cannot_be_drawn_is_left_out_and_said(tmp_path, capfd):
+def test_a_mesh_of_a_urdf_that_cannot_be_drawn_is_left_out_and_said(tmp_path, capfd, read_here):
     urdf, closures = urdf_texts(rss6(), allow_unphysical_inertia=True)
     for name in ("link1", "link2"):
         shape = f'<visual><geometry><mesh filename="{name}.stl"/></geometry></visual>'

@@ -151,6 +151,7 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
             identify(list(pair), rss6(), SCENARIO)
 
 
+@pytest.mark.slow
 def test_drawn_loads_spread_as_stated_and_are_never_negative():
     """Mean and spread of many: of a weighed mass, and of one hardly known, which normal deviations
     would make none.

@@ -133,6 +133,7 @@ def test_the_warm_starts_equation_holds_for_the_true_parameters(drive):
     assert np.sqrt(np.mean(balance**2)) < 5e-3 * np.sqrt(np.mean(gains**2))
 
 
+@pytest.mark.slow
 def test_a_single_gain_that_differs_is_diagnosed_with_its_size_and_the_setting():
     """Plant apart from the model: a study of a model that shares gains."""
     scenario = quick(**{"plant.gains": "each", "plant.values": {"joint3.lp": 10.8}})

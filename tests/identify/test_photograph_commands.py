@@ -83,6 +83,7 @@ def linked(pictures, folder):
     return folder
 
 
+@pytest.mark.slow
 def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, tmp_path, capfd):
     assert teach(pictures, tmp_path / "taught", "--quiet") == 0
     linked(pictures, tmp_path)

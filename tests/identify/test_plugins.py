@@ -123,6 +123,7 @@ def biased(spots):
 biased.bias_px = "much"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "said"),
     [("Bad", "finite centres (36, 2), got nan"), ("short", "good (36,) of bool, got bool (35,)")],

@@ -100,7 +100,7 @@ def test_a_proposal_for_vicon_asks_which_body_and_which_convention(record, tmp_p
         telemetry_of(trial)
 
 
-def test_a_proposal_for_a_bag_needs_no_answer(record, tmp_path):  # noqa: F811
+def test_a_proposal_for_a_bag_needs_no_answer(record, tmp_path, read_here):  # noqa: F811
     bag = as_mcap(tmp_path, record)
     proposed(bag, bag)
     check(bag, record)

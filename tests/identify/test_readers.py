@@ -186,7 +186,7 @@ def as_our_table(folder, record):
     "write_log", [as_motive, as_newer_motive, as_vicon, as_mcap, as_bag, as_table, as_our_table]
 )
 def test_every_kind_of_log_holds_the_poses_and_commands_of_the_record_to_1e_9(
-    write_log, record, tmp_path
+    write_log, record, tmp_path, read_here
 ):
     found = telemetry_of(write_log(tmp_path, record))
     ok = record["measured_ok"].values == 1
@@ -532,7 +532,9 @@ def test_a_bag_without_the_package_that_reads_it_is_one_line(record, tmp_path, m
         telemetry_of(path)
 
 
-def test_a_transform_among_others_and_arrays_without_a_stamp_are_read_from_a_bag(tmp_path):
+def test_a_transform_among_others_and_arrays_without_a_stamp_are_read_from_a_bag(
+    tmp_path, read_here
+):
     write_transforms(tmp_path / "bag", 20)
     bag = Bag(tmp_path / "bag")
     body = "transforms[vicon/plate.1]"

@@ -117,6 +117,7 @@ def test_a_record_with_times_of_its_own_is_checked_as_one_on_the_grid(record):
     assert found["clock offset"].value == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_too_small_cannot_show_the_parameters():
     """An identification from this record identifies no group; its model does not hold either."""
     small = run_plant(SCENARIO, 0, size=0.02)[0]
@@ -135,6 +136,7 @@ def test_clocks_that_differ_by_seconds_are_seen_in_the_motion(record):
     assert found.value == pytest.approx(-1.4, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_log_is_checked_by_its_description_and_a_robot_is_told_from_it(
     record, tmp_path, monkeypatch, capfd
 ):

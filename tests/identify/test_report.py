@@ -240,6 +240,7 @@ def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
     )
 
 
+@pytest.mark.slow
 def test_what_does_not_move_is_not_drawn():
     """Three coordinates, as of delta3; of rrr3 x, y and gamma."""
     for moves, panels, ellipses in (([0, 1, 2], 6, 3), ([0, 1, 5], 6, 1)):
@@ -388,6 +389,7 @@ def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refus
     assert not run_folder.report.exists()
 
 
+@pytest.mark.slow
 def test_a_record_without_truth_has_a_report_that_says_what_nobody_can_tell(run_folder):
     """Beside the models' errors against the measurement; no column and no figure of a truth."""
     data = read_run(without_truth(run_folder))

@@ -231,7 +231,7 @@ def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsy
     assert "from home, within the joints' travel" in capsys.readouterr().out
 
 
-def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, tmp_path):
+def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, tmp_path, read_here):
     pytest.importorskip("mujoco")
     model, out = tmp_path / "ups6.xml", tmp_path / "mine.toml"
     assert command("export", "mjcf", "ups6", "--out", model, "--quiet") == 0

@@ -124,6 +124,7 @@ def test_bodies_in_the_gltf_file_stand_where_the_robot_has_them(name):
     np.testing.assert_allclose(nearest, half, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_nearer_hides_what_is_farther():
     painter = Painter(Viewpoint(0.0, 0.0), np.zeros(3), 1.0)  # looks along -x
     for x, colour in ((0.2, "#ff0000"), (-0.2, "#0000ff"), (0.0, "#00ff00")):
@@ -173,6 +174,7 @@ def drawn_words(figure):
     return {text.get_text() for text in figure.findobj(Text)}
 
 
+@pytest.mark.slow
 def test_a_motion_holds_the_poses_of_the_files(finished_run):
     motion = read_motion(finished_run.path)
     files = {"true": ("experiment.nc", "truth", ""), "measured": ("experiment.nc", "", "measured_"),
@@ -211,6 +213,7 @@ def test_what_a_run_lacks_is_left_out_and_said(run_folder):
     assert "Cameras, stickers and images are left out" in read_motion(run_folder.path).notes[0]
 
 
+@pytest.mark.slow
 def test_what_no_replay_can_be_made_of_is_refused_in_one_line(run_folder, tmp_path):
     assert "cmmsim excite" in refusal(OutputFolderError, read_motion, tmp_path / "none")
     assert "cmmsim excite" in refusal(OutputFolderError, read_motion, tmp_path)

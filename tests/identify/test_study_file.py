@@ -68,7 +68,7 @@ def test_changes_and_options_hold_in_every_row_and_factors_in_their_own():
 
 
 def test_a_sample_is_spread_as_its_factors_say():
-    """Against the distributions' own quantiles; 2,000 points put a share within 0.05 at better than
+    """Against the distributions' own quantiles; 500 points put a share within 0.1 at better than
     1e-4.
     """
     factors = {
@@ -77,17 +77,17 @@ def test_a_sample_is_spread_as_its_factors_say():
         "scenario.filter.order": {"low": 2, "high": 5},
         METHOD: ["registration", "planes"],
     }
-    chosen = study(factors=factors, sample=2000)
+    chosen = study(factors=factors, sample=500)
     prepare(chosen)
     columns = zip(*(case.factors.values() for case in cases(chosen)), strict=True)
     baseline, dark, order, method = map(np.array, columns)
     assert ((baseline >= 0.5) & (baseline < 2.0)).all()
-    assert np.mean(baseline < 1.25) == pytest.approx(0.5, abs=0.05)
-    assert np.mean(dark < 10.0) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(baseline < 1.25) == pytest.approx(0.5, abs=0.1)
+    assert np.mean(dark < 10.0) == pytest.approx(0.5, abs=0.1)
     assert {*order.tolist()} == {2, 3, 4, 5}
-    assert [np.mean(order == k) for k in (2, 3, 4, 5)] == pytest.approx([0.25] * 4, abs=0.05)
-    assert np.mean(method == "planes") == pytest.approx(0.5, abs=0.05)
-    assert np.corrcoef(baseline, dark)[0, 1] == pytest.approx(0.0, abs=0.1)
+    assert [np.mean(order == k) for k in (2, 3, 4, 5)] == pytest.approx([0.25] * 4, abs=0.1)
+    assert np.mean(method == "planes") == pytest.approx(0.5, abs=0.1)
+    assert np.corrcoef(baseline, dark)[0, 1] == pytest.approx(0.0, abs=0.2)
     assert cases(study(factors=factors, sample=50)) == cases(chosen)[:50]
 
 
