@@ -198,7 +198,7 @@ def _in_common(run: _Run) -> Advice | None:
     true = np.array([rms_row(one["true"])[run.part] for one in run.result["validation"]])
     worst = np.unravel_index(int(np.argmax(true)), true.shape)
     measured = rms_row(run.result["validation"][worst[0]].get("measured"))[run.part][worst[1]]
-    if unseen(run.result).with_cameras or not measured < AGREES * true[worst]:
+    if unseen(run.result).estimated or not measured < AGREES * true[worst]:
         return None
     return Advice(
         f"All measured poses share an error that the cameras do not state: the model is off by "

@@ -95,8 +95,8 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
         headline = EXPLAINED if explained else _disagreement(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
     if not missed:
-        shifted = goals.unseen(result).with_cameras
-        words = "With the estimated errors of the cameras, the" if shifted else "The"
+        estimated = goals.unseen(result).estimated
+        words = f"With {estimated}, the" if estimated else "The"
         headline = f"{words} identified model moves as the true robot does."
         return Verdict(True, headline, tuple(sentences))
     if not explained:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import threading
 from collections.abc import Iterator
@@ -26,17 +27,25 @@ from dynamics.closed_loop.start_state import (
     checked_loop_parameters,
 )
 from identify.arrays import Array
+from identify.estimation.common_error_estimates import errors_of_run
 from identify.excitation.design import Design, unseen_trajectories
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import SensorPlan
 from identify.model.from_record import predicting_model
+from identify.model.loop_model import LoopModel
 from identify.model.model_side import ModelSide
 from identify.progress import Advance, Progress
 from identify.record.conditions import SERVO, logged_latencies, recorded_law
 from identify.record.recording import is_timed, recorded_reference
 from identify.runtime import cores, mapped
 from identify.trajectory import FourierTrajectory
+
+MOST_FITS = 12
+"""Largest number of linear fits of the starts and the clock of a record that begins in motion."""
+
+SETTLED = 0.99
+"""Ratio of the costs of two fits from which on no further fit is made."""
 
 POLL_S = 0.2
 """Interval at which the progress of the workers is read, s."""
@@ -112,7 +121,7 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
     All poses are NaN if the model is unstable. Latencies and lost frames are those of the record,
     because the servo of the model must hold its commands where the plant's did. If the record was
     made under the servo, the model simulates the servo. Otherwise the logged commands drive the
-    model.
+    model. A model that begins in motion gets the starts and the clock that fit the record best.
 
     Raises the errors of `model_run`.
     """
@@ -123,9 +132,28 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
         return model_run(side.robot, side.settings, parameters, reference, latencies, lost)
     run = predicting_model(record, side).driven_by_commands()
     try:
+        if run.begins_in_motion:
+            run = _with_fitted_start(run, parameters)
         return run.simulate(parameters).pose
     except LoopFailure:
         return np.full_like(run.measured, np.nan)
+
+
+def _with_fitted_start(run: LoopModel, parameters: Array) -> LoopModel:
+    """Return a model that begins in motion, with the starts and the clock that fit its record best.
+
+    Without them, a model with the right parameters would be off after each start. Each fit is
+    linear, and stick-slip of the joints is not: fits follow until they lower the cost no more.
+    """
+    cost = math.inf
+    for _ in range(MOST_FITS):
+        missed = run.missed_in_noise(parameters)
+        before, cost = cost, float(np.sum(missed**2))
+        if cost > SETTLED * before:
+            break
+        fitted = errors_of_run(run.with_common_errors(parameters), parameters)
+        run = run.having(fitted[: len(run.errors_had)])
+    return run
 
 
 class _Worker:

@@ -16,7 +16,7 @@ from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.model.from_record import identified_model
 from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes
-from identify.record.recording import is_timed
+from identify.record.recording import is_timed, poses
 from identify.record.smoothness import gross_errors
 from identify.validation.unseen import model_on_record
 from tests.identify.record_forms import (
@@ -34,7 +34,7 @@ from tests.identify.record_forms import (
     true_parameters,
     with_rows,
 )
-from tests.identify.synthetic import quick, run_plant, side_of, truth
+from tests.identify.synthetic import SIGMA, quick, run_plant, side_of, truth
 
 CHANCE = 4.0
 """Standard deviations that a figure may be off by chance."""
@@ -151,6 +151,18 @@ def test_the_model_holds_its_command_where_the_plant_lost_a_frame():
     whole = record.assign(measured_ok=("time", np.ones(len(run.pose), dtype=np.int8)))
     blind = model_on_record(side_of(scenario), truth(), whole)
     assert np.abs(blind - run.pose).max() > 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["gaps of the log", "two clocks"])
+def test_the_model_is_compared_with_a_record_from_starts_and_clock_that_fit_it(form):
+    """The true parameters miss the measured poses by noise alone, also after gaps."""
+    _, more = FORMS[form](1)
+    record = record_in(form, 1)
+    side = side_of(scenario_of(**more))
+    moved = model_on_record(side, true_parameters(), record)
+    off = (moved - poses(record, "measured"))[record["measured_ok"].values.astype(bool)]
+    assert np.sqrt(np.mean((off / SIGMA) ** 2)) == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.thorough
