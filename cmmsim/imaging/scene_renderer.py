@@ -13,11 +13,11 @@ drawn in pieces, and pieces without a body are left out. The scene has a perfect
 point spread and vignetting are applied to what is drawn, as with every renderer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from itertools import product
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, finalize
 
 import cv2
 import numpy as np
@@ -29,8 +29,12 @@ from cmmsim.imaging.pyrender_renderer import opengl_context
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh
 
-# Drawn pixels along each side of the largest piece.
-LARGEST_PIECE = 1024
+# Drawn pixels along each side of the largest piece, and of the frame buffer for pieces.
+LARGEST_PIECE = 512
+ATLAS = 1024
+# Ratio of drawn pixels to the pixels that are asked for, along each side. Materials and lamps make
+# a pixel five times as expensive as those of the renderer `pyrender`.
+SAMPLES = 5.0 / 9.0
 # Share of a body's level that comes from all sides.
 AMBIENT = 0.5
 # Radiance of the lamp that adds the rest to a face that looks at the camera. pyrender reflects
@@ -48,35 +52,43 @@ def draw_frames(
 ) -> NDArray[np.float32]:
     """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    Each pixel is the mean of ``supersampling``² drawn pixels. Raises OpenGLMissingError.
+    Each pixel is the mean of (SAMPLES supersampling)² drawn pixels. Raises OpenGLMissingError.
     """
     views = Views.of(views)
+    supersampling = max(1, round(SAMPLES * supersampling))
     width, height = views.size
     images = np.full((len(views), height, width), background, dtype=np.float32)
     reach = LARGEST_PIECE // supersampling
+    size = min(reach, width), min(reach, height)
     for shown in views.exposures:
         scene = _scene_of(drawable, shown.camera.focal_px * supersampling)
-        for k, left, top in product(
-            shown.windows.tolist(), range(0, width, reach), range(0, height, reach)
-        ):
-            shape = min(reach, height - top), min(reach, width - left)
-            low = views.corners[k] + [left, top] - 0.5
-            bounds = np.hstack([low, low + shape[::-1]])[None]
-            places = shown.camera_from_bodies
-            if drawable.reaching_windows(shown.camera, places, bounds).any():
-                # OpenCV's pixel coordinates refer to pixel centres, pyrender's to pixel corners.
-                centre = supersampling * (shown.camera.centre - low)
-                focal_lengths = supersampling * shown.camera.focal_lengths
-                size = shape[1] * supersampling, shape[0] * supersampling
-                drawn = scene.draw(places, focal_lengths, centre, size, background)
-                # The mean of supersampling² drawn pixels.
-                images[k, top : top + shape[0], left : left + shape[1]] = cv2.resize(
-                    drawn, shape[::-1], interpolation=cv2.INTER_AREA
-                )
+        places = shown.camera_from_bodies
+        cells = np.array(
+            list(product(shown.windows, range(0, width, size[0]), range(0, height, size[1])))
+        )
+        low = views.corners[cells[:, 0]] + cells[:, 1:] - 0.5
+        reached = drawable.reaching_windows(shown.camera, places, np.hstack([low, low + size]))
+        kept = reached.any(axis=1)
+        # OpenCV's pixel coordinates refer to pixel centres, pyrender's to pixel corners.
+        centres = supersampling * (shown.camera.centre - low[kept])
+        focal_lengths = supersampling * shown.camera.focal_lengths
+        drawn = scene.draw(
+            places,
+            reached[kept],
+            focal_lengths,
+            centres,
+            supersampling * np.array(size),
+            background,
+        )
+        for (k, left, top), piece in zip(cells[kept].tolist(), drawn, strict=True):
+            # The mean of the drawn pixels of each pixel.
+            mean = cv2.resize(LINEAR[piece], size, interpolation=cv2.INTER_AREA)
+            part = images[k, top : top + size[1], left : left + size[0]]
+            part[:] = mean[: part.shape[0], : part.shape[1]]
     return images
 
 
-SCENE = Renderer("scene", draw_frames, 0.00058)
+SCENE = Renderer("scene", draw_frames, 0.0016)
 
 
 class _Scene:
@@ -84,50 +96,70 @@ class _Scene:
 
     def __init__(self, drawable: Drawable, samples: float) -> None:
         # Only the context's owner imports pyrender before this.
-        opengl_context()
+        context = opengl_context()
         import pyrender
 
         self._pyrender = pyrender
         self._scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0])
         sample = drawable.distance / samples
-        self._bodies = {}
+        self._nodes = {}
+        # Primitives with the patches that each contains.
+        self.primitives = []
         for body in np.unique(drawable.body_index).tolist():
             own = np.flatnonzero(drawable.body_index == body)
-            patches = [drawable.patches[k] for k in own]
-            stickers = [p for p in patches if isinstance(p, DiscStack)]
-            solids = [p for p in patches if isinstance(p, Mesh)]
-            lit = [_facets(mesh, None) for mesh in solids]
-            # Discs are seen from one side. Normals to the other side keep the lamp from them.
-            even = [_facets(disc_mesh(p, sample), -p.discs[0].normal) for p in stickers]
-            primitives = [
-                self._primitive(np.concatenate(facets), share)
-                for facets, share in ((lit, AMBIENT), (even, 1.0))
-                if facets
-            ]
-            self._bodies[body] = self._scene.add(pyrender.Mesh(primitives))
+            discs = [k for k in own if isinstance(drawable.patches[k], DiscStack)]
+            solids = [k for k in own if isinstance(drawable.patches[k], Mesh)]
+            # Stickers come first: where they hide their body, it need not be lit.
+            for part, share in ((discs, 1.0), (solids, AMBIENT)):
+                if part:
+                    facets = [_facets_of(drawable.patches[k], sample) for k in part]
+                    primitive = self._primitive(np.concatenate(facets), share)
+                    node = self._scene.add(pyrender.Mesh([primitive]))
+                    self._nodes[node] = body
+                    self.primitives.append((node, primitive, part))
         self._scene.add(pyrender.DirectionalLight(intensity=LAMP), pose=OPENCV_FROM_OPENGL)
         self._camera = pyrender.IntrinsicsCamera(1.0, 1.0, 0.0, 0.0, znear=NEAR, zfar=FAR)
         self._scene.add(self._camera, pose=OPENCV_FROM_OPENGL)
+        context.make_current()
+        for _, primitive, _ in self.primitives:
+            primitive._add_to_context()
+        kept = [primitive for _, primitive, _ in self.primitives]
+        finalize(self, _UNUSED.extend, kept).atexit = False
 
     def draw(
         self,
         camera_from_bodies: Array,
+        reached: NDArray[np.bool_],
         focal_lengths: Array,
-        centre: Array,
-        size: tuple[int, int],
+        centres: Array,
+        size: NDArray[np.int_],
         background: float,
-    ) -> NDArray[np.float32]:
-        """Return the radiance (h, w) of drawn pixels.
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Yield the values (h, w) that the shader wrote in each of n pieces.
 
-        ``focal_lengths`` (2,), ``centre`` (2,) and ``size`` (w, h) are in drawn pixels.
+        ``reached`` (n, patches) are the patches that reach into each piece. ``focal_lengths`` (2,),
+        the principal points ``centres`` (n, 2) and ``size`` (w, h) are in drawn pixels.
         """
-        for body, node in self._bodies.items():
+        for node, body in self._nodes.items():
             self._scene.set_pose(node, camera_from_bodies[body])
-        self._camera.fx, self._camera.fy = focal_lengths
-        self._camera.cx, self._camera.cy = centre
         level = background ** (1.0 / GAMMA)
         self._scene.bg_color = np.array([level, level, level, 1.0])
-        return LINEAR[_drawing().draw(self._scene, size)]
+        self._camera.fx, self._camera.fy = focal_lengths
+        projections = np.empty((len(centres), 4, 4), dtype=np.float32)
+        for k, centre in enumerate(centres):
+            self._camera.cx, self._camera.cy = centre
+            projections[k] = self._camera.get_projection_matrix(*size)
+        drawn = [(node, one, reached[:, own].any(axis=1)) for node, one, own in self.primitives]
+        columns, rows = ATLAS // size
+        for first in range(0, len(centres), columns * rows):
+            part = slice(first, first + columns * rows)
+            own = [(node, one, np.asarray(shown)[part]) for node, one, shown in drawn]
+            atlas = _drawing().draw(self._scene, own, projections[part], size)
+            for k in range(len(projections[part])):
+                row, column = divmod(k, columns)
+                top = row * size[1]
+                left = column * size[0]
+                yield atlas[top : top + size[1], left : left + size[0]][::-1]
 
     def _primitive(self, facets: Array, share: float) -> Any:
         """Return triangles in pyrender's form. ``facets`` is as `_facets` returns it.
@@ -148,6 +180,14 @@ class _Scene:
             ),
             mode=4,
         )
+
+
+def _facets_of(patch: DiscStack | Mesh, sample: float) -> Array:
+    """Return the facets of a solid, or of discs for drawing with samples ``sample`` m apart."""
+    if isinstance(patch, Mesh):
+        return _facets(patch, None)
+    # Discs are seen from one side. Normals to the other side keep the lamp from them.
+    return _facets(disc_mesh(patch, sample), -patch.discs[0].normal)
 
 
 def _facets(mesh: Mesh, normal: Array | None) -> Array:
@@ -176,37 +216,77 @@ def _drawing() -> Any:
     """Return what draws pyrender's scenes in this process."""
     context = opengl_context()
     from OpenGL import GL
-    from pyrender import RenderFlags
+    from pyrender.constants import ProgramFlags, RenderFlags
     from pyrender.renderer import Renderer as SceneRenderer
 
     class Drawing(SceneRenderer):
-        """pyrender's own drawing. Only one channel is read, and no depths."""
+        """pyrender's own drawing of many pieces into one frame buffer, the atlas.
 
-        def draw(self, scene: Any, size: tuple[int, int]) -> NDArray[np.uint8]:
-            """Return the values (h, w) that the shader wrote, for a size (w, h)."""
+        Each mesh is drawn with pyrender's own shader, lamps and material into all pieces before the
+        next one. Meshes stay in OpenGL's memory as long as their scene exists.
+        """
+
+        def draw(
+            self,
+            scene: Any,
+            parts: Sequence[tuple[Any, Any, NDArray[np.bool_]]],
+            projections: NDArray[np.float32],
+            size: NDArray[np.int_],
+        ) -> NDArray[np.uint8]:
+            """Return the values (ATLAS, ATLAS) that the shader wrote, the lowest row first.
+
+            ``parts`` contains nodes of meshes with their primitives, and the pieces in which each
+            is drawn. ``projections`` (n, 4, 4) belong to the pieces, whose size is (w, h).
+            """
             context.make_current()
-            self.viewport_width, self.viewport_height = size
-            drawn: NDArray[np.uint8] = self.render(scene, RenderFlags.OFFSCREEN)
+            while _UNUSED:
+                _UNUSED.pop().delete()
+            self._configure_forward_pass_viewport(RenderFlags.OFFSCREEN)
+            GL.glClearColor(*scene.bg_color)
+            GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
+            pose = scene.get_pose(scene.main_camera_node)
+            for node, primitive, shown in parts:
+                program = self._get_primitive_program(
+                    primitive, RenderFlags.OFFSCREEN, ProgramFlags.USE_MATERIAL
+                )
+                program._bind()
+                program.set_uniform("V", np.linalg.inv(pose))
+                program.set_uniform("cam_pos", pose[:3, 3])
+                self._bind_lighting(scene, program, node, RenderFlags.OFFSCREEN)
+                place = scene.get_pose(node)
+                for n, k in enumerate(np.flatnonzero(shown).tolist()):
+                    row, column = divmod(k, ATLAS // int(size[0]))
+                    GL.glViewport(column * int(size[0]), row * int(size[1]), *size.tolist())
+                    program.set_uniform("P", projections[k])
+                    if n == 0:
+                        self._bind_and_draw_primitive(
+                            primitive, place, program, RenderFlags.OFFSCREEN
+                        )
+                        primitive._bind()
+                        continue
+                    # Everything but the projection is as in the first piece.
+                    GL.glDrawArraysInstanced(primitive.mode, 0, len(primitive.positions), 1)
+                primitive._unbind()
+                program._unbind()
             # The renderer `pyrender` relies on these switches.
             for switch in (GL.GL_CULL_FACE, GL.GL_BLEND, GL.GL_DEPTH_TEST):
                 GL.glDisable(switch)
-            return drawn
+            GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb)
+            rows = -(-len(projections) // (ATLAS // int(size[0]))) * int(size[1])
+            read = GL.glReadPixels(0, 0, ATLAS, rows, GL.GL_RED, GL.GL_UNSIGNED_BYTE)
+            return np.frombuffer(read, dtype=np.uint8).reshape(rows, ATLAS)
 
         def _configure_forward_pass_viewport(self, flags: int) -> None:
             super()._configure_forward_pass_viewport(flags)
             # Discs have soft rims. Several samples a drawn pixel would only take time.
             GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._main_fb)
 
-        def _read_main_framebuffer(self, scene: Any, flags: int) -> NDArray[np.uint8]:
-            GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb)
-            width, height = self._main_fb_dims
-            read = GL.glReadPixels(0, 0, width, height, GL.GL_RED, GL.GL_UNSIGNED_BYTE)
-            return np.frombuffer(read, dtype=np.uint8).reshape(height, width)[::-1]
-
     context.make_current()
-    return Drawing(LARGEST_PIECE, LARGEST_PIECE)
+    return Drawing(ATLAS, ATLAS)
 
 
+# Primitives of scenes that no longer exist, which are in OpenGL's memory until the next drawing.
+_UNUSED: list[Any] = []
 _SCENES: "WeakKeyDictionary[Drawable, dict[float, _Scene]]" = WeakKeyDictionary()
 
 
