@@ -71,7 +71,7 @@ def check_choice(
 
 
 def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., Any]:
-    """Return the built-in part of a name, or a user's own part.
+    """Return the built-in part with a name, or a user's own part.
 
     For the arguments see `check_choice`. Raises ScenarioError if there is no such part.
     """

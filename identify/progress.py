@@ -130,9 +130,9 @@ def print_warnings(warnings: Iterable[str], word: str = "warning") -> None:
 
 
 def print_advice(cause: str, command: str, of: str = "") -> None:
-    """Print the likeliest cause of what was missed, and the command to type next.
+    """Print the likeliest cause of missed goals, and the command to type next.
 
-    ``of`` names what was missed, where it is not clear.
+    ``of`` names the goals, if they are not clear from the lines above.
     """
     typer.echo(f"likeliest cause{f' ({of})' if of else ''}: {cause}")
     typer.echo(f"next: {command}")

@@ -1,9 +1,9 @@
 """Bounds of a search for parameters.
 
 No parameter is negative, except the first moments and products of inertia of full bodies, which
-have no bounds. As an option, bodies must be physically possible: a rigid body has a
-positive mass, and none of its principal moments of inertia exceeds the sum of the other two. With
-the second moments of its mass along its axes, J_x = integral of x^2 dm and so on,
+have no bounds. As an option, bodies must be physically possible: a rigid body has a positive mass,
+and none of its principal moments of inertia exceeds the sum of the other two. With the second
+moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
     Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
 
@@ -133,7 +133,7 @@ class ParameterBounds:
         return np.asarray(np.abs(np.linalg.inv(self.slope(coordinates))) @ std, dtype=float)
 
     def linear_coordinates(self, parameters: Array) -> Array:
-        """Return the coordinates (p,) of parameters (p,), with full bodies as they are."""
+        """Return the coordinates (p,) of parameters (p,), with full bodies left unchanged."""
         return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
 
     @property

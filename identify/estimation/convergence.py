@@ -25,7 +25,7 @@ def relative_change(step: Array, parameters: Array, scale: Array) -> float:
 
 
 def converged(cost: float, new_cost: float, change: float, criteria: StopCriteria) -> str:
-    """Return the reason for which a search has converged, or an empty text.
+    """Return the reason why a search has converged, or an empty text.
 
     cost, new_cost: costs before and after a step. change: `relative_change` by the step.
     """

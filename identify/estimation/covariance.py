@@ -5,11 +5,11 @@
 Sensor noise acts twice: in the measured poses, and through the servo on the plant's motion. A model
 that closes its own loop cannot follow the second effect. Its residuals are coloured, and stick-slip
 makes the response nonlinear. Therefore the experiment is repeated on the identified model with
-random noise. Each repetition gives residuals r, and the scores J^T r have the same covariance as
-those of the real record. With W the information of data and prior, the covariance of the estimate
-is W^-1 (cov(J^T r) + prior information) W^-1. The prior information contains that of the initial
-guess. Its part of the covariance is the effect of errors of the guess, which are the same in every
-record.
+random noise. Each repetition gives residuals r. With their Jacobian J with respect to the
+parameters, the scores J^T r have the same covariance as those of the real record. With W the
+information of data and prior, the covariance of the estimate is W^-1 (cov(J^T r) + prior
+information) W^-1. The prior information contains that of the initial guess. The part of the
+covariance due to the guess is the effect of its errors, which are the same in every record.
 
 A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. If a
 model misses the record by more than noise explains, the effect of its error on the scores is added
@@ -22,11 +22,10 @@ correlation with the parameters. The search estimates the common errors of each 
 If records share the same errors, the covariance of the estimate takes this into account.
 
 A known load has errors, too. Under the load L the model has the parameters p + L. An error dL moves
-the residuals of the records under this load by J dL, and the scores by J^T J dL. J is the Jacobian
-of the residuals with respect to the parameters. With S the covariance of the load, the covariance
-of the scores grows by H S H, where H is the sum of J^T J over these records. For example, if the
-load fixes the scale and is one percent heavier than stated, all parameters are about one percent
-too small.
+the residuals of the records under this load by J dL, and the scores by J^T J dL. With S the
+covariance of the load, the covariance of the scores grows by H S H, where H is the sum of J^T J
+over these records. For example, if the load fixes the scale and is one percent heavier than stated,
+all parameters are about one percent too small.
 """
 
 from collections.abc import Sequence

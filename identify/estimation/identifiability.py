@@ -207,9 +207,9 @@ def scale_warnings(
 ) -> tuple[str, ...]:
     """Return a warning if an instrument was used to fix the scale, but does not fix it.
 
-    Poses determine the controller's gain up to the scale. gain: its name. std: relative standard
-    deviation of the gain due to errors of the initial guess. prior_share: share of these errors in
-    its variance.
+    Poses determine the controller's gain up to the scale. gain: name of this gain. std: its
+    relative standard deviation due to errors of the initial guess. prior_share: share of its
+    variance due to these errors.
     """
     if anchor.value is None or std <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
         return ()

@@ -106,7 +106,7 @@ def identify(
 
 @one_thread
 def identified(asked: Asked, progress: Progress) -> IdentificationResult:
-    """Return what `identify` does, from its checked inputs, and with the same errors."""
+    """Return the result of `identify` from its checked inputs. Raises the same errors."""
     began = time.perf_counter()
     records = asked.records
     side = asked.side

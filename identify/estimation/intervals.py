@@ -12,8 +12,8 @@ unheld estimate, truncated at the bounds, has the stated coverage. But it can be
 contain the estimate. The returned interval is the union of the intervals of both estimates and the
 range between them, truncated at the smallest allowed value. It is never empty, contains the
 estimate, and has at least the stated coverage. The truncated interval of the bounded estimate alone
-does not: a sum of many quantities near their bounds is estimated too high by more than its standard
-deviation.
+does not have this coverage, because a sum of many quantities near their bounds is estimated too
+high by more than its standard deviation.
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,8 @@ loses the same frames as the real sensor. Driven by commands, the joints of the 
 commands, which contain the effect of the sensor's noise on the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance
-(`LoopModel.misses` computes them), and a row for each prior information: the initial guess of each
-parameter and the scale anchor.
+(`LoopModel.misses` computes them), and a row for each piece of prior knowledge: the initial guess
+of each parameter and the scale anchor.
 """
 
 from collections.abc import Sequence

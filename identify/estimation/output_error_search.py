@@ -1,11 +1,11 @@
 """Searches for the optimum of the output error, one after the other.
 
-The sequence is the linear warm start, the command-driven output error, which has few local minima,
-and the closed-loop output error, which has narrow local minima by stick-slip. The last two
-end by the criteria of `convergence`. In the first search, errors that all poses have in
-common are treated as noise, because far from the optimum they would hide the relevant residuals. If
-the model is unstable with both the warm start and the initial guess, multiple shooting finds a
-stable model.
+The linear warm start comes first. The search for the command-driven output error follows, which has
+few local minima. The search for the closed-loop output error is last, because stick-slip gives it
+narrow local minima. Both searches end by the criteria of `convergence`. In the first search, errors
+that all poses have in common are treated as noise, because far from the optimum they would hide the
+relevant residuals. If the model is unstable with both the warm start and the initial guess,
+multiple shooting finds a stable model.
 """
 
 from dataclasses import dataclass, replace

@@ -90,9 +90,9 @@ class IdentificationResult:
     whiteness : Whiteness
         Test of the residuals of the model that is driven by the logged commands.
     driven_estimate : ndarray, shape (p,)
-        Estimate with that model. It equals `estimate` if no closed-loop search followed.
+        Estimate with the command-driven model. It is `estimate` if no closed-loop search followed.
     driven_misfit : Misfit
-        Misfit of that model.
+        Misfit of the command-driven model.
     notes, warnings : tuple of str
         Decisions when the record was read, and what may be wrong.
     """

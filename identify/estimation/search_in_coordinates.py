@@ -2,7 +2,7 @@
 
 The parameters are a function of the coordinates. A linear function is linearised together with the
 problem. The function of log-Cholesky coordinates is curved. The problem is then linearised in the
-parameters only, and a step follows the curved function to the least linearised cost, which needs no
+parameters only, and a step follows the curved function to the least linearised cost. This needs no
 run of the model. If the curved function were linearised too, steps would be short where the data
 determine the parameters well.
 """

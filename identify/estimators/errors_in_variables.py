@@ -133,7 +133,8 @@ The last entry belongs to the right side of the equations.
 def total_least_squares(evidence: Evidence) -> Estimate:
     """Estimate by total least squares with drawn errors of the columns.
 
-    Raises EstimationError if the solution is not generic, so that the torques have no part in it.
+    Raises EstimationError if the solution is not generic, which means that the torques have no part
+    in it.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)

@@ -5,9 +5,10 @@ With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 2
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
-Both form one system with the unknowns Xi, the gains and the torques z (n,) at the start. The
-measured torque determines the scale, so no anchor is needed. Parameters that the motion does not
-excite keep the initial guess with its standard deviations.
+The symbols are those of `warm_start`. Both equations form one system with the unknowns Xi, the
+gains and the torques z (n,) at the start. The measured torque determines the scale, so no anchor is
+needed. Parameters that the motion does not excite keep the initial guess with its standard
+deviations.
 
 Noise of the poses enters the regression matrix through both derivatives, and biases the estimates
 towards zero, for any number of samples. The weights of the rows follow from the residuals of each
@@ -38,7 +39,7 @@ UNKNOWN_TORQUE = 1e3
 """Prior standard deviation of the torques at the start, N m, so large that it has no effect."""
 
 UNKNOWN_FORCE = 1e6
-"""Prior standard deviation of the forces at the start, N, of joints that slide, also so large."""
+"""Prior standard deviation of the forces at the start, N, of joints that slide."""
 
 
 @dataclass(frozen=True)
@@ -164,10 +165,10 @@ def weighted_least_squares(evidence: Evidence) -> Estimate:
 def two_steps(evidence: Evidence) -> Estimate:
     """Estimate inertial parameters first, then friction and gains with the inertias found.
 
-    Both steps are weighted least squares. The first one holds friction at the initial guess and
-    takes up what the guess lacks, so that inertias are biased (the two-step procedure that Li et
-    al., Electronics 8(8), 836, 2019, section 1, quote for parallel robots). Each step takes what it
-    holds as exact, also in the standard deviations.
+    Both steps are weighted least squares. The first step holds friction at the initial guess.
+    Errors of this guess bias the inertias (the two-step procedure that Li et al., Electronics 8(8),
+    836, 2019, section 1, quote for parallel robots). Each step takes the parameters that it holds
+    as exact, also in the standard deviations.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -231,7 +232,7 @@ def _solved(
 def _fit_std(equations: TorqueEquations, noise: Array, guess: StartingGuess) -> Array:
     """Return the standard deviations (p,) of parameters fitted to rows with some noise (2 m,)."""
     scale = prior_of(guess)[1]
-    # In units of the prior standard deviations, what is held does not spoil the inverse.
+    # In units of the prior standard deviations, held parameters do not make the inverse inaccurate.
     known = information(equations.whitened(noise), guess) * np.outer(scale, scale)
     covariance = np.linalg.inv(known) * np.outer(scale, scale)
     return standard_deviations(covariance, len(guess.values))

@@ -359,7 +359,7 @@ def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator)
     std = np.array(load.figures_std)
 
     def drawn() -> Array:
-        # so many numbers, in this order, that seeds give the same loads as ever
+        # The number and the order of the draws are kept, so that a seed always gives the same load.
         numbers = rng.standard_normal(len(layout.names))
         return figures + std * numbers[[0, 4, 5, 6, 1, 2, 3]]
 

@@ -171,7 +171,7 @@ def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
     try:
         model = run.simulate(guess).pose
     except DynamicsError:
-        # the search raises an error for an unstable model, with more evidence
+        # the search raises an error for an unstable model, with more detail
         return run
     offset = _likely_delay(
         run.times[run.ok], model[run.ok], run.measured[run.ok], REACH * stds[CLOCK_OFFSET]

@@ -1,8 +1,8 @@
 """Record of a run from its logs of poses, commands and the reference.
 
-A log on the grid of frames, with a reference, that begins at rest, and that shows every pose that
-the servo used, becomes a record on the grid. Its model can close its own loop. Every other log
-becomes a record with times of its own, whose model the commands drive.
+A log becomes a record on the grid of frames if its rows are on this grid, if it has a reference and
+begins at rest, and if it shows every pose that the servo used. Its model can close its own loop.
+Every other log becomes a record with times of its own, whose model the commands drive.
 
 Gross errors are left out, and what was decided is noted in the record.
 """
@@ -47,9 +47,8 @@ def record_of(
     """Return the record of a run from its logs.
 
     scenario_toml: scenario that the record states. stated (6, 6): covariance of the poses if the
-    log holds none. Raises RecordError if more than a
-    tenth of the poses are gross errors, if no command is logged, if clocks do not overlap, or as
-    `build_record` and `build_timed_record` do.
+    log holds none. Raises RecordError if more than a tenth of the poses are gross errors, if no
+    command is logged, if clocks do not overlap, or as `build_record` and `build_timed_record` do.
     """
     ok = telemetry.poses.ok
     covariances = telemetry.poses.covariance
@@ -213,7 +212,7 @@ def _not_on_grid(telemetry: Telemetry, timing: Timing, gross: bool) -> str | Non
 def _check_rate(telemetry: Telemetry, rate_hz: float) -> None:
     """Check that the usual time between the rows of one table is one frame of the stated rate.
 
-    Raises RecordError with the first row that is not.
+    Otherwise, raises RecordError with the first row at another distance.
     """
     times = telemetry.poses.time
     if len(times) < 2:
@@ -286,9 +285,9 @@ def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
 def _gaps(telemetry: Telemetry, acting: Array, kept: NDArray[np.bool_]) -> tuple[Array, list[str]]:
     """Return the times (k, 2) of the last and the first command around gaps, s, and notes.
 
-    In a gap, rows of commands and of poses are missing. The last command was held where only
-    commands are missing, and where the command after the missing rows is the one before them.
-    Otherwise it is not known what was commanded.
+    In a gap, rows of commands and of poses are missing. The last command was held if only commands
+    are missing, or if the command after the missing rows equals the one before them. Otherwise, the
+    commands in the gap are not known.
     """
     rows = telemetry.commands.time
     poses = telemetry.poses.time

@@ -39,13 +39,13 @@ from identify.scenario.sections import Excitation, Identification, Validation
 from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"
-"""Name of the table of that file with further measurements."""
+"""Name of the table of a log's TOML file with further measurements."""
 
 COLUMNS = "columns"
-"""Name of the table of that file with the columns of a log."""
+"""Name of the table of a log's TOML file with the columns of the log."""
 
 MOST_HZ = 1e6
-"""Frame rate, Hz, that no record has. A scenario names its own limit."""
+"""Frame rate, Hz, that no record has. A scenario refuses rates above its own, lower limit."""
 
 TABLES = (".csv", ".tsv", ".txt")
 """Endings of the names of tables."""
@@ -103,7 +103,7 @@ def is_log(path: Path) -> bool:
 
 
 def is_record(path: Path) -> bool:
-    """Return whether a path is a record: netCDF, a log, or a description with a table of one."""
+    """Return whether a path is a record: netCDF, a log, or a description of a log."""
     if path.suffix.lower() == ".toml":
         if not is_file(path):
             return False
@@ -171,7 +171,7 @@ def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:
     telemetry = read_telemetry(path, about, robot)
     if about.columns is not None and (found := log_suspicions(path, about, telemetry, robot)):
         raise RecordError("; ".join(found))
-    # Covariances of the log itself go first.
+    # Covariances in the log itself take precedence.
     stated = np.eye(6) if telemetry.poses.covariance is not None else _stated(measured, path)
     record = record_of(telemetry, robot, scenario.timing, scenario.to_toml(), stated)
     record.attrs["title"] = f"Record of {path.name}"
@@ -206,7 +206,7 @@ def read_description(path: Path, log: Path) -> Description:
 def with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario whose planned runs have whole frames at the rate of a record.
 
-    A record does not read these runs, and its rate can be any.
+    A record does not read these runs, and can have any rate.
     """
     timing = content.get("timing")
     rate = timing.get("frame_rate_hz") if isinstance(timing, Mapping) else None

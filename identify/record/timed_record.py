@@ -130,7 +130,7 @@ def _stretches(times: Array, ok: NDArray[np.bool_], acting: Array, gaps: Array) 
     """Return the number of the stretch of each pose (N,), from 1, and 0 for poses in none.
 
     A stretch begins with a measured pose, once two of its commands act. It ends with the last pose
-    before the missing command after its last known command.
+    before the first missing command would act.
     """
     usual = float(np.median(np.diff(acting))) if len(acting) > 1 else 0.0
     known_from = [-np.inf, *gaps[:, 1]]
