@@ -67,8 +67,8 @@ LONGEST_STEP = 0.3
 def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:
     """Return the integration steps per frame of length `period`, s.
 
-    A model has at least as many as the fastest motion of the robot needs at home, with its initial
-    guess.
+    A model has at least as many steps as the fastest motion of the robot needs at home, with the
+    parameters of the initial guess.
     """
     if not isinstance(side, Model) or side.start_parameters not in robot.parameter_sets:
         return side.steps_per_frame

@@ -113,7 +113,7 @@ def model_guess(robot: Robot, model: Model, settings: Identification) -> Startin
 
 
 WEIGHTLESS = 0.01
-"""Largest holding torque that counts as none, as a share of the torque to accelerate by GRAVITY."""
+"""Largest negligible holding torque, as a share of the torque to accelerate by GRAVITY."""
 
 GRAVITY = 9.81  # m/s^2
 

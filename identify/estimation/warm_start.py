@@ -245,7 +245,7 @@ def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, A
 def _acted(
     commands: Array, timing: FrameTiming, low_pass: Filter, latencies: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the same as `effective_command`, for commands with individual latencies.
+    """Return the results of `effective_command` for commands with individual latencies.
 
     The acting command is integrated from arrival to arrival, and the filtered rates of the
     integrals are returned.

@@ -79,7 +79,7 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """Estimating function with a title, and a text that names its inputs beside the commands.
+    """Estimating function with a title, and a text that names its inputs other than the commands.
 
     It is called like the function.
     """

@@ -29,7 +29,7 @@ def with_digest(content: bytes) -> bytes:
 
 
 def has_digest(path: Path | str, content: bytes) -> bool:
-    """Tell whether a netCDF file has a digest.
+    """Return whether a netCDF file has a digest.
 
     Raises RecordError if the digest is wrong.
     """

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
 LEAST_COMMAND = 1e-10
-"""Largest change of a command, rad, m, N m or N, that counts as none."""
+"""Largest change of a command, rad, m, N m or N, that counts as zero."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class BodyError:
     Attributes
     ----------
     kind, name : str
-        Kind of the error, as `identification.nuisances` names it, and its name, which begins with
+        Kind of the error in `identification.nuisances`, and name of the error. The name begins with
         the kind and ends with the unit.
     owners : tuple of int
         Rows of the bodies in the layout of the robot. There are none for a passive joint.

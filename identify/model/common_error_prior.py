@@ -1,4 +1,4 @@
-"""Prior of the common errors that are estimated beside the parameters, and their place in a loop.
+"""Prior of the common errors that are estimated with the parameters, and their effect on a loop.
 
 Errors of the poses and of the geometry come from the record. Errors of the latency, of the zeros
 and of the scale of commands, of the constants of the law of friction, and of the bodies have
@@ -52,7 +52,7 @@ def with_recorded_errors(
     motion: Array,
     own: Mapping[str, float] = MappingProxyType({}),
 ) -> Run:
-    """Return a model with the common errors that are estimated beside the parameters.
+    """Return a model with the common errors that are estimated with the parameters.
 
     Parameters
     ----------

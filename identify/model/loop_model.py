@@ -61,8 +61,8 @@ class LoopModel:
     marginal : Marginal, optional
         Whitener of the residuals for common errors, see `with_common_errors`.
     torques : ndarray, shape (N, n), optional
-        Torques or forces that the joints need at the frames beside those of the model, if the
-        logged commands drive it. See `joint_torques`.
+        Torques or forces that the joints need at the frames in addition to those of the model, if
+        the logged commands drive it. See `joint_torques`.
     bodies : ndarray, shape (k, N, n), optional
         Changes of the commands with the effect of one standard deviation of each error of bodies,
         see `body_errors`. `with_common_errors` computes them.

@@ -32,7 +32,7 @@ class ModelSide:
     low_pass : Filter
         Filter of the measured poses in all linear fits.
     nuisances : tuple of str
-        Kinds of errors that all poses have in common, and that are estimated beside the parameters.
+        Kinds of errors that all poses have in common. They are estimated with the parameters.
     fewest_frames : int
         Smallest number of frames of a record for an identification.
     """

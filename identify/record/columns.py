@@ -1,7 +1,7 @@
 """Table ``[columns]`` of the file that describes a record.
 
-It says what the columns of a log are called, and in which units, directions and frames they are. A
-pose of the record is
+It states the names of the columns of a log, and their units, directions and frames. A pose of the
+record is
 
     base_from_platform = base_from_frame · frame_from_body · body_from_platform
 

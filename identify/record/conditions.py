@@ -1,4 +1,4 @@
-"""Conditions of a run that its record states beside the frames.
+"""Conditions of a run that its record states in addition to the data of its frames.
 
 Law. A model can simulate the closed loop only with the visual servo. For another control law, the
 record states the name of the law, and whether its commands are joint commands or torques. A record

@@ -44,7 +44,7 @@ LARGEST = 200_000_000
 """Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes."""
 
 BESIDE = ("pair", "stickers", "why", "common_")
-"""Beginnings of the columns that `cmmsim measure` writes beside those of a record.
+"""Beginnings of the columns that `cmmsim measure` writes in addition to those of a record.
 
 These columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
 """

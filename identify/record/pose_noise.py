@@ -26,7 +26,7 @@ SEGMENTS = 4
 """Number of segments of the spectrum, not counting those that overlap two others."""
 
 SHORTEST = 128
-"""Smallest number of frames of a segment, if there are as many."""
+"""Smallest number of frames of a segment, if the record has that many."""
 
 
 def pose_noise(time: Array, poses: Array) -> Array:
@@ -64,8 +64,8 @@ class Spectrum:
 def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     """Return the spectrum of poses (N, 6) that were measured at times (N,).
 
-    Poses are interpolated at as many evenly spaced times. Positions or angles that move no more
-    than their noise (6,), m and rad, have no highest frequency.
+    Poses are interpolated at N evenly spaced times. Positions or angles that move no more than
+    their noise (6,), m and rad, have no highest frequency.
     """
     even = np.linspace(time[0], time[-1], len(time))
     rate = (len(time) - 1) / (time[-1] - time[0])

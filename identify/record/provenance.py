@@ -55,7 +55,7 @@ STATED = (
     *ADDED,
     *(f"{name}_std" for name in ADDED),
 )
-"""Attributes that an identification reads, beside the timing and servo of the scenario."""
+"""Attributes that an identification reads, in addition to the scenario's timing and servo."""
 
 ENTRY = "made_of"
 """Entry of a result with the digest of each file, by file name.
@@ -236,8 +236,8 @@ class RunFiles:
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
         """Check that a result was made from the present files of these names.
 
-        Files without a digest in the result are not checked. All records are checked if the first
-        one is. The default result is the result in the folder, if there is one.
+        Files without a digest in the result are not checked. If the first record is checked, all
+        records are. The default result is the result in the folder, if there is one.
 
         Raises
         ------

@@ -55,7 +55,7 @@ def table_text(robot: Robot) -> str:
 def proposed(
     logs: Sequence[Path], record: Path, robot: Robot, body: str | None, commands: str | None
 ) -> Proposal:
-    """Propose the columns of logs for the description beside the path of a record.
+    """Propose the columns of logs for the description of a record at a path.
 
     Raises the RecordError of `propose`.
     """

@@ -114,8 +114,8 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
 
     A wrong pose is far from the polynomial through its neighbours, and the neighbours are near the
     polynomial. At a kink of the motion, all poses are far from it. Neighbours can be wrong as well.
-    Of several polynomials through most neighbours, the one that most of them are near to is used
-    (least trimmed squares).
+    Of several polynomials through most neighbours, the one nearest to most of them is used (least
+    trimmed squares).
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ class Rows:
     """Number of each row, counted from 1."""
 
     word: str = "line"
-    """What a row is called: line or message."""
+    """Word for a row: line or message."""
 
     def place(self, row: int) -> str:
         """Return where a row, counted from 0, is found: ``mine.csv line 12``."""

@@ -139,7 +139,7 @@ def predict_poses(
 
 @dataclass(frozen=True)
 class _Basis:
-    """Predicted poses (N, 6), and what their covariance is made of.
+    """Predicted poses (N, 6), and the matrices that determine their covariance.
 
     slopes (N, 6, p + k): derivatives of the poses with respect to the parameters and to the numbers
     of `_known_in_common`. known (p + k, p + k): covariance of these parameters and numbers.
@@ -267,9 +267,10 @@ def predicted_variances(
     """Return the parts (N, 6) of the variance of a prediction by the sources of its uncertainty.
 
     `sources` (p + k, p + k) are the parts of the covariance by their names. The motion due to the
-    sensor's noise is another source, MOTION, and so are common errors of which the record of the
-    identification tells nothing. `number` (of the record, from one on) and `seed` select the noise,
-    as in `predicted_runs`. Raises LoopFailure or TooFewFramesError if nothing can be predicted.
+    sensor's noise is another source, MOTION. Common errors that the record of the identification
+    does not determine are further sources. `number` (of the record, from one on) and `seed` select
+    the noise, as in `predicted_runs`. Raises LoopFailure or TooFewFramesError if nothing can be
+    predicted.
     """
     run, rng = _predicting(side, record, seed, number)
     whole = np.asarray(sum(sources.values()))

@@ -55,7 +55,7 @@ def read_messages(
     Times are seconds, as text with all their digits. Raises the exceptions of rosbags.
     """
     paths = [_steps(name) for name in names]
-    # Times tell nothing, because each message has one.
+    # Every message has a time, so times do not show whether it has an entry.
     telling = [place for place, name in enumerate(names) if not _is_time(name)]
     numbers: list[int] = []
     columns: list[list[Entry]] = [[] for _ in names]

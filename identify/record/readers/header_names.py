@@ -54,7 +54,7 @@ OTHERWISE = (
 
 @dataclass(frozen=True)
 class Place:
-    """Part of a file in which columns stand."""
+    """Part of a file that has columns."""
 
     file: str
     topic: str | None

@@ -52,7 +52,7 @@ def read_mapped(columns: Columns, path: Path, robot: Robot, rate_hz: float) -> T
     Parameters
     ----------
     columns
-        What the columns are called.
+        Names, units and frames of the columns.
     path
         File of the record. Other files are relative to its folder.
     robot

@@ -44,7 +44,7 @@ EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz abo
 
 @dataclass
 class Proposal:
-    """Text of the tables of a description, and what is left to the user."""
+    """Text of the tables of a description, and the keys that are left to the user."""
 
     lines: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
@@ -172,7 +172,7 @@ def _propose_joints(made: Proposal, joints: Joints, rows: Place, robot: Robot) -
 def _propose_rows(
     made: Proposal, table: str, place: Place, rows: Place | None, names: Sequence[str]
 ) -> Stream:
-    """Add where the rows of a table are, if not in those of the poses. Return its columns."""
+    """Add the place and time of a table's rows, if not those of the poses. Return its columns."""
     if place is rows:
         return place.numbers.read(place.part, names)
     entries = {"file": place.file, "topic": place.topic}
