@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from identify.experiment.truth import true_poses
@@ -13,7 +14,9 @@ from identify.files.run_folder import RunFolder
 from identify.record.recording import intended_motion, poses
 from identify.reporting.figures import diagnosis, estimates, fit, overview, paths
 from identify.reporting.figures.style import drawn, moving
+from identify.reporting.goals import unseen
 from identify.reporting.run_data import RunData, read_run
+from identify.reporting.run_result import common_modes
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ def _errors(data: RunData) -> Picture:
         "Distance of both models, and of the single measured poses, from the true robot on the "
         "first validation trajectory."
     )
+    if estimated := unseen(data.result).estimated:
+        text += f" The identified model is drawn without {estimated}."
     return Picture(lambda: fit.error_figure(shown), text)
 
 
@@ -153,13 +158,16 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
 
 def _of_the_sensor(data: RunData) -> dict[str, Picture]:
     measured = poses(data.experiment, "measured")
+    shared = common_modes(data.experiment)
     covariances = data.experiment["measured_covariance"].values
+    covariances = covariances + shared @ np.swapaxes(shared, 1, 2)
     errors = None if data.truth is None else true_poses(data.truth) - measured
     # The reference has no noise, and shows which components move.
     shown = moving(intended_motion(data.experiment))
     text = (
         "Uncertainty of single measured poses: ellipses that contain 95 % of true poses according "
-        "to the cameras, along the path, enlarged as stated above each row."
+        "to the cameras, along the path, enlarged as stated above each row. Errors of the cameras "
+        "that all frames share are in them."
     )
     if errors is not None:
         text += " Dots: the true poses, whose distance from the measured poses is enlarged equally."
@@ -200,8 +208,9 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     if shown is None:
         return {}
     bars = (
-        "RMS of the identified model on each validation trajectory: bars against the truth; "
-        "diamonds as expected from the uncertainty of the parameters; dashes against the "
+        f"RMS of the {unseen(data.result).what} on each validation trajectory: bars against the "
+        "truth; "
+        "diamonds as predicted from the stated uncertainty; dashes against the "
         "measurement, including its noise."
     )
     text = (
@@ -209,8 +218,6 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
         + " Thick: the truth minus the identified model; dotted: its predicted range."
     )
     return {
-        "validation_errors": Picture(
-            lambda: fit.validation_figure(data.result["validation"]), bars
-        ),
+        "validation_errors": Picture(lambda: fit.validation_figure(data.result), bars),
         "fit_validation": Picture(lambda: fit.fit_figure(shown), text),
     }

@@ -77,8 +77,8 @@ def sensor_section(data: RunData) -> Section:
         )
     elif data.cameras_consistent is not None:
         said.append(
-            "Its errors are larger than the noise that it states, or depend on the errors of "
-            "earlier frames."
+            "Its errors are larger than the noise and the common errors that it states, or depend "
+            "on the errors of earlier frames."
         )
     watch = data.result.get("drift_watch")
     if watch and watch.get("noticed_s") is None:

@@ -72,7 +72,7 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
     seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
     covariances = np.concatenate([record["measured_covariance"].values for record, _ in runs])
-    common = np.concatenate([_common_variances(record) for record, _ in runs])
+    common = np.concatenate([np.sum(common_modes(record) ** 2, axis=2) for record, _ in runs])
     why = [text for record, _ in runs if (text := record.attrs.get("lost_frames"))]
     return {
         "frames": len(ok),
@@ -85,12 +85,15 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
     }
 
 
-def _common_variances(record: xr.Dataset) -> Array:
-    """Return the variances (N, 6) of the errors of the sensor that all poses have in common."""
+def common_modes(record: xr.Dataset) -> Array:
+    """Return the shifts (N, 6, k) of the poses by the sensor's errors that all of them share.
+
+    Each shift is by one standard deviation. The k numbers are independent.
+    """
     errors = read_common_errors(record, SENSOR_KINDS)
     if not errors.names:
-        return np.zeros((record.sizes["time"], 6))
-    return np.asarray(np.sum((errors.changes @ errors.factor) ** 2, axis=2))
+        return np.zeros((record.sizes["time"], 6, 0))
+    return errors.modes
 
 
 def _stated(what: str, variances: Array) -> dict[str, list[float]]:

@@ -17,7 +17,7 @@ from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_advice, print_table
 from identify.reporting import paper
 from identify.reporting.goal_causes import advices
-from identify.reporting.goals import check_goals, explanation_goals
+from identify.reporting.goals import check_goals, explanation_goals, unseen
 from identify.reporting.number_format import number, with_deviation
 from identify.reporting.settings import changed_settings
 
@@ -189,7 +189,11 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
     For a run that repeats the experiment of the paper, the paper's table 4 follows.
     """
     rows: list[tuple[str, ...]] = []
-    for n, run in enumerate(result.get("validation", []), start=1):
+    validation = result.get("validation", [])
+    estimated = unseen(result).estimated if validation else ""
+    for n, run in enumerate(validation, start=1):
+        if estimated:
+            rows.append((f"{n}: predicted, true", *_rms(rms_row(run["predicted"]))))
         rows.append((f"{n}: identified, true", *_rms(rms_row(run["true"]))))
         rows.append((f"{n}: identified, measured", *_rms(rms_row(run["measured"]))))
         if "initial_true" in run:
@@ -203,7 +207,8 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
         "Each validation trajectory, RMS",
         ("run: model, against", *AXIS_HEADER),
         tuple(rows),
-        "true: against the true poses of the robot; measured: against its measured poses.",
+        "true: against the true poses of the robot; measured: against its measured poses."
+        + (f" predicted: the identified model with {estimated}." if estimated else ""),
         folded=True,
     )
 

@@ -18,9 +18,11 @@ from identify.estimation.explanation import whiteness
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import rms_row
 from identify.record.recording import poses
+from identify.record.stored_common_errors import Marginal
 from identify.reporting import goals
 from identify.reporting.goals import check_goals, explanation_goals
 from identify.reporting.number_format import number, share
+from identify.reporting.run_result import common_modes
 
 CAMERAS_MISS = 1.5
 """Limit of the mean squared error of the measured poses, relative to the stated covariance.
@@ -52,9 +54,10 @@ class Verdict:
 
 
 def cameras_consistent(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
-    """Tell whether the errors of the cameras are consistent with the noise that the cameras state.
+    """Tell whether the errors of the cameras are consistent with what the cameras state.
 
-    None if the truth is not known, or if the record is too short to judge.
+    They state their noise, and errors that all frames share. None if the truth is not known, or if
+    the record is too short to judge.
     """
     if truth is None:
         return None
@@ -64,6 +67,10 @@ def cameras_consistent(record: xr.Dataset, truth: xr.Dataset | None) -> bool | N
     # Whitened errors have unit covariance if the cameras state their noise correctly.
     white = np.full_like(errors, np.nan)
     white[ok] = np.linalg.solve(roots, errors[ok][..., None])[..., 0]
+    shared = np.linalg.solve(roots, common_modes(record)[ok])
+    if shared.size:
+        whitener = Marginal.of(shared.reshape(-1, shared.shape[2]))
+        white[ok] = whitener.whiten(white[ok].ravel()).reshape(-1, 6)
     try:
         coloured = whiteness(white, ok).suspicious
     except EstimationError:

@@ -19,6 +19,7 @@ from identify.errors import OutputFolderError, RecordError
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
 from identify.record.model_runs import build_model_run, write_model_runs
 from identify.record.recording import read, write
+from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.figures import estimates, fit, paths, style
 from identify.reporting.figures.fit import Fit
@@ -203,7 +204,7 @@ def test_every_axis_has_a_unit_and_every_panel_its_letter(result):
     others = (
         paths.excitation_figure(TIME, NOISE),
         paths.ellipse_figure(poses, covariances, list(range(6)), 1e-6 * NOISE),
-        fit.validation_figure(result["validation"]),
+        fit.validation_figure(result),
         fit.error_figure(Fit(TIME, NOISE, ZERO + NOISE, NOISE, truth=ZERO)),
     )
     for figure in (drawn, *others):
@@ -233,7 +234,7 @@ def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
         looks = [(line.get_linestyle(), line.get_linewidth(), line.get_marker()) for line in named]
         assert len(named) > 1
         assert len(set(looks)) == len(looks), [line.get_label() for line in named]
-    bars = fit.validation_figure(result["validation"]).axes[0].containers
+    bars = fit.validation_figure(result).axes[0].containers
     assert len({(bar.patches[0].get_hatch(), bar.patches[0].get_facecolor()) for bar in bars}) == 3
     assert len(set(style.PALETTE.values())) == len(style.PALETTE), (
         "the page tells them apart by their code"
@@ -444,6 +445,12 @@ def test_cameras_are_acquitted_when_they_err_by_white_noise_of_the_size_that_the
     assert cameras_consistent(record.assign(measured_position=lasting), truth) is False, (
         "an error that lasts"
     )
+    shifted = record.assign(measured_position=record["measured_position"] + 1e-4)
+    assert cameras_consistent(shifted, truth) is False, "an error that is not stated"
+    changes = np.zeros((record.sizes["time"], 6, 1))
+    changes[:, :3] = 1e-4
+    store_common_errors(shifted, CommonErrors(("left.cx_px",), changes, np.eye(1)))
+    assert cameras_consistent(shifted, truth) is True, "stated, and the same in all frames"
     assert cameras_consistent(record.isel(time=slice(20)), truth.isel(time=slice(20))) is None, (
         "too short to say"
     )

@@ -29,7 +29,12 @@ from identify.reporting.figures.style import (
     legend_above,
     moving,
 )
-from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
+from identify.reporting.goals import (
+    UNSEEN_ORIENTATION,
+    UNSEEN_POSITION,
+    check_goals,
+    unseen,
+)
 from identify.reporting.number_format import number
 
 BAND = 2.0
@@ -260,18 +265,19 @@ HATCHES = ("", "////", "xxxx")
 """Patterns of the three bars of a run, which differ without colour."""
 
 
-def validation_figure(validation: list[dict[str, Any]]) -> Figure:
-    """Draw the RMS of the identified model on each validation trajectory.
+def validation_figure(result: dict[str, Any]) -> Figure:
+    """Draw the RMS by which the goals of validation are judged, on each validation trajectory.
 
-    The RMS is computed against truth and measurement. The prediction and the goals are drawn as
-    well.
+    The RMS of the model against the measurement, the prediction and the limits are drawn as well.
     """
+    validation = result["validation"]
+    found = unseen(result)
+    limits = {goal.name: goal.limit for goal in check_goals(result)}
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
-    for axes, first, limit in ((panels[0], 0, VALIDATION_UM), (panels[1], 3, VALIDATION_URAD)):
+    for axes, first, goal in ((panels[0], 0, UNSEEN_POSITION), (panels[1], 3, UNSEEN_ORIENTATION)):
         for i in range(first, first + 3):
-            true = [rms_row(run["true"])[i] for run in validation]
             measured = [rms_row(run["measured"])[i] for run in validation]
             predicted = [predicted_row(run)[i] for run in validation]
             # Three bars per run, side by side: x, y, z or α, β, γ.
@@ -282,7 +288,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             }
             axes.bar(
                 places,
-                true,
+                found.rows[:, i],
                 0.2,
                 hatch=HATCHES[i % 3],
                 label=f"{COMPONENTS[i]}, against the truth",
@@ -307,11 +313,11 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
                 label="predicted" if labelled else None,
             )
         axes.axhline(
-            limit,
+            limits[goal],
             color=GREY,
             linestyle="--",
             linewidth=0.9,
-            label=f"limit {limit:g} {UNITS[first]}",
+            label=f"limit {limits[goal]:.3g} {UNITS[first]}",
         )
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
