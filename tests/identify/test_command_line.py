@@ -30,8 +30,8 @@ def calls(monkeypatch):
     """The stages, replaced by notes of their calls; a run leaves a result, as the real one does."""
     made = []
 
-    def run(scenario, seed, folder, *more):
-        made.append(("run", scenario, seed, folder, *more))
+    def run(setup, folder, *more):
+        made.append(("run", setup, folder, *more))
         save_result(RunFolder(folder).result, warned(make_result()))
 
     noted = {name: lambda *arguments, name=name: made.append((name, *arguments)) for name in STAGES}
@@ -92,14 +92,15 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
     )
     assert capfd.readouterr() == ("", NOTED)
     assert command("run", "--seed", 3) == 0
-    (name, scenario, seed, folder, _, workers), default = calls
-    assert (name, seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
+    (name, setup, folder, _, workers), default = calls
+    assert (name, setup.seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
+    scenario = setup.scenario
     assert (scenario.name, scenario.timing.latency_s, scenario.pose_method) == (
         "quick",
         0.01,
         "planes",
     )
-    assert default[3].as_posix() == "runs/paper-3"
+    assert default[2].as_posix() == "runs/paper-3"
     out, err = capfd.readouterr()
     assert err == NOTED
     missed = [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")]
