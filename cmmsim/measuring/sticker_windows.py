@@ -242,12 +242,13 @@ class StickerWindows:
         moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures[good]]
         near = apply_each(moves, self.places[good, None])[:, 0]
         sizes = np.empty(len(exposures) - 1)
+        # Whole copies, because the kernel is compiled once more for parts of arrays.
         light_sizes(
             self.observer.rig.kernel_cameras,
             near,
             near - moves[:, :3, 3],
-            even.covariances.reshape(2, -1, 2, 2)[:, good],
-            even.lights.reshape(2, -1, 5)[:, good],
+            np.ascontiguousarray(even.covariances.reshape(2, -1, 2, 2)[:, good]),
+            np.ascontiguousarray(even.lights.reshape(2, -1, 5)[:, good]),
             np.searchsorted(self.exposures[good], exposures),
             sizes,
         )

@@ -226,9 +226,10 @@ def observe(
     all solids except the platform. ``noise`` (2, n, 3) are unit normal numbers. ``kept`` (n,) is
     False for stickers that are omitted at random.
     """
-    moving = False
-    apart = False
-    for i in range(6):
+    # Begun as comparisons and not as False, for which `image_stickers` would be compiled once more.
+    moving = poses[1, 0] != poses[2, 0]
+    apart = poses[3, 0] != poses[0, 0]
+    for i in range(1, 6):
         moving = moving or poses[1, i] != poses[2, i]
         apart = apart or poses[3, i] != poses[0, i]
     frame.longest[0] = 0.0
