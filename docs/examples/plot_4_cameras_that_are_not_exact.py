@@ -65,7 +65,8 @@ table.set_index(["known to [px]", "rig"]).round(2)
 #
 # - If the rays of both cameras miss each other, the sensor finds its stickers inconsistent and loses some or all frames.
 #   It then reports no wrong pose.
-# - Otherwise the poses are wrong by more than they claim, and nothing says so.
+# - Otherwise the poses are wrong by more than they claim. Only a warning of the teaching, that the rays of a sticker pass
+#   each other, says that something is wrong.
 
 seen = table[table["error [µm]"].notna()]
 figure, axes = plt.subplots(figsize=(6, 3.4), layout="constrained")
