@@ -201,7 +201,7 @@ def test_averaging_reduces_what_changes_but_not_the_pattern(exposures):
     ],
 )
 @pytest.mark.parametrize("differing", [False, True])
-@pytest.mark.parametrize("count", [25_000, pytest.param(100_000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("count", [10_000, pytest.param(100_000, marks=pytest.mark.thorough)])
 def test_a_mean_drawn_at_once_has_the_mean_and_variance_of_averaged_exposures(
     changes, differing, count
 ):

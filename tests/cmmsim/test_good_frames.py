@@ -42,9 +42,9 @@ def little_noise(deviation):
 @pytest.mark.parametrize(
     ("lens", "renderer", "count"),
     [
-        ("perfect", "analytic", 60),
+        ("perfect", "analytic", 25),
         ("all", "analytic", 6),
-        pytest.param("perfect", "pyrender", 25, marks=pytest.mark.rendering),
+        pytest.param("perfect", "pyrender", 10, marks=pytest.mark.rendering),
     ],
 )
 def test_little_noise_loses_no_frame(lens, renderer, count, deviation):

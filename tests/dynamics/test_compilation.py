@@ -66,6 +66,7 @@ def square(build=_square, content=b"square"):
     return compiled_functions(content, build)["square"](np.array([[3.0, 4.0]]))[0].ravel().tolist()
 
 
+@pytest.mark.slow
 def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
     """All outputs, bit by bit, at a batch of random states with a single row of parameters; those
     of inner loops may round otherwise."""
@@ -397,6 +398,7 @@ def test_kernels_are_kept_in_the_same_files(own_cache):
     assert file.stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.slow
 def test_where_numba_is_switched_off_the_plain_lines_run(loop):
     code = (
         "from tests.dynamics.conftest import Loop; import dynamics; robot = "

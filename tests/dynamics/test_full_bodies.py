@@ -223,6 +223,7 @@ def test_a_passive_joint_of_one_leg_has_its_share_of_the_friction_of_all_legs(fu
         assert all(twist @ part > 0 for part in parts)
 
 
+@pytest.mark.slow
 def test_a_full_body_without_first_moments_and_products_is_a_centred_body(robot, states):
     full = robot.with_full_bodies(["platform", "link3"])
     assert full.layout.full == tuple(name in ("platform", "link3") for name in robot.layout.bodies)

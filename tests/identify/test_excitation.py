@@ -152,6 +152,7 @@ def test_a_run_too_short_to_show_every_parameter_has_no_index():
     assert designed(duration_s=0.7).observability_index > 0.0
 
 
+@pytest.mark.slow
 def test_seed_decides_everything_and_unseen_trajectories_depend_on_nothing_else(robot):
     a, b, c = designed(), designed.__wrapped__(), designed(seed=4)
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)

@@ -351,6 +351,7 @@ def test_poses_survive_their_file_and_a_damaged_one_is_refused(tmp_path, rss6):
     assert "not JSON" in refusal(RecordError, read_static_poses, path, robot)
 
 
+@pytest.mark.slow
 def test_own_poses_are_calibrated_into_a_robot_file_by_the_command(tmp_path, rss6, capsys):
     from identify.files.run_folder import save_result
 

@@ -262,6 +262,7 @@ def test_what_does_not_move_is_not_drawn():
     assert len(paths.path_figure(TIME, poses).axes) == 2
 
 
+@pytest.mark.slow
 def test_times_along_a_path_do_not_touch_even_where_it_crosses_itself():
     turns = np.linspace(0, 2 * np.pi, 200)
     poses = np.zeros((200, 6))

@@ -74,6 +74,7 @@ def test_verdict_and_figure_take_lengths_before_and_after_settling_and_one_beyon
     assert "time [s]" in figure.axes[2].get_xlabel()
 
 
+@pytest.mark.slow
 def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_pid(
     monkeypatch, capfd, tmp_path
 ):
