@@ -38,12 +38,6 @@ ROUNDING = 1e-9
 SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
 """Numbers of a geometry that do not depend on the kind of its legs."""
 
-OLDER = "crank_length"
-"""Number by which a geometry of an older version is recognised.
-
-In these versions the numbers of the legs have other names, and are not compared.
-"""
-
 STATED = (
     "robot",
     ROBOT,
@@ -137,10 +131,7 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
     if ROBOT not in record.attrs:
         return
     recorded = _read(record.attrs[ROBOT])
-    numbers = _numbers(robot)
-    if OLDER in recorded:
-        numbers = {name: numbers[name] for name in SHARED}
-    for name, ours in numbers.items():
+    for name, ours in _numbers(robot).items():
         theirs = recorded.get(name, np.zeros(0))
         known = np.asarray(ours)
         if theirs.shape != known.shape:
