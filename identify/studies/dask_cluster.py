@@ -9,8 +9,8 @@ another machine must therefore be reached by TLS, with the certificates of Dask'
 
 A callback puts finished batches into a queue, which is read with a time limit. The time limit of
 ``distributed.as_completed`` would apply to the whole study, and that function polls ten times a
-second. ``Client.get_versions(check=True)`` compares the packages of Dask, even on the scheduler,
-which computes nothing. Here the packages that compute the rows are compared.
+second. ``Client.get_versions(check=True)`` is not used, because it compares the packages of Dask,
+even on the scheduler, which computes nothing. Here the packages that compute rows are compared.
 """
 
 import asyncio
@@ -177,7 +177,7 @@ def scheduler_lost(error: OSError) -> StudyError:
 
 
 CONNECT_SECONDS = 20
-"""Longest allowed time for the first answer of a scheduler, s. A busy TLS takes seconds."""
+"""Longest allowed time for the first answer of a scheduler, s. TLS takes seconds if it is busy."""
 
 ENCRYPTED = ("tls", "wss")
 """Kinds of address for which both sides present a certificate."""

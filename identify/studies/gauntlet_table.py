@@ -20,7 +20,7 @@ STEM = "gauntlet"
 """Name of the files, before their suffix."""
 
 DOUBLED = 2.0
-"""Misfit from which on a trouble counts in the figures that are compared with goals."""
+"""Smallest misfit with which a case counts in the shares of one and two causes."""
 
 LEVEL = 0.95
 """Probability of the intervals of shares."""
@@ -30,7 +30,7 @@ LEVEL = 0.95
 class Share:
     """Share of cases.
 
-    low, high: its interval, by the binomial distribution (Clopper and Pearson). goal: text.
+    low, high: Clopper and Pearson's interval of the share (binomial). goal: goal as text.
     """
 
     what: str
@@ -43,9 +43,10 @@ class Share:
 
 
 def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return one row for each case of a study's table of kind `gauntlet`, with names for numbers.
+    """Return one row for each case in the table of a study of kind `gauntlet`.
 
-    A row that could not be computed has the verdict "failed".
+    Kinds of trouble and groups of causes have their names, while the table has numbers for them. A
+    row that could not be computed has the verdict "failed".
     """
     own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
     # A row that could not be computed lacks its figures, which are NaN here.
@@ -105,9 +106,9 @@ def _name(names: tuple[str, ...], places: pd.Series) -> list[str]:
 
 
 def shares(cases: pd.DataFrame) -> list[Share]:
-    """Return the shares of right answers, each over the cases that it is about."""
+    """Return the share of right answers for each sort of case, and for the fitted sizes."""
     shown = cases["misfit"] >= DOUBLED
-    # a case that stopped has no misfit, and counts
+    # a case that stopped with an error has no misfit, but counts as well
     shown |= cases["stopped"] == 1
     one, two = (cases[(cases["wrong"] == sort) & shown] for sort in ("one", "two"))
     known = pd.concat([one, two])
@@ -139,11 +140,11 @@ def _share(what: str, values: pd.Series, goal: str) -> Share:
 
 
 def coverage(cases: pd.DataFrame) -> dict[str, float]:
-    """Return the share of intervals that hold where the cause was named, and its deviation.
+    """Return the share of intervals that contain the truth in cases whose cause was named.
 
-    The deviation comes from the spread from case to case, since intervals of a case depend on each
-    other. Cases in which nothing is identified after the remedy are counted apart. Empty if no
-    cause was named.
+    Its standard deviation is that between cases, because the intervals of one case depend on each
+    other. Cases in which nothing is identified after the remedy are counted separately. The result
+    is empty if no cause was named.
     """
     named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
     percent = named["covered_percent"].dropna()
@@ -160,7 +161,10 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
 
 
 def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
-    """Yield each kind of trouble with its cases, how many are right, median misfit and coverage."""
+    """Yield each kind of trouble, its number of cases and of right ones, median misfit, coverage.
+
+    The cases have this one trouble only.
+    """
     single = cases[cases["wrong"].isin(["one", "outside"])]
     for name in TROUBLES:
         own = single[single["trouble_1"] == name]

@@ -18,7 +18,7 @@ GB = 1e9
 
 
 def check_memory(study: Study, shared: Shared, workers: int) -> None:
-    """Raise StudyError if the longest rows, one per worker, need more memory than there is."""
+    """Raise StudyError if the longest rows, one per worker, need more memory than is installed."""
     kind = find_kind(study.kind)
     if kind.memory is None:
         return

@@ -140,7 +140,7 @@ class ProcessExecutor:
         return finished
 
     def _remove_dead(self, worker: "_Worker", suspects: Suspects) -> list[Finished]:
-        """Remove a dead process. Return a row during which two processes died with an error."""
+        """Remove a dead process. A row that has ended two processes is returned as failed."""
         with delay_interrupts():
             self._workers.remove(worker)
             worker.end()

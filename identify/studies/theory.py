@@ -5,7 +5,7 @@ quantities. The mean square is modelled as exp(X beta). The estimate solves X^T 
 0, the score equation of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989,
 section 8.3). The result is the scaling of the mean square itself, for any distribution of the
 figure. A straight line through logarithms would not give this scaling. The covariance is a sandwich
-estimate, so the figure can have another distribution in each row.
+estimate, which holds even if the figure's distribution differs from row to row.
 
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would

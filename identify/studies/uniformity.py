@@ -2,12 +2,13 @@
 
 A figure of a row whose name begins with `PROBABILITY` is the probability that a stated distribution
 gives to values below the truth. If the distribution is right, the figure is uniform between 0 and 1
-over the rows. Each figure is tested by Kolmogorov and Smirnov, with a correction for the number of
-figures. The plot shows the cumulative distribution of each figure minus the uniform one. A single
-hill belongs to estimates that are too large. A hill in the left half and a valley in the right half
-belong to intervals that are too narrow. The band contains the whole curve of a right distribution
-with a probability of 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test for discrete
-uniformity and its applications in goodness-of-fit evaluation and multiple sample comparison").
+over the rows. Each figure has a Kolmogorov-Smirnov test, with a correction for the number of
+figures. The plot shows the cumulative distribution of each figure minus the uniform one. If the
+estimates are too large, the curve is a single hill. If the intervals are too narrow, it has a hill
+in the left half and a valley in the right half. The band contains the whole curve of a right
+distribution with a probability of 95 % (Säilynoja, Bürkner and Vehtari 2022, "Graphical test for
+discrete uniformity and its applications in goodness-of-fit evaluation and multiple sample
+comparison").
 """
 
 from collections.abc import Sequence
@@ -44,8 +45,8 @@ class Uniformity:
     """Test of one figure.
 
     name: figure without `PROBABILITY`. point: values of the factors. values (n,): the figure in the
-    rows of the point that have it, in ascending order. p_value: Kolmogorov and Smirnov's.
-    corrected: p value multiplied by the number of tests (Bonferroni).
+    rows of the point that have it, in ascending order. p_value: p value of Kolmogorov and Smirnov's
+    test. corrected: p value multiplied by the number of tests (Bonferroni).
     """
 
     name: str

@@ -54,7 +54,7 @@ def find_kind(name: str) -> Kind:
 
 
 def _own(name: str, function: Callable[..., Any]) -> Kind:
-    """Make a kind from a function of three arguments, or of two arguments without options."""
+    """Make a kind from a function of (scenario, seed, options), or of (scenario, seed)."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # functions written in C can lack a signature

@@ -6,8 +6,8 @@ distribution gives to values below the truth. If the stated distributions are ri
 probabilities are uniform between 0 and 1 over the rows, whatever the truth (Talts et al. 2018,
 "Validating Bayesian inference algorithms with simulation-based calibration").
 
-A truth is drawn again if a body of it cannot exist, if a parameter is below its bound, or if its
-loop is unstable. The row counts these draws.
+A truth is drawn again if one of its bodies cannot exist, if a parameter is below its bound, or if
+its loop is unstable. The row counts these draws.
 """
 
 from dataclasses import dataclass, replace
@@ -102,7 +102,7 @@ class CalibrationOptions(SensorOptions):
 
 @dataclass(frozen=True)
 class DrawnTruth:
-    """True parameters (p,), and the count of numbers that were drawn again to be possible."""
+    """True parameters (p,), and the number of values drawn again because they were impossible."""
 
     values: Array
     redrawn: int
@@ -131,9 +131,9 @@ def drawn_truth(
 class StableExperiments:
     """Runs of a plant with a drawn truth.
 
-    record: run of the exciting trajectory. unseen: run of another trajectory. unstable: truths that
-    were drawn before and have an unstable loop. redrawn: numbers of all truths that were drawn
-    again to be possible.
+    record: run of the exciting trajectory. unseen: run of another trajectory. unstable: number of
+    truths drawn before, whose loop is unstable. redrawn: number of values, in all truths, that
+    were drawn again because they were impossible.
     """
 
     plant: Plant
@@ -178,7 +178,10 @@ def stable_experiments(
 def random_run(
     setup: Setup, plant: Plant, sensor: PoseSensor, number: int, seed: np.random.SeedSequence
 ) -> Experiment:
-    """Run a plant along a random trajectory, as long as the excitation or a validation."""
+    """Run a plant along a random trajectory.
+
+    Run 0 is as long as the excitation, and each other run as long as a validation.
+    """
     design = setup.design
     scenario = setup.scenario
     duration_s = (scenario.validation if number else scenario.excitation).duration_s
@@ -191,8 +194,8 @@ def random_run(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: CalibrationOptions) -> Row:
     """Compute one row.
 
-    Raises StudyError if plant and model have other parameters, or if no drawn truth has a stable
-    loop. Raises EstimationError, and the exceptions of experiment and sensor.
+    Raises StudyError if plant and model have different parameters, or if no drawn truth has a
+    stable loop. Raises EstimationError, and the exceptions of experiment and sensor.
     """
     setup = row_setup(scenario, stream_seed(seed, EXPERIMENT))
     settings = scenario.identification
@@ -234,11 +237,11 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Calibrati
 
 
 def log_of_moving_robot(record: xr.Dataset, from_s: float, robot: Robot) -> xr.Dataset:
-    """Return what is left of a record if its log begins later, when the robot moves.
+    """Return the part of a record from a time on at which the robot already moves.
 
-    Its clock begins with the log, and it holds no reference. Raises StudyError if errors that all
-    frames have in common are stored frame by frame, which such a record cannot state, or if fewer
-    than two frames are left.
+    Its time starts at 0, and it holds no reference. Raises StudyError if fewer than two frames
+    remain, or if the record stores, frame by frame, errors that all frames have in common. The
+    returned record could not state such errors.
     """
     left = record.isel(time=np.flatnonzero(record["time"].values >= from_s))
     if left.sizes["time"] < 2:
@@ -266,7 +269,7 @@ def log_of_moving_robot(record: xr.Dataset, from_s: float, robot: Robot) -> xr.D
 
 
 def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
-    """Return the probabilities below the truth of the identified quantities, and their coverage."""
+    """Return the probability of values below each identified quantity's truth, and the coverage."""
     truth = plant.parameters_of(result.layout)
     groups = result.groups
     counted = groups.identifiable & groups.several
@@ -288,7 +291,7 @@ def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
 
 
 def moving_frames(poses: Array) -> NDArray[np.int_]:
-    """Return the frames in which the poses (N, 6) have left the first one, or the last frame.
+    """Return the frames whose pose differs from the first of poses (N, 6), or else the last frame.
 
     While joints stick at the start, the platform rests there, and every prediction is exact.
     """
@@ -297,7 +300,7 @@ def moving_frames(poses: Array) -> NDArray[np.int_]:
 
 
 def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> Row:
-    """Return the probabilities below the true coordinates of a frame, and their coverage.
+    """Return the probability of values below each true coordinate of a frame, and the coverage.
 
     The coordinates are those in which the platform moves.
     """
@@ -314,9 +317,9 @@ def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> R
 
 
 def inner(below: Array, probability: float) -> Array:
-    """Return whether truths are in the central intervals of a probability.
+    """Return whether each truth lies in the central interval of a probability.
 
-    below (n,): probabilities below the truths.
+    below (n,): stated probabilities of values below the truths.
     """
     return np.asarray(np.abs(below - 0.5) < probability / 2)
 

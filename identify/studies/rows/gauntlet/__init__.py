@@ -1,5 +1,5 @@
-"""Gauntlet: a laboratory in which something is wrong, which the diagnosis shall find.
+"""Gauntlet: simulated laboratories in which something is wrong that the diagnosis must find.
 
-A trouble is drawn, a record is made with it, the plain model is identified, diagnosed, remedied and
-identified again. The drawn trouble is the truth with which the diagnosis is compared.
+A trouble is drawn, and a record is made with it. The plain model is identified and diagnosed. The
+remedy is applied, and the model is identified again. The diagnosis is compared with the trouble.
 """

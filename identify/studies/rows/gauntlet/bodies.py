@@ -42,7 +42,7 @@ def products_of_inertia(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def centre_of_leg_bodies(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw centres of mass of the bodies of one kind in all legs that are off along one axis."""
+    """Draw one offset, along one axis, of the centres of mass of one kind of body in all legs."""
     layout = lab.robot.layout
     kind = str(rng.choice(sorted({one.name for one in layout.kinds} - {"platform"})))
     size = sign(rng) * log_uniform(rng, 5e-3, 3e-2)
@@ -63,7 +63,7 @@ def centre_of_leg_bodies(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def load(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw a load on the platform that nobody has stated. It lies off the middle."""
+    """Draw an unstated load on the platform, away from the origin of the platform's frame."""
     size = log_uniform(rng, 0.3, 2.0)
     place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
     mass, principal = _known(lab, "platform")
@@ -82,7 +82,7 @@ def load(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def _known(lab: Laboratory, body: str) -> tuple[float, Array]:
-    """Return the mass of a body, and its inertia (3, 3) as a body can have it."""
+    """Return the mass of a body, and its inertia (3, 3), made physically possible."""
     names = lab.robot.layout.names
     mass, *moments = (
         float(lab.parameters[names.index(f"{body}.{name}")])
@@ -92,9 +92,9 @@ def _known(lab: Laboratory, body: str) -> tuple[float, Array]:
 
 
 def possible_moments(moments: list[float]) -> Array:
-    """Return moments (3,) of a body that exists, at least as large as those given.
+    """Return principal moments (3,) that a rigid body can have, at least as large as those given.
 
-    The smaller two are raised until they exceed the largest one together by a tenth.
+    If needed, the smaller two are scaled until their sum exceeds the largest one by a tenth.
     """
     found = np.array(moments)
     order = np.argsort(found)
@@ -104,15 +104,15 @@ def possible_moments(moments: list[float]) -> Array:
 
 
 def _rigid(inertia: Array) -> Array:
-    """Return an inertia (3, 3) that a body can have, near one that perhaps none can have."""
+    """Return a physically possible inertia (3, 3) near a given one that may be impossible."""
     principal, axes = np.linalg.eigh(inertia)
     return np.asarray(axes @ np.diag(possible_moments(principal.tolist())) @ axes.T)
 
 
 def _values(body: str, mass: float, centre: Array, inertia: Array) -> dict[str, float]:
-    """Return the parameters of a body with a centre of mass (3,) and an inertia (3, 3) there.
+    """Return the parameters of a body about the origin of its frame.
 
-    Parameters are about the origin of the body's frame.
+    centre (3,): centre of mass. inertia (3, 3): inertia about the centre of mass.
     """
     about = inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     first = dict(zip(("mcx", "mcy", "mcz"), mass * centre, strict=True))

@@ -1,4 +1,4 @@
-"""One case of the gauntlet: record with a trouble, identification, diagnosis, remedy, and again."""
+"""One case of the gauntlet: a record with trouble, its diagnosis, and the model after remedies."""
 
 import time
 from collections.abc import Sequence
@@ -53,18 +53,18 @@ class Case:
     diagnosis : Diagnosis
         What the diagnosis of the plain model said.
     named : tuple of int
-        For each trouble, the place of the finding that names it, from 1 on, or 0.
+        For each trouble, the place of the finding that names it, from 1 on, or 0 if none does.
     together : tuple of bool
-        For each trouble, True if the finding names it as one that cannot be told from another.
+        For each trouble, True if that finding names it only as not to be told from its own cause.
     size_errors : tuple of float
         Error of each trouble's size in standard deviations, NaN where it was not fitted.
     before, after : tuple of bool
         Whether each interval contains the truth, with the plain model and after the remedy.
     explained : bool
-        True if noise explains what the remedied model leaves of its record.
+        True if noise explains the residuals of the remedied model.
     alone : tuple of float
-        Of two troubles, the misfit of the plain model where only this one is there, over that by
-        noise. NaN where the model cannot be identified.
+        For each of two troubles, the misfit of the plain model with this trouble only, divided by
+        the misfit due to noise. NaN if the model cannot be identified.
     seconds : tuple of float
         Time of the first identification and of the diagnosis, s.
     """
@@ -120,8 +120,8 @@ def drawn(lab: Laboratory, seed: np.random.SeedSequence, wrong: Wrong) -> Drawn:
 def run_case(case: Drawn) -> Case:
     """Identify from the record of a case, diagnose, remedy what was found, and identify again.
 
-    Raises EstimationError, and the exceptions of the model, unless they come after the remedy.
-    Then no interval holds.
+    Raises EstimationError, and the exceptions of the model. An error after the remedy is caught,
+    and the case then has no intervals.
     """
     scenario = case.lab.scenario
     made = case.made
@@ -137,7 +137,7 @@ def run_case(case: Drawn) -> Case:
         for trouble, (place, _) in zip(case.troubles, places, strict=True)
     ]
     named = {place for place, _ in places}
-    # a laboratory cannot know which findings are right, and types what the others say, too
+    # a laboratory cannot know which findings are right, so it also applies those of the others
     remedies += [
         Remedied(typed(one).settings)
         for place, one in enumerate(found.findings, start=1)
@@ -166,8 +166,8 @@ def run_case(case: Drawn) -> Case:
 def laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
     """Return the laboratory of a scenario without trouble. It is made once per process.
 
-    Its robot runs the exciting trajectory once, for its largest torque. trajectory: seed of the
-    trajectory.
+    Its robot runs the exciting trajectory once, which gives the largest torque. trajectory: seed of
+    the trajectory.
 
     Raises ScenarioError if the scale needs a second record.
     """
@@ -189,7 +189,7 @@ def laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
 
 
 def recorded(lab: Laboratory, troubles: Sequence[Trouble], number: int) -> Recorded:
-    """Make the record of a laboratory with troubles, with a seed.
+    """Make the record of a laboratory with troubles, from the seed `number`.
 
     The record names the scenario without troubles, because an experimenter knows no other.
     """
@@ -209,10 +209,10 @@ def recorded(lab: Laboratory, troubles: Sequence[Trouble], number: int) -> Recor
 
 
 def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[bool, ...], bool]:
-    """Return which intervals hold after remedies, as `Case` does, and whether noise explains what
-    is left.
+    """Return `Case.after` and `Case.explained` for remedies.
 
-    remedies: those of the case's troubles, in their order, then those of other findings.
+    remedies: first those of the case's troubles, in the order of the troubles, then those of other
+    findings.
     """
     pairs = zip(case.troubles, remedies, strict=False)
     left = [one for one, by in pairs if not by.mended]
@@ -233,7 +233,7 @@ def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[boo
 
 
 def misfits_alone(case: Drawn) -> tuple[float, ...]:
-    """Return how much each of two troubles alone raises the misfit, see `Case.alone`."""
+    """Return the misfit with each of two troubles alone, see `Case.alone`."""
     if len(case.troubles) < 2:
         return ()
     known = case.lab.scenario.with_overrides({"identification.method": "command_driven"})
@@ -251,9 +251,9 @@ def misfits_alone(case: Drawn) -> tuple[float, ...]:
 
 
 def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:
-    """Return the place of the finding that names a trouble, and whether together with another.
+    """Return the place of the finding that names a trouble, from 1 on, or 0 if none does.
 
-    The place is counted from 1, and 0 if none names it.
+    The second result is True if the trouble only cannot be told from the finding's own cause.
     """
     groups = {one.name: one.group for one in found.candidates}
     for place, finding in enumerate(found.findings, start=1):

@@ -43,10 +43,10 @@ TROUBLES: tuple[str, ...] = (*INSIDE, *OUTSIDE)
 Wrong = Literal["drawn", "none", "one", "two", "outside"]
 
 SHARES: dict[Wrong, float] = {"one": 0.55, "two": 0.2, "none": 0.125, "outside": 0.125}
-"""Probability of each sort of case where it is drawn."""
+"""Probability of each sort of case, if the sort is drawn."""
 
 ALONE = ("stated noise",)
-"""Kinds that are never one of two, because their size shows only where nothing else is wrong."""
+"""Kinds that are never drawn with another. Their size shows only if nothing else is wrong."""
 
 
 def drawn_troubles(
@@ -73,5 +73,5 @@ def drawn_troubles(
 
 
 def _clash(one: Trouble, other: Trouble) -> bool:
-    """Tell whether two troubles set the same key of the plant."""
+    """Return whether two troubles set the same key of the plant."""
     return bool(set(one.settings) & set(other.settings))

@@ -33,13 +33,13 @@ MOST_FRAMES = 4
 """Largest number of frames with gross errors."""
 
 FRAME = re.compile(r"mark frame (\d+)")
-"""Number of a frame that a remedy wants to have marked as lost."""
+"""Pattern of a remedy that marks a frame as lost. It captures the number of the frame."""
 
 
 def late_by(seconds: float, per_second: float = 0.0) -> Callable[[xr.Dataset], xr.Dataset]:
-    """Return the change of a record whose commands act later than it says.
+    """Return a function that makes the stated times of a record's commands later.
 
-    seconds: from the first frame on. per_second: more for each second of the record.
+    seconds: delay at the first frame, s. per_second: growth of the delay in each second.
     """
 
     def later(record: xr.Dataset) -> xr.Dataset:
@@ -94,7 +94,7 @@ def drift(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def scale(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw a ratio of gears or encoders that is off: joints go further than the log says."""
+    """Draw a wrong ratio of gears or encoders: joints move further or less than the log says."""
     size = sign(rng) * log_uniform(rng, 1e-3, 6e-3)
     return Trouble(
         kind="command scale",
@@ -149,8 +149,8 @@ def gross_errors(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
     def remedy(finding: Finding) -> Remedied:
         found = {int(one) for text in finding.remedies for one in FRAME.findall(text)}
-        # the servo has seen these frames, so that a model that closes its own loop without them
-        # is another loop
+        # the servo has used these frames, so a model that closes its own loop without them would
+        # simulate a different loop
         settings = {"identification.method": "command_driven"}
         return Remedied(settings, lambda record: without_frames(record, sorted(found)))
 

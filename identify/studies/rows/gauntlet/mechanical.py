@@ -37,7 +37,7 @@ PLAY = {"rad": (5e-4, 3e-3), "m": (1e-4, 1e-3)}
 
 
 def _moved_by(change: Callable[[RobotGeometry], RobotGeometry]) -> Callable[[Plant], Plant]:
-    """Return the change of a plant whose true geometry is changed."""
+    """Return a function that applies a change of geometry to the true robot of a plant."""
 
     def moved(plant: Plant) -> Plant:
         geometry: RobotGeometry = plant.robot.geometry
@@ -64,7 +64,7 @@ def zero(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def geometric_number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw a number of the geometry that is off, other than a zero."""
+    """Draw an error of one number of the geometry that is not a zero of a joint."""
     geometry = lab.robot.geometry
     places = [
         place
@@ -89,7 +89,7 @@ def geometric_number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def geometric_numbers(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw several numbers of the geometry of one kind that are off, other than zeros."""
+    """Draw errors of several numbers of the geometry, all of one kind and none a joint's zero."""
     geometry = lab.robot.geometry
     kinds: dict[str, list[int]] = {}
     for place, name in enumerate(geometry.number_names):
@@ -127,7 +127,7 @@ def springs(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def static_friction(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw static friction above that of Coulomb."""
+    """Draw static friction that exceeds Coulomb friction."""
     key = _velocity_key(lab, "stribeck_velocity")
     size = log_uniform(rng, 0.03, 0.3)
     return Trouble(
@@ -164,12 +164,15 @@ def _velocity_key(lab: Laboratory, name: str) -> str:
 
 
 def _per_unit(lab: Laboratory) -> float:
-    """Return how much slower joints that slide are than joints that turn, as numbers in SI."""
+    """Return the factor from typical velocities of revolute joints, rad/s, to those of this robot.
+
+    It is 0.1 for prismatic joints, m/s.
+    """
     return 0.1 if lab.robot.layout.prismatic else 1.0
 
 
 def passive_friction(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw friction of one kind in the passive joints at one place of all legs."""
+    """Draw friction of one law in the passive joints at the same place of every leg."""
     name = str(rng.choice(passive_parameters(lab.robot.geometry.legs)))
     size = log_uniform(rng, *PASSIVE[name.partition(".")[2]])
     return Trouble(
@@ -184,8 +187,8 @@ def passive_friction(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def torque_limit(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw drives that cut the largest torques."""
-    # the drives still hold the robot, and lack what the fastest motion needs
+    """Draw a torque limit of the drives that cuts off the largest torques."""
+    # the drives can hold the robot, but cannot reach the torques of the fastest motion
     limit = lab.holding + rng.uniform(0.75, 0.92) * (lab.peak - lab.holding)
     size = 1.0 - limit / lab.peak
     unit = lab.robot.layout.unit("joint1.coulomb").replace(" ", "_")
@@ -196,13 +199,13 @@ def torque_limit(lab: Laboratory, rng: np.random.Generator) -> Trouble:
         unit="1",
         groups=("torque limit of the drives",),
         settings=settings,
-        # the drives say what it is, while the record shows it only in the model's scale
+        # the limit is read from the drives, because a record shows it only up to the model's scale
         remedy=lambda finding: Remedied(settings),
     )
 
 
 def cascade(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Return drives that are a cascade. They are there or not, so that nothing is drawn."""
+    """Return cascade drives. Nothing is drawn, because a cascade has no size."""
     return Trouble(
         kind="cascade drives",
         size=1.0,
@@ -214,7 +217,7 @@ def cascade(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def backlash(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw play between commands and drives, of which the diagnosis has no cause."""
+    """Draw play between commands and drives. The diagnosis has no such cause."""
     unit = lab.robot.layout.joint_unit
     size = log_uniform(rng, *PLAY[unit])
     return Trouble(
@@ -227,7 +230,7 @@ def backlash(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def quantised(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw drives that get their commands in steps, of which the diagnosis has no cause."""
+    """Draw drives that get their commands in steps. The diagnosis has no such cause."""
     unit = lab.robot.layout.joint_unit
     size = log_uniform(rng, *STEP[unit])
 

@@ -1,8 +1,8 @@
-"""Rows of kind `gauntlet`: something is wrong, and the diagnosis shall find it.
+"""Rows of kind `gauntlet`: something is wrong, and the diagnosis must find it.
 
 The trouble of a row is drawn from its seed, see `identify.studies.rows.gauntlet.catalogue`. The
-sensor adds noise of the stated covariance at the home pose. Figures of a row are numbers, so kinds
-of trouble are their places in `TROUBLES`, and groups of causes theirs in `GROUPS`.
+sensor adds noise with the covariance that is stated at the home pose. Figures of a row are numbers:
+a kind of trouble is its place in `TROUBLES`, and a group of causes is its place in `GROUPS`.
 """
 
 import math

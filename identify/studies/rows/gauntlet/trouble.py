@@ -1,4 +1,4 @@
-"""Trouble of a laboratory: what is wrong, what shall be found, and what a laboratory does then."""
+"""Trouble of a laboratory: what is wrong, the right diagnosis, and the laboratory's remedy."""
 
 import re
 import tomllib
@@ -16,7 +16,7 @@ from identify.experiment.plant import Plant
 from identify.scenario import Scenario
 
 SETTING = re.compile(r"--set (?:'([^']+)'|(\S+))")
-"""Setting in a remedy, as it would be typed, with or without quotes."""
+"""Pattern of a setting in a remedy, as it would be typed, with or without quotes."""
 
 
 def unchanged_plant(plant: Plant) -> Plant:
@@ -40,7 +40,7 @@ class Remedied:
     record : callable
         Correction of the record.
     mended : bool
-        True if the trouble is taken away, and the experiment repeated without it.
+        True if the trouble is removed, and the experiment repeated without it.
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -49,15 +49,16 @@ class Remedied:
 
 
 def mend(finding: Finding) -> Remedied:
-    """Take the trouble away, and repeat the experiment."""
+    """Return the remedy that removes the trouble, and repeats the experiment."""
     return Remedied(mended=True)
 
 
 def typed(finding: Finding) -> Remedied:
-    """Set what the remedies of a finding say. Where one line names an alternative, the first.
+    """Return the settings that the remedies of a finding name.
 
-    A later remedy replaces an earlier one. A finding without settings names the trouble only as one
-    that cannot be told from its own cause, and the trouble is mended.
+    If a line names alternatives, the first one counts. A later setting of a key replaces an earlier
+    one. A finding without settings names the trouble only as one that cannot be told from the
+    finding's own cause. In this case the trouble is mended.
     """
     settings: dict[str, Any] = {}
     for remedy in finding.remedies:
@@ -142,11 +143,11 @@ class Laboratory:
 
 
 Draw = Callable[[Laboratory, np.random.Generator], Trouble]
-"""Function that draws a trouble at a workshop's size."""
+"""Function that draws a trouble, with a size as it occurs in workshops."""
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform between those of two bounds."""
+    """Draw a number whose logarithm is uniform between the logarithms of two bounds."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 

@@ -1,9 +1,9 @@
-"""Plants with a trouble that no setting of a scenario makes: late commands, and play of the joints.
+"""Plants with troubles that no setting of a scenario can make: late commands, and play of joints.
 
-With play, a joint follows its command as soon as the command has crossed the play. That is the play
-operator with the output y of an input u and a width w: y is as near to its last value as
-|u - y| <= w / 2 allows. The log holds the commands before the play. The servo is that of eq. 30,
-and sees its effect in the measured poses. The diagnosis has no cause for it.
+With play, a joint follows its command only after the command has crossed the play. This is the play
+operator with input u, output y and width w: y stays as near to its last value as |u - y| <= w / 2
+allows. The log holds the commands before the play. The servo (eq. 30) sees the effect of the play
+in the measured poses. The diagnosis has no cause for play.
 """
 
 from dataclasses import dataclass, replace
@@ -100,7 +100,7 @@ class _ServoWithPlay:
     def follow(
         self, frame: int, time: float, measured: Array, desired: Array, desired_rate: Array
     ) -> Array:
-        """Return what the play leaves of the servo's command at a frame."""
+        """Return the servo's command at a frame as it is after the play."""
         error = desired - measured
         self._integral = self._integral + self._period * error
         rate = (measured - self._last) / self._period

@@ -35,11 +35,12 @@ GROUPS: tuple[str, ...] = (
 """Names of groups of causes. Rows name a group by its place here."""
 
 HOLD = 0.5
-"""Least share of a case's intervals that hold where they count as right.
+"""Smallest share of a case's intervals that must contain the truth for the verdict "right".
 
-The intervals of a case depend on each other. One in twenty right models is off by two deviations in
-the common scale of all parameters, which alone takes a third of the intervals from the truth. With
-a wrong model, nearly none hold, or nothing is identified. The share over all cases is judged apart.
+The intervals of a case depend on each other. In one of twenty right models, the common scale of all
+parameters is off by two standard deviations, so that a third of the intervals miss the truth. With
+a wrong model, nearly all miss it, or nothing is identified. The share over all cases is judged
+separately.
 """
 
 FIRST = 3
@@ -49,11 +50,12 @@ Verdict = Literal["right intervals", "right cause", "failed"]
 
 
 def rightly_named(case: Case) -> bool:
-    """Tell whether the diagnosis is right.
+    """Return whether the diagnosis is right.
 
-    With one trouble, the first finding names it, alone or together with causes that cannot be told
-    from it. Two are both among the first findings, each by one of its own. Nothing is found where
-    nothing is wrong, and "none of these" is the answer to a trouble outside the catalogue.
+    One trouble must be named by the first finding, alone or together with causes that cannot be
+    told from it. Two troubles must be named by two different findings among the first. If nothing
+    is wrong, nothing must be found. A trouble outside the catalogue needs the answer "none of
+    these".
     """
     found = case.diagnosis
     if any(not one.groups for one in case.troubles):
@@ -68,7 +70,7 @@ def rightly_named(case: Case) -> bool:
 def judge(case: Case) -> Verdict:
     """Return the verdict on a case.
 
-    No remedy is known for a trouble outside the catalogue, so that its intervals are not judged.
+    No remedy is known for a trouble outside the catalogue, so its intervals are not judged.
     """
     if not rightly_named(case):
         return "failed"
