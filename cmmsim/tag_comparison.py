@@ -1,4 +1,4 @@
-"""Poses from square tags of others (ArUco, AprilTag), beside those from the stickers of a sensor.
+"""Poses from square tags (ArUco, AprilTag), compared with poses from the stickers of a sensor.
 
 A tag is drawn on each plane of the platform, as large as fits between the plane's stickers, with
 the same cameras, levels, lens and noise as the stickers. OpenCV finds its corners. Tags and
@@ -60,7 +60,7 @@ class Found(NamedTuple):
     """Marks found in one frame.
 
     pixels      (2, n, 2), the left and the right image, px
-    expected    (2, n, 2), where exact images of the marks are, px
+    expected    (2, n, 2), exact places of the marks in the images, px
     pose        (6,), m and rad; NaN if the frame is lost
     covariance  (6, 6), of the pose
     seconds     time from the images to the pose
@@ -82,9 +82,9 @@ class MarkScore:
 
     points               mean number of stickers or corners in a frame
     bias_px, scatter_px  rms error of a point per axis without noise, and rms change by noise
-    position_*_um        the same of the position, rms over axes
-    angle_*_urad         the same of the orientation
-    normalised_error     root of the mean squared error over the stated covariance; 1 if it is right
+    position_*_um        bias and scatter of the position, rms over axes
+    angle_*_urad         bias and scatter of the orientation, rms over axes
+    normalised_error     rms error in units of the stated covariance; 1 if the covariance is right
     lost                 share of frames without a pose
     milliseconds         median time from whole images to the pose
     """
@@ -288,7 +288,7 @@ def _score(marks: str, method: str, poses: Array, found: Sequence[Sequence[Found
         for k in np.flatnonzero(good).tolist()
     ]
     bias = np.concatenate([(pair[0].pixels - pair[0].expected).ravel() for pair in found])
-    # Without noise, the same marks are found, and in the same order.
+    # The scatter comes from the pairs in which the same marks are found, and in the same order.
     alike = [pair for pair in found if np.array_equal(pair[0].expected, pair[1].expected)]
     scatter = np.concatenate(
         [np.zeros(0), *((pair[1].pixels - pair[0].pixels).ravel() for pair in alike)]

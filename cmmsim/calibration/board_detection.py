@@ -65,7 +65,7 @@ PLAIN_NOISE = CameraNoise(
 )
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
 SMALLEST_AREA_PX = 20.0
-# Largest area of a dot over the area of the image.
+# Largest area of a dot, as a share of the area of the image.
 LARGEST_AREA = 0.01
 # OpenCV first searches an image reduced to at most this size, which is faster and has less noise.
 FIND_SIDE_PX = 1600
@@ -268,10 +268,10 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
     """Return the median radius of bright dots, in units of half the distance to a neighbour.
 
     Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. The dot
-    covers the fraction (mean - ground) / (dot - ground) of its cell. These are the mean grey value
-    of the cell, and the grey values of the ground and of the dot. The radius is
-    overestimated if a dot is so blurred that its middle is not uniform: by a quarter at 2.5 px
-    radius and 1 px of blur.
+    covers the fraction (mean - ground) / (dot - ground) of its cell. Here, mean is the mean grey
+    value of the cell, and ground and dot are the grey values of the ground and of the dot. The
+    radius is overestimated if a dot is so blurred that its middle is not uniform: by a quarter at
+    2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0

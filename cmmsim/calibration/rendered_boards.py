@@ -21,8 +21,9 @@ from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, soli
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
-# Constants of the drawn board. Width of the plate beyond its outermost points, in spacings. The
-# outer squares of a board fill this margin, and a bright rim of width RIM surrounds the squares.
+# The first constants describe the drawn board.
+# Width of the plate beyond its outermost points, in spacings. The outer squares of a board fill
+# this margin, and a bright rim of width RIM, in spacings as well, surrounds the squares.
 MARGIN = 1.0
 RIM = 0.35
 # Picture elements along the side of a square. OpenCV rounds the sides of markers to them.
@@ -33,19 +34,19 @@ BRIGHT = 0.86
 DARK = 0.06
 # The normal of the front points against the board's z axis.
 FRONT = frozen([0.0, 0.0, -1.0])
-# Constants of its poses.
+# The next constants limit the poses of the board.
 # Largest angle between the board's normal and the direction to the middle of the baseline, rad.
 LARGEST_TILT = 0.75
-# Range of the board's depth, in units of the depth at which the optical axes come nearest.
+# Range of the board's depth, in units of the depth at which the optical axes are nearest.
 DEPTH_RANGE = (0.8, 1.2)
 # Each image is divided into 3 x 3 cells that the board visits in turn.
 CELLS = 3
-# Smallest cosine between the board's normal and the viewing direction of either camera.
+# Smallest cosine of the angle between the board's normal and the view direction of either camera.
 GRAZING = 0.35
 # Largest number of poses tried for one image, and number of poses that are examined together.
 TRIES = 4000
 AT_ONCE = 200
-# Constants of its images.
+# Samples per pixel and axis in the images of dots.
 SUPERSAMPLING = 12
 
 

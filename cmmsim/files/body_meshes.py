@@ -76,7 +76,7 @@ def closed_mesh(path: Path, scale: float, where: str) -> trimesh.Trimesh:
 
 
 def with_meshes(file: SensorFile, source: str) -> SensorFile:
-    """Check the meshes of a file. Return the file with the planes moved onto them where asked.
+    """Check the meshes of a file, and return the file with planes moved onto the meshes.
 
     The planes of a body are moved if its entry ``drop`` is True. Raises SensorFileError for a mesh
     that cannot be read, is not closed or has a wrong unit, and for a sticker that does not lie on
@@ -139,7 +139,7 @@ def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Arr
             inside = (
                 (u >= -EDGE_TOLERANCE) & (v >= -EDGE_TOLERANCE) & (u + v <= 1.0 + EDGE_TOLERANCE)
             )
-        # the volume is below zero where a line along the normal leaves the body
+        # the volume is negative where a line along the normal leaves the body
         met = inside & (volume < 0.0)
         if met.any():
             heights[k] = height[met][np.abs(height[met]).argmin()]

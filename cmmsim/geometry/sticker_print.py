@@ -13,8 +13,9 @@ opposite sides. The shift of the centre is therefore
     (integral of n n' ds)^-1  integral of n rho ds.
 
 The rim is the image c + M q of the unit circle q, so that n is M^-T q, scaled to length one.
-A thick sticker grows by the side of its rim that the camera sees. A brightness that rises across a
-sticker moves its centre as well, but is fitted with it, see ``light_kernels``.
+The outline of a thick sticker grows by the side of its rim that the camera sees. A brightness that
+rises across a sticker moves its centre as well, but is fitted together with it. See
+``light_kernels``.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ class SeenStickers:
 
     @property
     def rim_growth(self) -> Array:
-        """Growth (k, RIM_POINTS) of the outlines per radius of thickness: the side of the rim."""
+        """Growth (k, RIM_POINTS) of outlines by the side of the rim, per radius of thickness."""
         return np.maximum(self.slopes @ CIRCLE, 0.0)
 
 

@@ -2,7 +2,7 @@
 
 A perfect lens images a plane by a homography. Each sample of a pixel therefore has its exact place
 on the print. The renderer of prints draws nothing else, so `ImageFormation` adds distortion, point
-spread and pixels as it does for stickers. Of an image, only the tiles that show a plate are drawn.
+spread and pixels as it does for stickers. Only the tiles of an image that show a plate are drawn.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plugin of pytest for accuracy benchmarks, like pytest-benchmark for time.
+"""Plugin of pytest for benchmarks of accuracy, as pytest-benchmark is one for benchmarks of time.
 
 The fixture `accuracy` records figures with their limits. The fixtures `cmmsim_sensor`,
 `cmmsim_robot` and `cmmsim_scenario` provide what is simulated. The options `--accuracy-save`,

@@ -31,10 +31,10 @@ CONFIDENCE = 0.95
 
 
 FIRST = 20
-"""Number of values that are drawn first until a limit is decided."""
+"""Number of values that `Accuracy.sample_until` draws first."""
 
 MOST = 640
-"""Default of the largest number of these values."""
+"""Default of the largest number of values that it draws."""
 
 
 class AccuracyError(IdentifyError):
@@ -148,8 +148,8 @@ class Figure:
 def test_name(file: Path, place: str) -> str:
     """Return the name of a test: its file, from the folder of its package on, and its place there.
 
-    Other than a node id, the name does not depend on the folder from which pytest runs, nor on the
-    place of the package. `place` is what a node id has after the file, such as `test_x[1]`.
+    Unlike a node id, the name depends neither on the folder from which pytest runs nor on the
+    folder of the package. `place` is the part of a node id after the file, such as `test_x[1]`.
     """
     parts = [file.name]
     folder = file.parent
@@ -276,11 +276,11 @@ class Accuracy:
         better: Better = "lower",
         most: int = MOST,
     ) -> None:
-        """Record the mean of independent values, of which more are drawn until it is decided.
+        """Record the mean of independent values, which are drawn until the limit is decided.
 
-        The first 20 values are doubled as long as the interval of the mean contains the limit. With
-        `most` values the figure is then undecided, and the test passes. The interval is wider than
-        that of `sample`, because it may be looked at several times (Bonferroni).
+        From 20 on, the number of values is doubled as long as the interval of the mean contains the
+        limit. If it still does with `most` values, the figure is undecided, and the test passes.
+        The interval is wider than that of `sample`, as it is judged several times (Bonferroni).
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class Accuracy:
         Raises
         ------
         AccuracyError
-            `draw` returns another number of values, a value is not a finite number, `most` is not a
+            `draw` returns a wrong number of values, a value is not a finite number, `most` is not a
             whole number of at least 20, or the name was recorded already.
 
         Examples

@@ -11,8 +11,9 @@ covariance of teaching. Errors of the encoders enter the covariance of the pose 
 number that the poses do not determine keeps its nominal value, with the tolerance as its standard
 deviation.
 
-An encoder offset has the same effect as a change of the zero angle, or of the base joint along the
-slide. The calibrated geometry contains these offsets, so that it agrees with the encoders.
+An encoder offset has the same effect as a change of the zero angle of a turning joint, or of the
+place of a sliding joint along its slide. The calibrated geometry contains these offsets, so that it
+agrees with the encoders.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 
 OBSERVABLE = 1 / 3
-"""Largest standard deviation, as a share of the tolerance, of a number that the poses determine.
+"""Largest standard deviation, as a share of the tolerance, with which a number is determined.
 
 The prior then has at most a ninth of the information, and hardly affects an interval.
 """
@@ -262,7 +263,7 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
         nominal=robot,
         deviations=deviations,
         frames=frames,
-        # This removes asymmetry by rounding.
+        # The average removes asymmetry due to rounding.
         joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
         noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),

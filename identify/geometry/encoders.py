@@ -10,10 +10,10 @@ from identify.errors import RecordError
 from identify.geometry.static_poses import StaticPoses
 
 WRONG = 0.2
-"""Largest allowed difference of a joint's motion, as a share of its expected motion."""
+"""Largest allowed difference between read and expected motion, as a share of the expected."""
 
 STILL = 0.1
-"""Smallest reference for the difference of a joint's motion, as a share of the travel."""
+"""Smallest expected motion (rms) to which a difference is related, as a share of the travel."""
 
 UNITS = {
     False: {
@@ -24,7 +24,7 @@ UNITS = {
     },
     True: {"in mm": 1e3, "in um": 1e6, "in inches": 1 / 0.0254, "taken for mm": 1e-3},
 }
-"""Factors of readings in wrong units, by False for turning and True for sliding actuators."""
+"""Factors of readings in wrong units. The key is True for sliding actuators."""
 
 
 def check_encoders(robot: Robot, data: StaticPoses) -> None:
@@ -79,9 +79,9 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
 
 
 def _left(expected: Array, read: Array, still: float) -> float:
-    """Return the norm of the unexplained motion, relative to the expected motion.
+    """Return the norm of the unexplained motion, relative to that of the expected motion.
 
-    The RMS of the expected motion is at least `still`.
+    If the rms of the expected motion is less than `still`, `still` is used in its place.
     """
     least = still * len(expected) ** 0.5
     return float(np.linalg.norm(read - expected) / max(float(np.linalg.norm(expected)), least))

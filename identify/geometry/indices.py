@@ -18,7 +18,7 @@ from identify.arrays import Array
 from identify.geometry.calibration import OBSERVABLE
 
 EXTREMES = 24
-"""Number of best and of worst determined directions that the first ranking uses."""
+"""Number of the best determined, and of the worst determined directions in the first ranking."""
 PROMISING = 16
 """Number of best candidates of the first ranking for which the index is computed exactly."""
 HARDLY = 10.0

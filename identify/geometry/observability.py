@@ -69,7 +69,7 @@ def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot
 
 
 def posterior(information: Array, scale: Array, count: int) -> Array:
-    """Return the covariance (g, g) [m and rad] of the first `count` = g unknowns, the geometry.
+    """Return the covariance (g, g) [m and rad] of the geometry, the first `count` = g unknowns.
 
     information (u, u): information of the poses about unknowns in units of their prior. The prior
     is added here.
@@ -81,7 +81,7 @@ def posterior(information: Array, scale: Array, count: int) -> Array:
 def check_enough(
     robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array
 ) -> None:
-    """Raise EstimationError if the poses have fewer equations than numbers to determine.
+    """Raise EstimationError if the poses give fewer equations than there are numbers to determine.
 
     ``information`` (u, u) is the information of many poses about all unknowns, in units of their
     prior. The message states how many poses are needed and which numbers are hardest to determine.

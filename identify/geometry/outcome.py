@@ -23,7 +23,7 @@ from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
 CURVE = 12
-"""Number of sizes of random pose sets whose expected errors are listed."""
+"""Number of entries in the list of expected errors by the number of random poses."""
 NOISY = 4.0
 """Excess of the noise ratio, in standard deviations, at which a warning is given."""
 
@@ -194,7 +194,10 @@ class GeometryOutcome:
         return {name: self._left_by(one) for name, one in sets.items()}
 
     def _by_count(self, most: int) -> list[dict[str, Any]]:
-        """Return expected errors of validation poses for numbers of random poses up to `most`."""
+        """Return expected errors of validation poses after several numbers of random poses.
+
+        The largest number is `most`, if there are so many candidates.
+        """
         rows = len(self.calibration.nominal.coordinate_names)
         fewest = -(-len(self.calibration.deviations) // rows)
         largest = max(fewest, min(most, len(self.among)))

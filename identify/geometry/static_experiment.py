@@ -30,7 +30,7 @@ from identify.record.stored_common_errors import CommonErrors, kind_of
 from identify.scenario.sections import Geometry
 
 FIRST_POSE_RUN = 2_000_000
-"""Number of the sensor's run at the first pose, larger than the numbers of all motions."""
+"""Number of the sensor's run at the first pose, larger than those of an experiment's motions."""
 
 
 REST = 1e-3
@@ -146,7 +146,7 @@ def measured(
                 scatter += float(np.sum(away * weighted)) / away.shape[1]
                 spare += len(values) - 1
     seen = counts > 0
-    # Single frames show no scatter, and then the variance is not reduced.
+    # If each pose has a single frame, no scatter is known, and the variance is not reduced.
     share = min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
     lost = int(len(poses) * frames - counts.sum())

@@ -15,10 +15,10 @@ UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
 """Standard deviation (6,) of an unknown frame, m and rad. It is larger than realistic errors."""
 
 APART = 10.0
-"""Smallest difference of different poses in some joint, in standard deviations of the encoder."""
+"""Smallest difference in a joint by which two poses are different, in standard deviations."""
 
 ROUNDING = 1e-9
-"""Smallest difference of different poses in some joint, rad or m."""
+"""Lower bound of this difference, rad or m."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class StaticPoses:
     covariances : ndarray, shape (N, 6, 6)
         Covariances of the poses.
     frames : FrameKnowledge
-        Knowledge of the frames of the measurement.
+        Covariances of the errors of the two frames.
     common : ndarray, shape (N, 6, k), optional
         Shift of each pose by further independent errors of variance one that all poses have in
         common, for example of inexact cameras.
@@ -169,7 +169,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
 
 
 def _columns(rows: Any) -> int:
-    """Return the length of the first innermost list of nested lists, or one without such a list."""
+    """Return the length of the first innermost one of nested lists, or 1 if there is none."""
     try:
         return len(rows[0][0])
     except (TypeError, LookupError):

@@ -1,1 +1,1 @@
-"""Figures and tables of the paper, from our own runs beside its numbers."""
+"""Figures and tables of the paper from our own runs, beside the numbers of the paper."""

@@ -1,6 +1,6 @@
-"""Block diagrams of the paper (figures 3, 4, 7 and 9), with the names that the parts have here.
+"""Block diagrams of the paper (figures 3, 4, 7 and 9), with our names of their parts.
 
-A diagram is a list of blocks and a list of arrows between them. The arrows are its CSV file.
+A diagram is a list of blocks and a list of arrows between them. Its CSV file lists the arrows.
 """
 
 from collections.abc import Sequence

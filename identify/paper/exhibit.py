@@ -1,4 +1,4 @@
-"""Exhibit: one figure or table of the paper, as it comes out here."""
+"""Exhibit: one figure or table of the paper, made from our own runs."""
 
 import csv
 import io
@@ -20,20 +20,20 @@ Columns = Mapping[str, Collection[Any]]
 
 @dataclass(frozen=True)
 class Exhibit:
-    """Figure or table of the paper with the same from our own runs.
+    """Figure or table of the paper, and its counterpart from our own runs.
 
     Attributes
     ----------
     name : str
         Name in the paper, such as "Figure 8".
     title : str
-        What it is about.
+        Subject of the figure or table.
     paper, ours : str
-        Sentences on what the paper shows, and on what we show and why it differs.
+        Sentences on what the paper shows, and on what our counterpart shows and why it differs.
     columns : mapping
         Numbers of the exhibit, which become its CSV file.
     draw : callable, optional
-        Function that draws the figure. A table has none, and its columns are drawn.
+        Function that draws the figure. It is None for a table, whose columns are drawn.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Exhibit:
 
     @property
     def table(self) -> Table:
-        """Columns as a table for people."""
+        """Columns as a table of text, with numbers formatted for reading."""
         rows = zip(
             *([_shown(cell) for cell in cells] for cells in self.columns.values()), strict=True
         )

@@ -54,7 +54,7 @@ def page(exhibits: list[Exhibit], runs: PaperRuns) -> str:
 
 
 def differences(runs: PaperRuns) -> Table:
-    """Return the table of what differs between the paper and the two runs, and why."""
+    """Return the table of differences between the paper and our two runs, with their reasons."""
     ours = runs.ours
     settings = runs.settings
     found = ours.result["identification"]

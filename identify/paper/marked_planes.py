@@ -51,8 +51,8 @@ class MarkedPlanes:
     def corners(self, plane: int) -> Array:
         """Return the corners (m, 3), m, of the drawn part of a plane.
 
-        It is the smallest convex part with the stickers of the plane, and with the ends of its
-        intersections with the other planes.
+        It is the convex hull of the stickers, projected onto the plane, and of the ends of the
+        plane's intersections with the other planes.
         """
         own = self.points[self.plane == plane]
         normal = self.normals[plane]
@@ -66,7 +66,7 @@ class MarkedPlanes:
     def edge(self, first: int, second: int) -> Array:
         """Return the ends (2, 3), m, of the intersection of two planes.
 
-        It begins in the origin, and reaches as far as the stickers of both planes.
+        It begins at the origin, and reaches as far as the farthest sticker of both planes.
         """
         along = np.cross(self.normals[first], self.normals[second])
         along /= np.linalg.norm(along)
@@ -105,7 +105,7 @@ def _distances(points: Array, plane: NDArray[np.int_], planes: list[FittedPlane]
 
 
 def draw(marked: MarkedPlanes) -> Figure:
-    """Draw stickers, planes, their intersections, and the frame that follows, in mm."""
+    """Draw stickers, planes, their intersections, and the frame that they define, in mm."""
     figure = Figure(figsize=(WIDTH, 4.2))
     axes: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
     for k, (name, colour) in enumerate(zip(PLANE_NAMES, COLOURS, strict=True)):

@@ -1,4 +1,4 @@
-"""Figures of the paper that a run, a comparison of engines or a view of the scene draws."""
+"""Figures of the paper, drawn from runs, from a comparison of engines and from a scene."""
 
 from functools import partial
 from typing import Any
@@ -50,7 +50,7 @@ def figures(runs: PaperRuns) -> list[Exhibit]:
 
 
 def cameras(cell: Workcell, view: StereoView) -> Exhibit:
-    """Return figure 2: the cameras before the robot."""
+    """Return figure 2: the cameras in front of the robot."""
     found = view.found["platform"]
     columns: dict[str, Any] = {"sticker": found.ids}
     for side, name in enumerate(("left", "right")):
@@ -120,7 +120,7 @@ def _instants(cell: Workcell, times: Array, poses: Array) -> Figure:
 
 
 def engines(runs: PaperRuns) -> Exhibit:
-    """Return figure 8: the model against another engine."""
+    """Return figure 8: the model compared with another physics engine."""
     found = judge(runs.engines)
     units = ("um", "um", "um", "urad", "urad", "urad")
     difference = {

@@ -76,7 +76,7 @@ def identified_parameters(runs: PaperRuns) -> Exhibit:
 
 
 def errors_of_the_fit(runs: PaperRuns) -> Exhibit:
-    """Return table 3: models against the measurement on the exciting trajectory."""
+    """Return table 3: errors of the models against the measurement on the exciting trajectory."""
     columns: dict[str, Any] = {
         "component": AXES,
         "paper before": paper.BEFORE,
@@ -101,7 +101,7 @@ def errors_of_the_fit(runs: PaperRuns) -> Exhibit:
 
 
 def errors_of_validation(runs: PaperRuns) -> Exhibit:
-    """Return table 4: the identified model on trajectories that were not used."""
+    """Return table 4: errors of the identified model on trajectories that were not used for it."""
     rows: list[tuple[Any, ...]] = []
     for number, values in enumerate(paper.VALIDATION, start=1):
         rows.append((number, "paper, against measurement", *values))

@@ -20,7 +20,7 @@ LEG = 3
 def leg_points(robot: Robot) -> Array:
     """Return the points B, T and A (legs, 3, 3) of the legs at home, m.
 
-    B is the axis of the crank, T joins crank and link, and A joins link and platform.
+    B lies on the axis of the crank, T joins crank and link, and A joins link and platform.
     """
     rods = parts_of(robot.geometry).rods(robot, robot.home_pose).reshape(-1, 2, 2, 3)
     return np.stack([rods[:, 0, 0], rods[:, 0, 1], rods[:, 1, 1]], axis=1)

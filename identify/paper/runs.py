@@ -33,5 +33,5 @@ class PaperRuns:
 
     @property
     def both(self) -> Mapping[str, RunData]:
-        """Both runs by the words for them in a table."""
+        """Both runs, by their names in the tables."""
         return {"ours": self.ours, "paper's settings": self.settings}

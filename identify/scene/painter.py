@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cmmsim.geometry.pose import Array
 
 PIECE = 1 / 60
-"""Longest edge of a piece, in sizes of the scene."""
+"""Longest edge of a piece, as a share of the size of the scene."""
 
 LIGHT = np.array([0.35, -0.55, 0.76])
 """Direction from the scene to the light, in the base frame. Its length does not matter."""
@@ -32,7 +32,7 @@ class Viewpoint:
     """Direction and distance from which a scene is seen.
 
     The azimuth is the angle from the x axis about z. The distance is measured from the middle of
-    the scene, in sizes of the scene.
+    the scene, as a multiple of the size of the scene.
     """
 
     azimuth_deg: float = -105.0

@@ -43,7 +43,7 @@ CONFIDENCE = 2.7955
 """Radius of the ball with 95 % of a normal distribution in space, in standard deviations."""
 
 LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
-"""End of the libraries in the page that trimesh writes. Its own viewer follows."""
+"""End of the libraries in the page that trimesh writes. The viewer of trimesh follows them."""
 
 
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:
@@ -101,7 +101,7 @@ def page(motion: Motion, progress: Progress) -> str:
 
 
 def three_js() -> str:
-    """Return the text of three.js with its loader of glTF files and its controls by the mouse.
+    """Return the text of three.js with its loader of glTF files and its mouse controls.
 
     It is extracted from a page that trimesh writes. Raises IdentifyError if the page of the
     installed trimesh has another form.

@@ -71,7 +71,7 @@ class Motion:
         measured = self.poses[MEASURED]
         robot = self.cell.robot
         good = np.asarray(np.isfinite(measured).all(axis=1))
-        # Index of the last measured frame. Frames before the first measured frame use that frame.
+        # Each frame uses the last measured frame, or the first one if none was measured before.
         last = np.maximum.accumulate(np.where(good, np.arange(len(good)), good.argmax()))
         return measured[last] if robot is None else robot.pose(robot.coordinates(measured[last]))
 

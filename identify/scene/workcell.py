@@ -137,7 +137,7 @@ class Workcell:
 
     @cached_property
     def leg_meshes(self) -> Mapping[str, trimesh.Trimesh]:
-        """Meshes of the robot file of bodies of the legs, by the names of their parts.
+        """Meshes that the robot file gives to bodies of the legs, by the names of their parts.
 
         Parts without a mesh are rods.
         """

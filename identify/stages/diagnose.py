@@ -1,4 +1,4 @@
-"""Stage that names the causes for which the identified model misses its record."""
+"""Stage that names causes of the misfit between the identified model and its record."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,13 +19,13 @@ from identify.scenario import load_scenario
 from identify.stages.plan import identified_files
 
 ENTRY = "diagnosis"
-"""Name of the entry of result.json."""
+"""Name of the entry of result.json that holds the diagnosis."""
 
 
 def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     """Diagnose the identified model of a run folder, and store the diagnosis in result.json.
 
-    own: causes of the user's own, which are tried as well. Raises RecordError if the result is
+    own: the user's own causes, which are tried as well. Raises RecordError if the result is
     incomplete or was made of another record, and the errors of `identify.diagnose`.
     """
     run_folder = RunFolder(folder)

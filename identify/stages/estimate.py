@@ -88,8 +88,8 @@ def identify_own(
 ) -> None:
     """Estimate the parameters from a user's own records, and write a run folder without the truth.
 
-    Nothing is written if the records are not suitable for an identification, other than a picture
-    of a log with too many gross errors.
+    Nothing is written if the records are not suitable for an identification. The only exception is
+    a picture of a log with too many gross errors.
 
     Raises the errors of `identify` and of `read_own_records`.
     """
@@ -125,15 +125,15 @@ def identify_own(
 
 
 LITTLE = 0.1
-"""Largest excess of the residual for which no causes are asked, as a share of the noise.
+"""Largest excess of the residual, as a share of the noise, for which no diagnosis is made.
 
-The residual is that under the logged commands. Errors of teaching that count as exact cause as
-much.
+The residual is that of the model under the logged commands. Errors of the teaching can cause such
+an excess if the teaching counts as exact.
 """
 
 
 def _is_missed(result: IdentificationResult) -> bool:
-    """Return whether the residuals exceed the noise by so much that causes are asked for."""
+    """Return whether the model misses its record, so that a diagnosis is made."""
     excess = result.driven_misfit.found - (1 + LITTLE) * result.driven_misfit.expected
     return result.misfit.significant or result.whiteness.suspicious or excess > 0
 
@@ -155,7 +155,7 @@ def _identified_files(
     began = time.perf_counter()
     result = identified(asked, progress)
     diagnosis = None
-    # Causes are known only for records with joint commands.
+    # The diagnosis has causes only for records with joint commands.
     if result.drive.in_loop and _is_missed(result):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnosed(asked, result)

@@ -35,7 +35,7 @@ def designed_runs(
             trajectories.append(trajectory)
             advance()
     duration_s = setup.scenario.excitation.duration_s
-    # These runs replace the validation runs, so the records state their duration as such.
+    # These runs take the place of validation runs, so their duration is set as that of validation.
     scenario = setup.scenario.with_overrides({"validation.duration_s": duration_s})
     setup = replace(setup, scenario=scenario, seed=stream)
     plan = setup.sensor_plan

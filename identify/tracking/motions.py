@@ -168,7 +168,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
         File with the columns t, x, y, z, alpha, beta, gamma, in s, m and rad. The motion is a
         spline of fifth degree through the poses, at rest and without acceleration at both ends.
     robot
-        Robot that shall follow the motion.
+        Robot that follows the motion.
     fastest
         Largest speed of a joint, in rad/s or m/s.
 

@@ -320,7 +320,7 @@ def _drawn(
     timing = plant.runs.timing
     squares = []
     for number, motion in enumerate(task.motions):
-        # All causes have the same noise, so that it does not affect their differences.
+        # The runs for all causes have the same noise, so it does not affect their differences.
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(timing.frames(motion.duration_s)) < timing.dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")
