@@ -94,7 +94,7 @@ class SeenStickers:
 
     @property
     def retro_shifts(self) -> Array:
-        """Directions (k, 2) away from the camera in (u, v), times angle of view over RETRO_ANGLE.
+        """Directions (k, 2) away from the camera in (u, v), scaled by angle of view / RETRO_ANGLE.
 
         The shift of a retro-reflective sticker is proportional to them.
         """

@@ -159,7 +159,7 @@ class AccuracySession:
 
     @property
     def figures(self) -> list[Figure]:
-        """All figures, sorted by the name of their test and in the order of their test."""
+        """All figures, sorted by the names of their tests. Within a test they keep their order."""
         return [figure for test in sorted(self._figures) for figure in self._figures[test]]
 
     @property

@@ -22,7 +22,7 @@ from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile
 
 BOOKKEEPING = ("row", "seed_entropy", "seed_spawn_key", "seconds", "error")
-"""Columns of a study's table that are neither factors nor figures, except `repeat`."""
+"""Columns that are dropped from the table: neither factors nor figures. `repeat` is kept."""
 
 
 @dataclass(frozen=True)

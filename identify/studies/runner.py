@@ -261,7 +261,7 @@ def compute(shared: Shared, cases: list[Case]) -> list[Finished]:
 
     Only this function runs in other processes and on other machines.
     """
-    # The user allowed these modules in the main process only.
+    # The user has allowed these modules in the main process, which other processes do not know.
     allow_plugin(*shared.plugins)
     return [_compute(shared, case) for case in cases]
 

@@ -110,7 +110,7 @@ def _sandwich(design: Array, residuals: Array) -> Array:
     """
     bread = np.linalg.inv(design.T @ design)
     leverage = np.einsum("ni,ij,nj->n", design, bread, design)
-    # A single row at its level has leverage 1, which would cause a division by zero.
+    # A row that alone determines a coefficient has leverage 1, which would divide by zero.
     scores = design * (residuals / np.maximum(1.0 - leverage, 1e-6))[:, None]
     return np.asarray(bread @ (scores.T @ scores) @ bread, dtype=float)
 
@@ -284,7 +284,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Test whether the figure grows along values of the factor, by the smallest step."""
+    """Test by the smallest step whether the figure grows along values of the factor."""
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])

@@ -61,7 +61,7 @@ Every record identifies these parameters, so their spread follows the noise.
 """
 
 UNAWARE = "the same figure, identified without the errors that all frames have in common"
-"""Meaning of the figures `unaware_`. Labels show the names of these figures."""
+"""Meaning of all figures whose names begin with `unaware_`. Labels show their names instead."""
 
 COLUMNS = {
     "frames": Column("1", "frames of the record"),

@@ -74,7 +74,7 @@ class KeysRead:
 
 
 def among(path: str, keys: tuple[str, ...]) -> bool:
-    """Return whether a path is one of the keys, or in a section or table that is one of those."""
+    """Return whether a path is one of the keys, or lies in a section or table that is one."""
     return any(path == key or path.startswith(f"{key.removesuffix('.')}.") for key in keys)
 
 

@@ -1,9 +1,9 @@
 """Rows of kind `tracking`: a control law that knows a model follows validation trajectories.
 
 For comparison, the plant also follows the same motions under `pid`, with the same noise. The model
-is the initial guess, a model identified from a record of this row, or the true model. A model
-between the truth and the initial guess is possible as well, and a model with a relative error in
-all parameters.
+is the initial guess, a model identified from a record of this row, or the true model. The options
+`model_error` and `off` give a model between the truth and the initial guess, and a model with a
+relative error in all parameters.
 """
 
 from dataclasses import replace
