@@ -117,7 +117,7 @@ class NoiseAmplification(ObservabilityIndex):
 
 
 def _eigenvalues(information: Array, columns: Array) -> Array:
-    """Return ascending eigenvalues (N, k) of an information (k, k) plus that of each pose."""
+    """Return the ascending eigenvalues (N, k) of an information (k, k) with each pose added."""
     return np.asarray(np.linalg.eigvalsh(information + columns.swapaxes(1, 2) @ columns))
 
 

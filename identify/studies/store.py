@@ -219,7 +219,7 @@ def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> 
 
 
 def _check_content(folder: Path) -> None:
-    """Refuse a folder that holds other files than those of a study."""
+    """Refuse a folder with files that do not belong to a study."""
     if folder.exists() and not folder.is_dir():
         raise StudyError(f"study folder {folder} is a file; name another with --out")
     if folder.is_dir() and not (folder / STUDY).exists():

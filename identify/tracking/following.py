@@ -62,7 +62,7 @@ class TrackingRun:
 def by_drawing(
     covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False
 ) -> LoopSensor:
-    """Return a measurement that draws poses at random, in place of a sensor.
+    """Return a substitute for a sensor, which draws the measured poses at random.
 
     The poses scatter about the true poses with a covariance (6, 6). Lost frames (N,) have no pose.
     With ``exact`` the poses are the true poses, and their stated covariance is nearly zero, so that

@@ -55,7 +55,7 @@ class Case:
     named : tuple of int
         For each trouble, the place of the finding that names it, from 1 on, or 0 if none does.
     together : tuple of bool
-        For each trouble, True if that finding names it only as not to be told from its own cause.
+        For each trouble, True if that finding only names it as indistinguishable from its cause.
     size_errors : tuple of float
         Error of each trouble's size in standard deviations, NaN where it was not fitted.
     before, after : tuple of bool
@@ -253,7 +253,7 @@ def misfits_alone(case: Drawn) -> tuple[float, ...]:
 def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:
     """Return the place of the finding that names a trouble, from 1 on, or 0 if none does.
 
-    The second result is True if the trouble only cannot be told from the finding's own cause.
+    The second result is True if the finding only names it as indistinguishable from its own cause.
     """
     groups = {one.name: one.group for one in found.candidates}
     for place, finding in enumerate(found.findings, start=1):

@@ -57,8 +57,8 @@ def typed(finding: Finding) -> Remedied:
     """Return the settings that the remedies of a finding name.
 
     If a line names alternatives, the first one counts. A later setting of a key replaces an earlier
-    one. A finding without settings names the trouble only as one that cannot be told from the
-    finding's own cause. In this case the trouble is mended.
+    one. A finding without settings only names the trouble as indistinguishable from its own cause.
+    In this case the trouble is mended.
     """
     settings: dict[str, Any] = {}
     for remedy in finding.remedies:
@@ -89,8 +89,8 @@ class Trouble:
     unit : str
         Unit of the size.
     groups : tuple of str
-        Groups of causes of the diagnosis, each of which is a right answer. Empty: the trouble is
-        outside the catalogue of the diagnosis, and "none of these" is right.
+        Groups of causes of the diagnosis. Each of them is a right answer. If there are none, the
+        trouble is outside the catalogue of the diagnosis, and "none of these" is right.
     cause : str
         Name of the cause of the diagnosis that has this size. Empty if it has no comparable size.
     settings : mapping

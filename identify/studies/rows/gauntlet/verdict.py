@@ -52,10 +52,10 @@ Verdict = Literal["right intervals", "right cause", "failed"]
 def rightly_named(case: Case) -> bool:
     """Return whether the diagnosis is right.
 
-    One trouble must be named by the first finding, alone or together with causes that cannot be
-    told from it. Two troubles must be named by two different findings among the first. If nothing
-    is wrong, nothing must be found. A trouble outside the catalogue needs the answer "none of
-    these".
+    One trouble must be named by the first finding, alone or together with causes that are
+    indistinguishable from it. Two troubles must be named by two different findings among the
+    first. If nothing is wrong, there must be no finding. For a trouble outside the catalogue, the
+    answer must be "none of these".
     """
     found = case.diagnosis
     if any(not one.groups for one in case.troubles):
