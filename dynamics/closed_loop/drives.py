@@ -5,8 +5,8 @@ is, up to the limit,
 
     torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
-`motion_kernels.drive` computes the torque. At the limit, li z - lx theta does not grow further:
-integration stops until the error changes its sign (conditional integration). The laws differ in the
+`motion_kernels.drive` computes the torque. At the limit, li z - lx theta is kept constant while it
+would otherwise grow further (conditional integration). The laws differ in the
 gains that they use, in c, and in lx:
 
     pid            c = 1, lx = 0                  law of the paper (eq. 31)
@@ -25,10 +25,10 @@ kv = ld and ki = lx. In every law, a common factor of lp, li and ld is a factor 
 A law without an integral balances a load by an error: at rest, its command is the coordinate of the
 joint plus the torque over lp.
 
-A drive can receive another command than the one that was sent, by a wrong scale s, a wrong zero z
-of the joint, steps q of a digital interface, and the limits of its range:
+A drive can receive another command than the one that was sent, by a wrong scale s, a wrong zero
+z0 of the joint, steps q of a digital interface, and the limits of its range:
 
-    U = s clip(q round(sent / q), lowest, highest) + z
+    U = s clip(q round(sent / q), lowest, highest) + z0
 """
 
 from collections.abc import Mapping
@@ -121,10 +121,10 @@ class JointLaw(NamedTuple):
 
 
 def gain_columns(by_gains: np.ndarray, own_gains: bool) -> np.ndarray:
-    """Derivatives (..., n, 3) with respect to a joint's gains, as columns of all gains.
+    """Columns of all gains, from derivatives (..., n, 3) with respect to the gains of each joint.
 
-    The columns are (..., n, 3) for shared gains. They are (..., n, 3 n) for gains of each joint,
-    with zeros for those of other joints.
+    The columns are (..., n, 3) if all joints share their gains. Otherwise, they are (..., n, 3 n),
+    with zeros for the gains of other joints.
     """
     if not own_gains:
         return by_gains
@@ -152,7 +152,7 @@ class Drives:
     command_scale : float
         Ratio s of the received to the sent commands.
     joint_zeros : tuple of float
-        Zero error z of each joint, rad or m: its true coordinate minus its reading. The default is
+        Zero error z0 of each joint, rad or m: its true coordinate minus its reading. The default is
         no error.
     command_step : float, optional
         Step q of the received commands, rad or m. The default is no steps.
@@ -278,7 +278,7 @@ class Drives:
 
 
 def _of_joints(what: str, values: tuple[float, ...], joints: int) -> np.ndarray:
-    """Values (n,) of all joints, zero without any. Raises SimulationError for a wrong number."""
+    """Values (n,) of all joints, zero if none are given. Raises SimulationError for others."""
     if values and len(values) != joints:
         raise SimulationError(f"there are {what} of {len(values)} joints, the robot has {joints}")
     return np.array(values) if values else np.zeros(joints)

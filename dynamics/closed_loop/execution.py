@@ -338,7 +338,7 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # A feedforward is the whole command at the start, so the servo's part of it is zero.
+    # A feedforward is the whole command at the start, so that the servo's part is zero.
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
@@ -365,7 +365,7 @@ def _fill(
 
 @lru_cache(maxsize=16)
 def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
-    """Addresses of the kernels that other kernels call by address, by name."""
+    """Addresses, by name, of the kernels that other kernels call by address."""
     memory = empty_memory(sizes)
     arguments = memory.task, memory.now, memory.evaluations[0], memory.tangent, 0
     functions = {kernel: getattr(kernel, "py_func", kernel) for kernel in CALLED}

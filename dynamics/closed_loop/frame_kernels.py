@@ -89,7 +89,7 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
 
 @kernel
 def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -> None:
-    """Record the columns of the parameters, and the columns of the start state if it has any."""
+    """Record the columns of the parameters, and those of the start state if there are any."""
     copy_rows(rows, by_parameters, now.parameters)
     copy_rows(rows[:, now.parameters :], by_start, by_start.shape[1])
 
@@ -246,9 +246,9 @@ def run_frames(
 ) -> tuple[int, int]:
     """Run the frames from `first` up to, but not including, `last`.
 
-    Returns the status and the frame that has it. The memory is passed as arrays of one record each,
-    because passing a record from Python takes 8 us, and a run with a sensor in Python calls this
-    function at every frame.
+    Returns the status, and the frame at which it arose. The memory is passed as arrays of one
+    record each, because passing a record from Python takes 8 us, and a run with a sensor in Python
+    calls this function at every frame.
     """
     task = tasks[0]
     now = nows[0]

@@ -109,7 +109,7 @@ class Memory(NamedTuple):
     and gains. `now` is the state of the integrator. `evaluations` (5,) have all computed values at
     the stages of a step and at its end. Rows of stuck joints are in the order of `now.stuck`.
     `tangent` has derivatives: a row for each unknown, and columns for the parameters, for the start
-    state, and for the length of a step that an event cuts.
+    state or directions, and for the length of a step that an event shortens.
     """
 
     task: Any

@@ -38,7 +38,7 @@ class StartState:
     motor_angle, motor_rate : array_like, shape (n,), optional
         Coordinate of the motors of elastic joints, rad or m, and its rate.
     filtered_rate : array_like, shape (n,), optional
-        Rates of the errors in drives with a filter, after the filter. The default is zero.
+        Rate of the error of each drive after its filter. The default is zero.
     latencies : array_like, shape (k,), optional
         Latencies of `commands`, s. The default is the latency of the timing.
 
@@ -150,7 +150,7 @@ def equilibrium(
     """State of rest at a pose, without friction torques.
 
     The state includes its derivatives with respect to the parameters. If friction has an offset,
-    the integrals hold the robot without it, as friction of a joint at rest can be zero.
+    the integrals hold the robot without this offset, because friction at rest can be zero.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class Solid:
 
     `mass` is in kg, and `centre` (3,) is the centre of mass, m. `inertia` (3, 3) is about the
     centre, kg m^2. `axes` (3, 3) has the axes of the body as columns. `rod` is the length and the
-    radius of the rod that draws the body, m. `shapes` are meshes that draw it.
+    radius of the drawn rod, m. `shapes` are the drawn meshes.
     """
 
     name: str

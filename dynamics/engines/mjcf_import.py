@@ -1,8 +1,8 @@
 """Import of a robot from an MJCF file of any program.
 
 Loops are `connect` or `weld` equalities. Home is the keyframe `home`, else the first keyframe, else
-the model as it is written. The platform may fly freely or hang on a leg. The `numeric` elements
-joint_pid and travel_limit, which the exporter writes, are read back.
+the model as it is written. The platform may have a free joint, or be the child of a leg. The
+`numeric` elements joint_pid and travel_limit, which the exporter writes, are read back.
 """
 
 from pathlib import Path

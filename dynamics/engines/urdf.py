@@ -1,8 +1,8 @@
 """URDF of a robot and YAML of its closures, in the convention that `urdf_import` reads.
 
 URDF can describe only trees. The last body of each leg ends in a frame `end_...` that coincides
-with a frame `seat_...` of the platform, and the YAML lists these pairs of frames. The platform
-floats, or hangs on the first leg by a spherical joint. Actuated joints are written at coordinate
+with a frame `seat_...` of the platform, and the YAML lists these pairs of frames. The platform has
+a floating joint, or a spherical joint on the first leg. Actuated joints are written at coordinate
 zero, and passive joints as they are at home. A universal joint is two revolute joints with a hub
 between them. A spherical joint is written as a revolute joint, and the YAML names it.
 """
@@ -58,7 +58,7 @@ def urdf_texts(
         # URDF has no ball joint: the YAML file names the hinges that stand for one.
         if segment.joint == "ball":
             spherical.append(name)
-        # URDF has no universal joint: two hinges with a body without mass between them are one.
+        # URDF has no universal joint: it becomes two hinges, with a body without mass between them.
         if segment.joint == "universal":
             hub = f"hub_{name}"
             lines.append(_link(hub))
@@ -131,7 +131,7 @@ def _joint(
     coordinate: float = 0.0,
     more: str = "",
 ) -> str:
-    """Joint with a coordinate, rad or m, at home, where parent and child have their `places`.
+    """Joint with a coordinate, rad or m, at home. Parent and child have their `places` at home.
 
     `more` has further elements of the joint.
     """
