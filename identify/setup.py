@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 import cmmsim
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import Robot, load_robot
+from dynamics.checks import shown
 from identify.arrays import Array
 from identify.errors import EstimationError, ScenarioError, WriteError
 from identify.estimation.result import IdentificationResult
@@ -292,7 +293,8 @@ class Setup:
         """
         if not isinstance(result, IdentificationResult):
             raise EstimationError(
-                f"{result!r} is not a result: identify.identify(record) returns one"
+                "unseen_errors needs a result, as identify.identify(record) returns it, got "
+                f"{type(result).__name__}"
             )
         scenario = self.scenario.with_drive(result.drive.law)
         return UnseenErrors(unseen_errors(result.estimate, self.in_file, scenario, self.seed))
@@ -333,7 +335,7 @@ def set_up(
     """
     if not isinstance(scenario, Scenario):
         raise ScenarioError(
-            f"{scenario!r} is not a scenario: identify.load_scenario(name) returns one"
+            f"{shown(scenario)} is not a scenario: identify.load_scenario(name) returns one"
         )
     setup = Setup(scenario, integer_seed(seed), progress=progress).on_this_machine()
     # Errors of the plant or the sensor are raised here, and not at their first use.

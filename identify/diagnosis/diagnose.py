@@ -6,7 +6,6 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-import xarray as xr
 
 from dynamics import Robot
 from identify.arrays import Array
@@ -23,7 +22,13 @@ from identify.diagnosis.ranking import Rows
 from identify.diagnosis.selection import select
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import AT_BOUND
-from identify.estimation.identification import Asked, asked_of, identified, output_error_problem
+from identify.estimation.identification import (
+    Asked,
+    Record,
+    asked_of,
+    identified,
+    output_error_problem,
+)
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
@@ -36,7 +41,7 @@ MOST_STEPS = 30
 
 
 def diagnose(
-    record: xr.Dataset | Sequence[xr.Dataset],
+    record: Record | Sequence[Record],
     result: IdentificationResult | None = None,
     robot: Robot | None = None,
     scenario: Scenario | None = None,
@@ -46,8 +51,8 @@ def diagnose(
 
     Parameters
     ----------
-    record : xarray.Dataset or sequence of them
-        One or several records of the same robot.
+    record : xarray.Dataset or path, or sequence of them
+        One or several records of the same robot, or the paths of their netCDF files.
     result : IdentificationResult, optional
         What was identified from them. The default is to identify it.
     robot : Robot, optional

@@ -7,10 +7,14 @@ has no access to the sensor, the plant's settings or the truth.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import TypeAlias
 
 import xarray as xr
 
 from dynamics import DynamicsError, Robot, load_robot
+from dynamics.checks import shown
 from dynamics.closed_loop.drives import DriveName
 from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
@@ -40,10 +44,13 @@ from identify.record.conditions import SERVO, command_time_warnings, drift_warni
 from identify.record.from_telemetry import reading_notes
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import recorded_scenario, recorded_seed
-from identify.record.recording import is_timed
+from identify.record.recording import is_timed, read
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 from identify.scenario.sections import Identification
+
+Record: TypeAlias = xr.Dataset | str | PathLike[str]
+"""Record, or the path of its netCDF file."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class Asked:
 
 
 def identify(
-    record: xr.Dataset | Sequence[xr.Dataset],
+    record: Record | Sequence[Record],
     robot: Robot | None = None,
     scenario: Scenario | None = None,
     progress: Progress | None = None,
@@ -65,8 +72,9 @@ def identify(
 
     Parameters
     ----------
-    record : xarray.Dataset or sequence of them
-        One or several records of the same robot. The first record has the scale anchor.
+    record : xarray.Dataset or path, or sequence of them
+        One or several records of the same robot, or the paths of their netCDF files. The first
+        record has the scale anchor.
     robot : Robot, optional
         Robot with its known geometry. The default is the robot of the scenario.
     scenario : Scenario, optional
@@ -186,10 +194,11 @@ def identified(asked: Asked, progress: Progress) -> IdentificationResult:
 
 
 def asked_of(
-    record: xr.Dataset | Sequence[xr.Dataset], robot: Robot | None, scenario: Scenario | None
+    record: Record | Sequence[Record], robot: Robot | None, scenario: Scenario | None
 ) -> Asked:
     """Return the checked inputs of `identify`, with its arguments and errors."""
-    records = [record] if isinstance(record, xr.Dataset) else list(record)
+    given = [record] if isinstance(record, (xr.Dataset, str, PathLike)) else list(record)
+    records = [one if isinstance(one, xr.Dataset) else _read(one) for one in given]
     if not records:
         raise EstimationError("no record to identify from")
     scenario = recorded_scenario(records[0]) if scenario is None else scenario
@@ -200,10 +209,18 @@ def asked_of(
     return Asked(records, model_side(robot, scenario), scenario.identification)
 
 
+def _read(record: object) -> xr.Dataset:
+    if not isinstance(record, (str, PathLike)):
+        raise EstimationError(
+            f"{shown(record)} is neither a record (an xarray.Dataset) nor the path of its file"
+        )
+    return read(Path(record))
+
+
 def _check_type(given: object, kind: type, loader: str) -> None:
     if not isinstance(given, kind):
         raise EstimationError(
-            f"{given!r} is not a {kind.__name__}: {loader}(name or path) returns one"
+            f"{shown(given)} is not a {kind.__name__}: {loader}(name or path) returns one"
         )
 
 

@@ -182,9 +182,11 @@ def truth_of(record: xr.Dataset) -> xr.Dataset:
     """
     path = record.attrs.get("path")
     if path is None:
+        file = record.encoding.get("source", "experiment.nc")
         raise RecordError(
-            "the record has no attribute path, which names the file with its truth; "
-            "setup.run(path=...) writes one, and a record of a real robot has none"
+            "the record has no attribute path, which setup.run() adds and which names the file "
+            f'with its truth; xarray.open_dataset("{file}", group="{TRUTH_GROUP}") is the truth of '
+            "a simulated run, and a record of a real robot has none"
         )
     if digest(read(path)) != digest(record):
         raise RecordError(

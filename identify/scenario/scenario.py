@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from dynamics.files import Name
+from dynamics.files import Name, is_file
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.loop_sections import Control, Servo
@@ -298,7 +298,15 @@ def load_scenario(name_or_path: str | Path, **entries: Any) -> Scenario:
     0.01
     """
     found = SCENARIOS.load(name_or_path)
-    return found.with_overrides(dict(_dotted(entries))) if entries else found
+    if not entries:
+        return found
+    changed = found.with_overrides(dict(_dotted(entries)))
+    if "robot" in entries and changed.robot not in _robot_names() and not is_file(changed.robot):
+        raise ScenarioError(
+            f"robot {changed.robot[:200]!r} is neither built in ({', '.join(_robot_names())}) nor "
+            "a file"
+        )
+    return changed
 
 
 def _dotted(entries: Mapping[str, Any], section: str = "") -> Iterator[tuple[str, Any]]:

@@ -199,6 +199,10 @@ def test_scenario_is_that_of_a_file_and_what_is_none_is_named(tmp_path):
         match=r"'nope' is neither built in \(geometry, paper, paper_settings, quick\) nor a file",
     ):
         load_scenario("nope")
+    with pytest.raises(
+        ScenarioError, match=r"robot 'd9' is neither built in \(.*rss6.*\) nor a file"
+    ):
+        load_scenario("quick", robot="d9")
     with pytest.raises(ValueError, match="frozen"):
         load_scenario("paper").timing.latency_s = 1.0
 

@@ -1,5 +1,7 @@
 """The door from Python: what a person types in a notebook, against the rooms behind it."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,9 +9,11 @@ import xarray as xr
 
 import identify
 from identify.errors import EstimationError, RecordError, ScenarioError, StudyError
+from identify.estimation.identification import asked_of
 from identify.experiment.truth import read_truth, true_parameters
 from identify.progress import SilentProgress
 from identify.random_streams import integer_seed
+from identify.record.provenance import digest
 from identify.studies.runner import run_study
 from identify.studies.study_file import Study as StudyFile
 
@@ -50,6 +54,18 @@ def test_a_record_finds_its_own_truth_and_no_other(setup, record, tmp_path):
     nowhere.attrs = {}
     with pytest.raises(RecordError, match=r"has no attribute path"):
         nowhere.truth  # noqa: B018
+    opened = xr.open_dataset(path := record.attrs["path"])
+    with pytest.raises(RecordError, match=rf'open_dataset\("{path}", group="truth"\)'):
+        opened.truth  # noqa: B018
+
+
+def test_identify_reads_a_record_from_the_path_of_its_file(record):
+    for given in (record.attrs["path"], [Path(record.attrs["path"])]):
+        assert digest(asked_of(given, None, None).records[0]) == digest(record)
+    with pytest.raises(EstimationError, match="3 is neither a record"):
+        identify.identify([3])
+    with pytest.raises(RecordError, match=r"there is no file nowhere\.nc"):
+        identify.identify("nowhere.nc")
 
 
 def test_identify_takes_robot_and_scenario_from_the_record(setup, record, result):
@@ -96,7 +112,7 @@ def test_unseen_errors_are_those_of_the_parameters(setup, result):
     poses = identify.unseen_errors(result.estimate, setup.robot, setup.scenario, seed=3)
     np.testing.assert_array_equal(errors.poses, poses)
     assert errors.rms()["beta_urad"] == pytest.approx(1e6 * np.sqrt((poses[..., 4] ** 2).mean()))
-    with pytest.raises(EstimationError, match=r"not a result: identify\.identify"):
+    with pytest.raises(EstimationError, match=r"as identify\.identify.* got ndarray"):
         setup.unseen_errors(result.estimate)
 
 
