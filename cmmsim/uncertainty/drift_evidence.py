@@ -42,6 +42,8 @@ WALK_FRAMES = 1000
 DRIFT_NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)
 # If the named parameters explain this fraction of the evidence for a drift, no more are named.
 ENOUGH_EXPLAINED = 0.97
+# If the named parameters explain less than this fraction, no movement is claimed.
+MOSTLY_MOVED = 0.9
 # Largest number of parameters that a finding names.
 MOST_NAMED = 3
 # A direction is named by the parameters whose components, in units of SIZES, are at least this
@@ -291,6 +293,15 @@ class Finding:
         """Sentence that describes the detected movement; None if none was detected."""
         if self.noticed_s is None:
             return None
+        alarm = f"(the probability of a false alarm is {self.chance:g} per run)"
+        # Movements that explain little are fitted to an error of another kind.
+        if self.explained < MOSTLY_MOVED:
+            return (
+                f"stickers are not where the cameras should see them, noticed after "
+                f"{self.noticed_s:.2f} s, and a movement of {MOST_NAMED} parameters of the cameras "
+                f"explains only {100 * self.explained:.0f} % of it: more likely, the detection of "
+                f"the stickers or their places are wrong {alarm}"
+            )
         moved = ", ".join(map(str, self.movements))
         since, what = (
             ("were wrong from the start", "an error")
@@ -300,7 +311,7 @@ class Finding:
         return (
             f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end of the run, "
             f"{100 * self.explained:.0f} % of what the stickers show is explained by {what} of "
-            f"{moved} (the probability of a false alarm is {self.chance:g} per run)"
+            f"{moved} {alarm}"
         )
 
     def to_dict(self) -> dict[str, Any]:

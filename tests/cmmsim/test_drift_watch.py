@@ -22,7 +22,7 @@ from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.observation import faces_camera
 from cmmsim.measuring.sticker_windows import StickerObservation
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
-from cmmsim.uncertainty.drift_evidence import Filter
+from cmmsim.uncertainty.drift_evidence import Filter, Finding, Movement
 from cmmsim.uncertainty.drift_watch import DriftWatch
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from tests.cmmsim.sensors import exact
@@ -328,3 +328,11 @@ def test_images_give_no_alarm_for_what_is_no_drift(changes):
             sensor.measure(sensor.home + share * (pose - sensor.home), pose_rate=share * rate)
         assert watch.finding.frames == 60
         assert watch.finding.noticed_s is None
+
+
+def test_a_movement_that_explains_little_is_not_claimed():
+    moved = Movement("left.k3", 0.05, 0.01)
+    finding = Finding(1.0, 30, 20.0, 9.0, 1e-3, 600, 600, (moved,), 0.19, False, ())
+    assert "moved" not in finding.warning
+    assert "explains only 19 % of it" in finding.warning
+    assert replace(finding, explained=0.95).warning.startswith("the cameras moved: noticed after")
