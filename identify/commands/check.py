@@ -1,7 +1,6 @@
 """Command ``check``: checks a robot, or the telemetry of a run, before anything is identified."""
 
 from pathlib import Path
-from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -129,8 +128,6 @@ def _tell(
     findings: "list[Finding]", title: str, about: str, json: Path | None, quiet: bool
 ) -> None:
     """Output findings, and raise VerificationError if any of them fails."""
-    from identify.verification.robot_check import LONGEST
-
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (
@@ -148,8 +145,7 @@ def _tell(
     }
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        lines = [f"{finding.check}: {finding.text}" for finding in failed]
-        said = "; ".join(shorten(line, LONGEST, placeholder=" …") for line in lines)
+        said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
         raise VerificationError(
             f"{len(failed)} of {len(findings)} findings about {about} fail: {said}"
         )

@@ -6,17 +6,20 @@ frame, without dry friction.
 """
 
 from collections.abc import Callable, Iterator
-from textwrap import shorten
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cmmsim.errors import CmmError
 from cmmsim.files import SensorFile
 from dynamics import Robot, built_in_robots, load_robot, workspace
+from dynamics.bodies import parts_of
+from dynamics.errors import RobotFileError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
 from identify.experiment.law_in_loop import feedback
+from identify.experiment.leg_bodies import robot_meshes
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, OWN_SENSOR, platform_distances
 from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
@@ -28,8 +31,8 @@ from identify.verification.loop_check import CheckSettings, check_gains, check_l
 SAMPLES = 2000
 """Number of random joint coordinates over the travel."""
 
-LONGEST = 160
-"""Largest number of characters of a finding in a message."""
+MOST_MESH_RATIO = 20.0
+"""Largest ratio between the length of a mesh and the reach of its body, in either direction."""
 
 NEGLIGIBLE_CHANGE = 1e-9
 """Largest relative change of an acceleration that counts as zero."""
@@ -48,6 +51,7 @@ def check_robot(
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
         lambda: _centres(robot, parameters),
+        lambda: check_meshes(robot),
         lambda: check_loop(robot, parameters, around.settings),
         lambda: check_steps(robot, parameters, around),
         lambda: check_gains(robot, parameters, around),
@@ -99,11 +103,10 @@ def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
     failed = [finding for finding in findings if not finding.ok]
     if not failed:
         return None
-    more = f", and of {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
-    said = shorten(failed[0].text, LONGEST, placeholder=" …")
+    more = f"; further faults: {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
     return (
-        f"cmmsim check finds fault with {robot.name}: of {failed[0].check} ({said}){more}; the run "
-        f"begins nevertheless; for all findings: cmmsim check {file}"
+        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].text}{more}; the run "
+        f"begins nevertheless; cmmsim check {file} shows all findings"
     )
 
 
@@ -251,6 +254,34 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
     )
     share = float(off[worst] / reach[worst])
     yield Finding("centres of mass", share <= 1.0, share, 1.0, "1", leg, text)
+
+
+def check_meshes(robot: Robot) -> Iterator[Finding]:
+    """Check that the meshes of the legs have about the sizes of their bodies."""
+    name = "body meshes"
+    if not robot.geometry.meshes:
+        return
+    try:
+        meshes = robot_meshes(robot)
+    except (CmmError, RobotFileError) as error:
+        yield Finding(name, False, 0.0, None, "1", None, str(error))
+        return
+    parts = parts_of(robot.geometry).all
+    legs = {part.name: part.leg for part in parts}
+    reaches = {part.name: float(robot.geometry.body_reaches[part.body]) for part in parts}
+    sizes = {body: float(np.max(mesh.extents)) for body, mesh in meshes.items()}
+    ratios = {body: sizes[body] / reaches[body] for body in meshes}
+    worst = max(ratios, key=lambda body: max(ratios[body], 1 / ratios[body]))
+    ratio = max(ratios[worst], 1 / ratios[worst])
+    text = (
+        f"the mesh of {worst} is {sizes[worst]:.3g} m long, and its body reaches "
+        f"{reaches[worst]:.3g} m from its reference point"
+    )
+    if ratio > MOST_MESH_RATIO:
+        text += ": give the length of one unit of the mesh by scale, 0.001 for mm"
+    yield Finding(
+        name, ratio <= MOST_MESH_RATIO, ratio, MOST_MESH_RATIO, "1", legs[worst] + 1, text
+    )
 
 
 def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:

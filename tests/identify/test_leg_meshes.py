@@ -20,6 +20,7 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.experiment.leg_bodies import meshed_parts, robot_meshes, robot_transforms
 from identify.scene import stereo_view, workcell
+from identify.verification.robot_check import check_meshes
 from tests.identify.commands import command
 from tests.identify.synthetic import rss6
 
@@ -115,6 +116,23 @@ def test_a_mesh_that_cannot_be_used_is_refused_in_one_line(tmp_path, body, mesh,
     with pytest.raises((RobotFileError, cmmsim.SensorFileError), match=message) as error:
         robot_meshes(with_meshes(tmp_path, STATED.format(body=body, pose=POSE)))
     assert "\n" not in str(error.value)
+
+
+def test_the_check_of_a_robot_finds_a_mesh_in_another_unit_and_one_that_cannot_be_used(
+    robot, tmp_path
+):
+    (right,) = check_meshes(robot)
+    assert right.ok
+    text = STATED.format(body="crank", pose=POSE)
+    trimesh.creation.box((0.01, 0.01, 0.1)).export(tmp_path / "crank.stl")
+    (small,) = check_meshes(with_meshes(tmp_path, text))
+    assert (small.ok, small.leg) == (False, 1)
+    assert "the mesh of crank1 is 0.0001 m long" in small.text
+    trimesh.creation.box((10.0, 10.0, 300.0)).export(tmp_path / "crank.stl")
+    (large,) = check_meshes(with_meshes(tmp_path, text.replace("0.001", "1.0")))
+    assert not large.ok
+    assert "of crank1 is 300 m long, at most 10 m" in large.text
+    assert list(check_meshes(rss6())) == []
 
 
 def test_a_mesh_of_a_urdf_that_cannot_be_drawn_is_left_out_and_said(tmp_path, capfd, read_here):

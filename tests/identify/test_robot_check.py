@@ -128,7 +128,7 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd, monkeypatch):
     assert found["drives by design"]["ok"]
     assert "joint_pid = { lp = " in found["drives by design"]["text"]
     warned = run_warning(Setup(load_scenario("quick", robot=str(tmp_path / "mine.toml"))))
-    assert warned.startswith("cmmsim check finds fault with ups6: of ")
+    assert warned.startswith("the check of ups6 fails: ")
     assert "gain margin" in warned
     assert "\n" not in warned
     assert run_warning(Setup(load_scenario("quick", robot="ups6"))) is None
