@@ -28,6 +28,9 @@ BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
 # Largest ratio without a warning between two baselines, that of the calibration and that of the
 # sensor file. The longer one is divided by the shorter one.
 LARGEST_BASELINE_RATIO = 1.5
+# Ratio of these baselines from which on the board file certainly has another unit: mm give about
+# 1000, and cm about 100.
+OTHER_UNIT_RATIO = 30.0
 
 
 @dataclass(frozen=True)
@@ -212,14 +215,29 @@ class SensorTemplate:
 
     def disagreements(self, calibration: Calibration) -> list[str]:
         """Return a warning if the calibrated baseline differs much from that of the sensor file."""
-        baseline = float(np.linalg.norm(calibration.rig.right_from_left[:3, 3]))
-        if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_BASELINE_RATIO:
+        baseline, ratio = self._compared(calibration)
+        if ratio <= LARGEST_BASELINE_RATIO:
             return []
         return [
             f"the calibrated cameras stand {baseline:.4g} m apart, but {self.baseline:.4g} m in "
             f"the sensor file {self.name}: are the lengths of the board file in m, and does the "
             "sensor file describe these cameras?"
         ]
+
+    def wrong_unit(self, calibration: Calibration) -> str:
+        """Return why the lengths of the board are certainly not in m; empty if they can be."""
+        baseline, ratio = self._compared(calibration)
+        if ratio <= OTHER_UNIT_RATIO:
+            return ""
+        return (
+            f"cameras {baseline:.4g} m apart, and {self.baseline:.4g} m in the sensor file "
+            f"{self.name}, cannot be the same: give the lengths of the board file in m"
+        )
+
+    def _compared(self, calibration: Calibration) -> tuple[float, float]:
+        """Return the calibrated baseline, m, and the longer of both baselines over the shorter."""
+        baseline = float(np.linalg.norm(calibration.rig.right_from_left[:3, 3]))
+        return baseline, max(baseline / self.baseline, self.baseline / baseline)
 
 
 def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:

@@ -126,7 +126,9 @@ def calibrate(
     deviations, covariance, residuals, and the images used and rejected. If the points of a picture
     have correlated errors, the covariance is enlarged, with a warning. It also writes rig.toml, the
     camera tables of a sensor file; residuals.png, coverage.png and distortion.png; and with
-    --sensor also sensor.toml, that whole sensor file with the calibrated cameras.
+    --sensor also sensor.toml, that whole sensor file with the calibrated cameras. Cameras that
+    cannot be those of a sensor, as with exchanged folders or a board in mm, end with an error and
+    without sensor.toml; the other files show why.
 
     \b
     Examples:
@@ -142,6 +144,7 @@ def calibrate(
         --board pictures/board.toml --out mine
     """
     from cmmsim.calibration import CalibrationOptions, as_dict, read_board, sensor_template
+    from cmmsim.errors import CalibrationError
 
     folder = context.with_resource(new_run_folder(out)).path
     progress = terminal_progress(quiet)
@@ -177,9 +180,9 @@ def calibrate(
     found, apart = _adjusted(described, pairs, size, options, halves or 0, seed or 0, progress)
     content = as_dict(found) | ({} if apart is None else {"halves": apart.to_dict()})
     refused = _write(folder, found, template, content)
-    print_warnings(
-        [*found.warnings, *(template.disagreements(found) if template else []), *refused]
-    )
+    print_warnings([*found.warnings, *(template.disagreements(found) if template else [])])
+    if refused:
+        raise CalibrationError(f"sensor.toml is not written: {refused}")
     tell(content, json, quiet, lambda: _print_summary(found, apart, folder))
 
 
@@ -223,11 +226,11 @@ def _adjusted(
 
 def _write(
     folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]
-) -> list[str]:
+) -> str:
     """Write all files of a calibration.
 
     All contents are made before the first file is written. If no sensor can have these cameras,
-    returns a warning for the user.
+    there is no sensor.toml, and the reason is returned.
     """
     from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
@@ -238,6 +241,7 @@ def _write(
     )
 
     sensor = None if template is None else template.filled(found)
+    unit = "" if template is None else template.wrong_unit(found)
     figures = {
         "residuals": residual_figure,
         "coverage": coverage_figure,
@@ -245,19 +249,17 @@ def _write(
     }
     drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
     files = {"rig.toml": rig_tables(found), "calibration.json": content, **drawn}
-    if sensor is not None:
+    if sensor is not None and not unit:
         try:
             # sensor.toml is checked in its folder, because its base file can be a path relative to
             # this folder.
             save_files(folder, {"sensor.toml": sensor, **files}, require_sensor)
         except SensorFileError as error:
             save_files(folder, files)
-            return [
-                f"sensor.toml is not written, because no sensor can have these cameras: {error}"
-            ]
+            return f"no sensor can have these cameras: {error}"
     else:
         save_files(folder, files)
-    return []
+    return unit
 
 
 def _render(

@@ -86,7 +86,7 @@ def teach(
     Examples:
       cmmsim teach photos/left photos/right --sensor mine.toml --out teaching
       cmmsim teach left.avi right.avi --sensor mine.toml --colour green
-    Render images to try it with, and the true poses into poses.csv:
+    Render images to try it with, and the true poses into true_poses.csv:
       cmmsim teach --render 24 --sensor mine.toml --out photos
     """
     from cmmsim.from_photographs import photographs_for, sensor_for
@@ -129,7 +129,7 @@ def _render(folder: Path, sensor: str, count: int, seed: int, progress: Progress
     np.savetxt(text, poses, delimiter=",", header=header, comments="")
     with progress.stage("render", count) as advance, atomic_contents(folder) as made:
         save_pairs(made, frames, advance)
-        write_text(made / "poses.csv", text.getvalue())
+        write_text(made / "true_poses.csv", text.getvalue())
 
 
 def save_pairs(folder: Path, frames: "Iterable[StereoFrame]", advance: Advance) -> None:

@@ -153,7 +153,7 @@ def test_the_commands_of_the_tutorial_measure_the_poses_that_they_rendered(tmp_p
     monkeypatch.chdir(tmp_path)
     for line in lines:
         assert command(*shlex.split(line)[1:], "--quiet") == 0
-    true = np.loadtxt("photos/poses.csv", delimiter=",", skiprows=1)
+    true = np.loadtxt("photos/true_poses.csv", delimiter=",", skiprows=1)
     with Path("poses.csv").open() as file:
         rows = list(csv.DictReader(file))
     names = columns_of(load_robot("rss6"))["measured"].names
