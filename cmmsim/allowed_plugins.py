@@ -97,12 +97,22 @@ def import_plugin(option: str, name: str) -> Any:
             f"cmmsim.allow_plugin({module!r}) in Python"
         )
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = importlib.import_module(module)
     except (Exception, SystemExit) as error:
+        # A module that exists can itself import another one that is missing.
+        missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(
+            f"{error.name}."
+        )
+        advice = "; the folder of the module must be on PYTHONPATH" if missing else ""
+        raise CmmError(f"{option} {name!r} cannot be imported: {error}{advice}") from error
+    if not hasattr(found, attribute):
+        names = ", ".join(one for one in vars(found) if not one.startswith("_"))
+        place = getattr(found, "__file__", None)
         raise CmmError(
-            f"{option} {name!r} cannot be imported: {error}; the folder of the module must be on "
-            "PYTHONPATH"
-        ) from error
+            f"{option} {name!r}: the module {place or module} has no {attribute}; it has "
+            f"{names[:200] or 'nothing'}"
+        )
+    return getattr(found, attribute)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     --------
     >>> import dynamics
     >>> dynamics.load_robot("rss6")
-    Robot('rss6', 64 parameters, sets: guess, truth)
+    Robot('rss6', 64 parameters and 3 gains, sets: guess, truth)
     """
     return Robot(read_robot_file(name_or_path))
 

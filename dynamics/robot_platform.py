@@ -49,9 +49,10 @@ class RobotPlatform:
         self.nominal_parameters = description.parameter_sets["guess"].dynamic
 
     def __repr__(self) -> str:
-        count = len(self.parameter_names)
+        dynamic = len(self.parameter_names)
+        gains = len(self.layout.names) - dynamic
         sets = ", ".join(self.parameter_sets)
-        return f"Robot({self.name!r}, {count} parameters, sets: {sets})"
+        return f"Robot({self.name!r}, {dynamic} parameters and {gains} gains, sets: {sets})"
 
     @property
     def home_pose(self) -> np.ndarray:

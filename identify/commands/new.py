@@ -274,12 +274,16 @@ def _copy(kind: str, like: str, file: Path) -> str:
 def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
     """Return the text of a robot like a built-in one with other lengths, m."""
     from dynamics import load_robot
-    from dynamics.robot_lengths import robot_of_lengths
+    from dynamics.robot_lengths import lengths_of, robot_of_lengths
     from dynamics.robot_text import robot_text
     from identify.loop_parameters import loop_settings
     from identify.scenario import load_scenario
 
     chosen = load_robot(_known("robot", like))
+    valid = [_option(name) for name in lengths_of(chosen.geometry)]
+    for name in map(_option, lengths):
+        if name not in valid:
+            raise OutputFolderError(f"{like} has no length {name}; valid: {', '.join(valid)}")
     given = load_scenario("paper")
     slower = given.timing.model_copy(update={"frame_rate_hz": 29.0, "latency_s": 1 / 29})
     loops = [
@@ -288,6 +292,11 @@ def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
     ]
     made, comments = robot_of_lengths(_toml(file).stem, chosen, lengths, loops)
     return _with_schema(_schema("robot"), robot_text(made, comments))
+
+
+def _option(length: str) -> str:
+    """Return the option that sets a length."""
+    return f"--{length.replace('_', '-')}"
 
 
 def _of_a_workshop(text: str) -> str:

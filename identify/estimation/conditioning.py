@@ -63,7 +63,9 @@ class Conditioning:
             f"the record is poorly conditioned: of {self.directions} independent combinations of "
             f"parameters and gains, {self.unshown} are known from the initial guess rather than "
             f"from the poses (the condition number of the poses' information is {number}); move "
-            "the robot faster, farther or longer",
+            "the robot faster (excitation.fundamental_hz), farther "
+            "(excitation.position_amplitude_m, orientation_amplitude_rad) or longer "
+            "(excitation.duration_s)",
         )
 
 

@@ -66,7 +66,9 @@ def test_a_new_robot_of_other_lengths_is_written_and_a_length_it_does_not_have_i
     )
     assert schema_named_in("mine.toml") == robot_schema()
     assert command("new", "robot", "other.toml", "--like", "rrr3", "--leg", 0.3) == NOT_DONE
-    assert "unknown length of rrr3 `leg`; valid: base_radius" in one_line(capfd.readouterr().err)
+    assert "rrr3 has no length --leg; valid: --base-radius, --platform-radius" in one_line(
+        capfd.readouterr().err
+    )
     assert not Path("other.toml").exists()
 
 
