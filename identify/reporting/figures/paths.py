@@ -276,7 +276,7 @@ def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
     unit.
     """
     look: dict[str, Any] = {
-        "frameon": False,
+        "frameon": True,
         "sep": 3,
         "borderpad": 0.3,
         "color": BLUE,
