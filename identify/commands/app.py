@@ -158,8 +158,10 @@ STUDIES = "Studies"
 PICTURES = "What it looks like"
 SETTING_UP = "Setting up"
 
-_add(EXPERIMENT, run, paper)
-_add(STAGES, excite, record, identify, validate, report)
+_add(EXPERIMENT, run, cls=Judging)
+_add(EXPERIMENT, paper)
+_add(STAGES, excite, record, identify, validate)
+_add(STAGES, report, cls=Judging)
 _add(RECORDS, diagnose, budget, estimators, variation, track)
 _add(PICTURES, replay, show)
 _add(ROBOTS, check, cls=Judging)

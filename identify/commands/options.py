@@ -140,6 +140,10 @@ Quiet = Annotated[
     bool,
     typer.Option("--quiet", help="Print no progress bars and no tables, only warnings."),
 ]
+Strict = Annotated[
+    bool,
+    typer.Option("--strict", help="End with exit status 4 if a goal is missed."),
+]
 
 
 def _allow(modules: list[str] | None) -> None:

@@ -7,6 +7,7 @@ import typer
 
 from identify.commands.comparisons import compare_excitation
 from identify.commands.options import (
+    STANDARD_OUTPUT,
     EstimatorSettings,
     JsonFile,
     NewFolder,
@@ -17,11 +18,13 @@ from identify.commands.options import (
     ScenarioArgument,
     Seed,
     Settings,
+    Strict,
     Workers,
     chosen_scenario,
     parse_settings,
     tell,
 )
+from identify.errors import VerificationError
 from identify.files.lock import lock_folder
 from identify.files.run_folder import (
     BEGUN,
@@ -45,6 +48,7 @@ def run(
     robot: RobotOption = None,
     settings: Settings = None,
     workers: Workers = None,
+    strict: Strict = False,
     json: JsonFile = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
@@ -53,7 +57,8 @@ def run(
 
     Chooses an exciting trajectory, moves the simulated robot along it with images in the loop,
     identifies the robot from the record, validates the model on further trajectories, and writes
-    the report. A missed goal is reported, and does not change the exit status.
+    the report. A missed goal is reported, also with --quiet, and changes the exit status only with
+    --strict.
 
     Reads a scenario, and the robot and sensor that it names.
 
@@ -88,6 +93,7 @@ def run(
     _pipeline().run(setup, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_goals(result, folder.report))
+    _tell_missed(result, quiet or str(json) == STANDARD_OUTPUT, strict)
 
 
 def warm_up(
@@ -297,10 +303,13 @@ def validate(
 def report(
     context: typer.Context,
     out: RunFolderOption,
+    strict: Strict = False,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
     """Draw the figures of a run and write its report, one file that opens without a network.
+
+    A missed goal changes the exit status only with --strict.
 
     Reads result.json, the records and model.nc from the folder. Writes report.html and figures
     there.
@@ -313,8 +322,25 @@ def report(
     folder.require("result.json", "experiment.nc")
     context.with_resource(lock_folder(out))
     _pipeline().report(out, terminal_progress(quiet))
+    result = load_result(folder.result)
     if not quiet:
-        _summary().print_goals(load_result(folder.result), folder.report)
+        _summary().print_goals(result, folder.report)
+    _tell_missed(result, quiet, strict)
+
+
+def _tell_missed(result: dict[str, Any], unseen: bool, strict: bool) -> None:
+    """Print each missed goal on standard error if its table is unseen; raise an error if strict."""
+    from identify.reporting.goals import check_goals
+    from identify.reporting.verdict import sentence
+
+    goals = check_goals(result)
+    missed = [goal for goal in goals if not goal.passed]
+    if unseen:
+        print_warnings(map(sentence, missed), "missed")
+    if strict and missed:
+        are = "is" if len(missed) == 1 else "are"
+        names = ", ".join(goal.name for goal in missed)
+        raise VerificationError(f"{len(missed)} of {len(goals)} goals {are} missed: {names}")
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:

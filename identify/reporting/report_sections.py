@@ -57,15 +57,16 @@ def sensor_section(data: RunData) -> Section:
     ok = data.experiment["measured_ok"].values.astype(bool)
     note = data.scenario.sensor_note
     name = Path(data.scenario.sensor).stem
-    said = [] if data.truth is None else [f"The sensor is {name}{f': {note}' if note else '.'}"]
+    said = [] if data.truth is None else [f"The sensor is “{name}”{f': {note}' if note else '.'}"]
     if isinstance(data.scene, str):
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
     # The result of a real robot has no entry `sensor`, because no truth is known.
     if "sensor" not in data.result:
         said.append(
-            f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in "
-            f"{int((~ok).sum())} of them the platform was lost. The truth is not known: the "
-            "uncertainties below are those that the sensor states."
+            f"The record as it was used has {int(ok.sum())} measured poses at "
+            f"{data.scenario.timing.frame_rate_hz:g} Hz, and {int((~ok).sum())} frames without a "
+            "pose. Rows that were left out when it was read are not counted. The truth is not "
+            "known: the uncertainties below are those that the sensor states."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_consistent:
@@ -100,10 +101,7 @@ def excitation_section(data: RunData) -> Section:
 def fit_section(data: RunData) -> Section:
     """Describe how well the models follow the exciting trajectory, and how the search ended."""
     found = data.result["identification"]
-    text = (
-        f"The search took {found['iterations']} steps; it ended because "
-        f"{typographic(found['stop_reason'])}."
-    )
+    text = f"{_steps(found)} ended because {typographic(found['stop_reason'])}."
     table = tables.excitation_error_table(data.result, data.repeats_paper)
     causes = _diagnosis_table(data.result)
     return Section(
@@ -118,15 +116,11 @@ def parameter_section(data: RunData) -> Section:
     """Describe the identified parameters and, folded, the other parameters with the reasons."""
     found = data.result["identification"]
     parameters = found["parameters"]
-    groups = found.get("groups", {})
     known = [p for p in parameters.values() if p["identifiable"]]
-    sums = [group for group in groups.values() if len(group["coefficients"]) > 1]
-    known_sums = sum(bool(group["identifiable"]) for group in sums)
-    counted = f", and {known_sums} of {len(sums)} sums of parameters" if sums else ""
     text = [
-        f"The record identifies {len(known)} of {len(parameters)} parameters{counted}. A quantity "
-        "is identified if the record at least halves the standard deviation of its initial guess, "
-        "and reduces it to less than half of the quantity's size.",
+        f"The record identifies {tables.identified_counts(found)}. A quantity is identified if the "
+        "record at least halves the standard deviation of its initial guess, and reduces it to "
+        "less than half of the quantity's size.",
         parameter_tables.scale_sentence(found),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
@@ -194,11 +188,21 @@ SECTIONS: tuple[Callable[[RunData], Section], ...] = (
 """Functions that build the sections, in the order of the report."""
 
 
+def _steps(found: Mapping[str, Any]) -> str:
+    """State the number of steps and of searches. Each search has its own limit of steps."""
+    steps = found["iterations"]
+    searches = len(found.get("searches") or [""])
+    counted = f"{steps} step{'s' * (steps != 1)}"
+    if searches == 1:
+        return f"The search took {counted}; it"
+    return f"The {searches} searches took {counted} together; the last one"
+
+
 def _prior_text(found: dict[str, Any]) -> list[str]:
     """State how many estimates depend on the initial guesses of other parameters."""
     counts = {
         "parameters": sum(bool(p.get("rests_on_prior")) for p in found["parameters"].values()),
-        "sums": sum(bool(g.get("rests_on_prior")) for g in found.get("groups", {}).values()),
+        "sums": sum(bool(g.get("rests_on_prior")) for g in tables.sums_of(found)),
     }
     said = " and ".join(f"{count} of these {kind}" for kind, count in counts.items() if count)
     if not said:
@@ -215,9 +219,10 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     directions = conditioning["directions"]
     unshown = conditioning["unshown"]
     return [
-        f"Poses determine {directions} independent quantities of this robot and its controller, up "
-        "to one factor that is common to all of them. This record determines "
-        f"{directions - unshown} of them better than the initial guess does."
+        f"The single parameters, sums and gains that poses can show are {directions} independent "
+        "quantities, up to one factor that is common to all of them. This record determines "
+        f"{directions - unshown} of them better than the initial guess does, which is less than "
+        "identified."
     ]
 
 

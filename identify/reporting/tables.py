@@ -6,7 +6,7 @@ comparison.
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -96,19 +96,22 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     rate = result.get("sensor", {}).get("stereo_frames_per_second")
     seconds = result.get("seconds", {})
     # Names with a dot are parts of a stage, and are already counted in it.
-    stages = [
-        value
+    stages = {
+        name: value
         for name, value in seconds.items()
         if name != "total" and "." not in name and value is not None
-    ]
+    }
     rows: list[tuple[str, ...]] = []
     if rate:
         what = "rendered and measured, in one process"
         rows.append(("processed stereo frames", f"{number(rate)} 1/s", "", "", what))
     if stages:
-        total = seconds.get("total") or sum(stages)
-        what = "all stages so far, compiling included"
-        rows.append(("whole run", f"{number(total)} s", "", "", what))
+        if total := seconds.get("total"):
+            what = "all stages, teaching and compiling included"
+            rows.append(("whole run", f"{number(total)} s", "", "", what))
+        else:
+            what = f"{', '.join(stages)}; compiling included"
+            rows.append(("stages so far", f"{number(sum(stages.values()))} s", "", "", what))
     return rows
 
 
@@ -281,22 +284,36 @@ def _rms(values: list[float]) -> list[str]:
     return [number(value) if math.isfinite(value) else "diverged" for value in values]
 
 
+def sums_of(identification: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the base parameters that combine several parameters.
+
+    A base parameter of one member is a parameter itself, and counts as one.
+    """
+    groups = identification.get("groups", {}).values()
+    return [group for group in groups if len(group["coefficients"]) > 1]
+
+
+def identified_counts(identification: Mapping[str, Any]) -> str:
+    """Return the numbers of identified parameters and sums of parameters, in words."""
+    kinds = {
+        "parameters": list(identification["parameters"].values()),
+        "sums of parameters": sums_of(identification),
+    }
+    return ", and ".join(
+        f"{sum(bool(one['identifiable']) for one in found)} of {len(found)} {words}"
+        for words, found in kinds.items()
+        if found
+    )
+
+
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """Print a summary of the identification.
 
     The summary states what is identified, how well the model explains the record, the time, and the
     path of the result.
     """
-    identification = result["identification"]
-    kinds = {"parameters": "parameters", "groups": "sums of them that the motion depends on"}
-    entries = {words: identification.get(kind, {}).values() for kind, words in kinds.items()}
-    counts = [
-        f"{sum(bool(one['identifiable']) for one in found)} of {len(found)} {words}"
-        for words, found in entries.items()
-    ]
-    typer.echo(
-        f"identified: {' and '.join(counts)}, in {number(result['seconds'].get('identify'))} s"
-    )
+    counts = identified_counts(result["identification"])
+    typer.echo(f"identified: {counts}, in {number(result['seconds'].get('identify'))} s")
     goals = explanation_goals(result)
     for goal in goals:
         typer.echo(f"{goal.name}: {f'{number(goal.value)} {goal.unit}'.strip()}: {goal.detail}")

@@ -163,6 +163,15 @@ class LoggedRun:
         held = commands.command[inside]
         return len(held) > 1 and bool(np.ptp(held, axis=0).any())
 
+    def commands_are_missing(self, begin: float, end: float) -> bool:
+        """Return whether commands changed between two times without a row of commands between."""
+        commands = self.telemetry.commands
+        half = self.side.timing.frame_period_s / 2
+        if ((commands.time > begin + half) & (commands.time < end - half)).any():
+            return False
+        before, after = self.commands_at(np.array([begin + half, end + half]))
+        return not np.array_equal(before, after)
+
     def can_show(self, run: ClosedLoopRun) -> NDArray[np.bool_]:
         """Return which groups (rank,) the poses can identify, as an identification judges them."""
         robot = self.side.robot

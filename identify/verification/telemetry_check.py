@@ -130,7 +130,7 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
         MINIMUM_GOOD_SHARE,
         "1",
         None,
-        f"{lost} of {due} poses were lost, in {len(logged.gaps)} gaps",
+        f"{lost} of {due} poses are empty or missing, in {len(logged.gaps)} gaps",
     )
     if not len(logged.gaps):
         return
@@ -138,6 +138,7 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
     longest = int(np.argmax(widths))
     begin, end = logged.gaps[longest]
     changed = sum(logged.commands_change(*gap) for gap in logged.gaps)
+    missing = sum(logged.commands_are_missing(*gap) for gap in logged.gaps)
     yield Finding(
         "longest gap",
         bool(widths[longest] <= LONG_GAP_S),
@@ -147,7 +148,8 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
         None,
         f"no pose from {begin:.4f} to {end:.4f} s; commands changed in {changed} of "
         f"{len(widths)} gaps"
-        + (", in which the servo had poses that the log has not" if changed else ""),
+        + (", in which the servo had poses that the log has not" if changed else "")
+        + (f"; rows of commands are missing in {missing}" if missing else ""),
     )
 
 

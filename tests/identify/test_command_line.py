@@ -15,6 +15,7 @@ from rich.console import Console
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
 from identify.commands import run_stages as command_line
+from identify.commands.help import BEYOND_LIMIT
 from identify.commands.options import parse_settings
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, save_result
@@ -53,7 +54,10 @@ def warned(result):
         "whiteness": {"p_value": 0.0},
         "notes": ["the servo\nused wrong poses"],
         "warnings": ["not white", "a\nb"],
-        "groups": {"platform.mass": {"identifiable": True}},
+        "groups": {
+            "platform.mass": {"identifiable": True, "coefficients": {"platform.mass": 1.0}},
+            "sum": {"identifiable": True, "coefficients": {"a": 1.0, "b": 0.2}},
+        },
     }
     return result
 
@@ -67,7 +71,7 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
     assert "the model explains the record" in out
     save_result(run_folder.result, warned(load_result(run_folder.result)))
     said = (
-        "identified: 4 of 5 parameters and 1 of 1 sums of them that the motion depends on",
+        "identified: 4 of 5 parameters, and 1 of 1 sums of parameters, in ",
         "residual variance / noise variance: 1.356: mean square of",
         "noise alone gives 1.100 ± 0.040",
         "the model does NOT explain the record: the model is wrong, or the errors of the cameras "
@@ -90,7 +94,10 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
         command("run", "quick", "--out", "mine", "--seed", 7, "--workers", 2, "--quiet", *settings)
         == 0
     )
-    assert capfd.readouterr() == ("", NOTED)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith(f"{NOTED}missed: residual variance / noise variance 1.356, required at ")
+    assert err.count("\nmissed: ") == 2
     assert command("run", "--seed", 3) == 0
     (name, setup, folder, _, workers), default = calls
     assert (name, setup.seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
@@ -151,6 +158,10 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         text in shown
         for text in ("validation motion, position", "µrad", "stereo frames", str(run_folder.report))
     )
+    assert command("report", "--out", run_folder.path, "--strict", "--quiet") == BEYOND_LIMIT
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("missed: friction and gains far off 1, required at most 0 (of 3: ")
+    assert second == "error: 1 of 8 goals is missed: friction and gains far off"
 
 
 @pytest.mark.parametrize(
