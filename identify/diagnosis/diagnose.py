@@ -1,5 +1,7 @@
 """Diagnosis of records: from what was identified of them to the causes that explain the rest."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

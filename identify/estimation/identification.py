@@ -4,6 +4,8 @@ Its input is the records, the robot's geometry and initial guess, and the scenar
 has no access to the sensor, the plant's settings or the truth.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
