@@ -30,6 +30,7 @@ RENDERERS = {
     "analytic": "cmmsim.imaging.analytic:ANALYTIC",
     "pyrender": "cmmsim.imaging.pyrender_renderer:PYRENDER",
     "scene": "cmmsim.imaging.scene_renderer:SCENE",
+    "mitsuba": "cmmsim.imaging.mitsuba_renderer:MITSUBA",
     "statistical": "cmmsim.without_images.drawn_stickers:STATISTICAL",
 }
 AUTO = "auto"  # pyrender where OpenGL works, else analytic

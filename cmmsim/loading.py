@@ -37,7 +37,7 @@ def load_sensor(
         Result of an earlier teaching of the same cameras and bodies.
     progress : callable, optional
         Function that is called during teaching with the number of steps done and their total.
-    renderer : {"pyrender", "analytic", "scene", "auto", "statistical"}, optional
+    renderer : {"pyrender", "analytic", "scene", "mitsuba", "auto", "statistical"}, optional
         Renderer to use instead of the renderer that the file names. ``module:name`` names a user's
         own renderer.
     changes : mapping, optional
