@@ -7,6 +7,7 @@ from typing import Protocol
 
 import typer
 from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -157,11 +158,43 @@ def print_table(
         Names of the columns that hold words and are aligned left. Other columns are aligned right.
     title, note : str, optional
         Lines above and below the table.
+
+    Notes
+    -----
+    On a narrow terminal, words are folded, those of the first column last. Numbers and single words
+    are never cut: a table that needs more columns than the terminal has is printed wider.
     """
+    console = Console(markup=False, emoji=False)
+    cells = [list(row) for row in rows]
+    widths = _column_widths([header, *cells], [name in words for name in header], console.width)
     table = RichTable(title=title, caption=note, box=SIMPLE_HEAD, show_edge=False, padding=0)
-    # The first column names the row, and is never broken into lines.
-    for place, name in enumerate(header):
-        table.add_column(name, justify="left" if name in words else "right", no_wrap=not place)
-    for row in rows:
+    for name, width in zip(header, widths, strict=True):
+        table.add_column(
+            name, justify="left" if name in words else "right", width=width, overflow="fold"
+        )
+    for row in cells:
         table.add_row(*row)
-    Console(markup=False, emoji=False).print(table)
+    console.width = max(console.width, sum(widths) + len(widths) - 1)
+    console.print(table)
+
+
+def _column_widths(
+    lines: Sequence[Sequence[str]], words: Sequence[bool], available: int
+) -> list[int]:
+    """Return the width of each column, in letters.
+
+    Columns of words are reduced down to their longest word, until the table has the available
+    width. The first column is reduced if the others do not suffice.
+    """
+    columns = list(zip(*lines, strict=True))
+    widths = [max(cell_len(part) for cell in one for part in cell.split("\n")) for one in columns]
+    longest = [
+        max(cell_len(word) for cell in one for word in cell.split() or [""]) for one in columns
+    ]
+    # A gap of one letter stands between two columns.
+    excess = sum(widths) + len(widths) - 1 - available
+    for candidates in ([k for k in range(1, len(columns)) if words[k]], [0]):
+        while excess > 0 and (wide := [k for k in candidates if widths[k] > longest[k]]):
+            widths[max(wide, key=widths.__getitem__)] -= 1
+            excess -= 1
+    return widths

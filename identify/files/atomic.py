@@ -68,8 +68,12 @@ def write_figure(path: Path | str, figure: "Figure") -> None:
 
 def figure_bytes(figure: "Figure", suffix: str, dpi: int = 150) -> bytes:
     """Return the content of a figure's file in the format of a suffix, such as ``.png``."""
+    import matplotlib as mpl
+
     stream = io.BytesIO()
-    figure.savefig(stream, format=suffix.removeprefix("."), dpi=dpi)
+    # Hinting widens letters by an amount that depends on dpi, and text leaves the figure.
+    with mpl.rc_context({"text.hinting": "none"}):
+        figure.savefig(stream, format=suffix.removeprefix("."), dpi=dpi)
     return stream.getvalue()
 
 

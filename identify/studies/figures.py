@@ -38,16 +38,8 @@ STYLE: Any = {
     "pdf.fonttype": 42,  # text stays text
     "svg.fonttype": "none",
 }
-CURVES: list[dict[str, Any]] = [
-    {"fmt": f"{marker}{line}", "color": color}
-    for marker, line, color in zip(
-        "osD^vP",
-        ("-", "--", "-.", ":", "-", "--"),
-        ("C0", "C1", "C2", "C3", "C4", "C5"),
-        strict=True,
-    )
-]
-"""Markers, lines and colours. Curves can be distinguished even without colour."""
+MARKERS = "osD^vPX<>*hpd"
+LINES = ("-", "--", "-.", ":")
 FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis. With it, small differences look small."""
@@ -210,6 +202,8 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
     The axes are logarithmic.
     """
     figure, panels = panel_grid(len(laws), *PANEL)
+    # Panels over several factors share one legend, so each label has one look in all of them.
+    looks: dict[str, int] = {}
     for axes, (law, verdict) in zip(panels, laws, strict=True):
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
@@ -217,11 +211,14 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         curves = _curves(have, others)
         for place, (label, rows) in enumerate(curves):
             levels = _beside(_levels(study, rows, factor), place, len(curves))
-            _curve(axes, levels, law_data(law, rows), label, place)
-        _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
+            look = looks.setdefault(label, len(looks))
+            _curve(axes, levels, law_data(law, rows), label, look)
+        exponent = law.exponent or 0.0
+        _theory_line(axes, have[factor], law_data(law, have), exponent, "theory")
         scale(axes, _levels(study, have, factor))
         axes.set_title(
-            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})",
+            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})\n"
+            f"theory: {exponent:g}",
             fontsize="medium",
         )
         axes.set_xlabel(axis_label(factor, study))
@@ -287,8 +284,11 @@ def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
     return levels * BESIDE ** (place - (count - 1) / 2)
 
 
-def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int) -> None:
-    """Draw the rms at each level with its band."""
+def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, look: int) -> None:
+    """Draw the rms at each level with its band.
+
+    ``look`` is a number that chooses marker, line and colour. Markers differ even without colour.
+    """
     groups = pd.Series(values, index=levels.index).groupby(
         levels, sort=pd.api.types.is_numeric_dtype(levels)
     )
@@ -306,13 +306,17 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int)
         markersize=4,
         linewidth=1.2,
         label=label or "rows",
-        **CURVES[place],
+        fmt=MARKERS[look % len(MARKERS)] + LINES[look % len(LINES)],
+        color=f"C{look % 10}",
     )
 
 
-def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
+def _theory_line(
+    axes: Axes, factor: pd.Series, values: Array, exponent: float, label: str = ""
+) -> None:
     """Draw the power law with this exponent through the middle of the data.
 
+    Without a label, the legend shows the power.
     Nothing is drawn if a value of the factor is not positive, because a power law needs positive
     values.
     """
@@ -321,8 +325,8 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
         return
     level = np.sqrt(np.mean((values / x**exponent) ** 2))
     ends = np.geomspace(x.min(), x.max(), 50)
-    label = f"theory: $y \\propto x^{{{exponent:g}}}$"
-    axes.plot(ends, level * ends**exponent, "--k", linewidth=1, label=label)
+    power = f"theory: $y \\propto x^{{{exponent:g}}}$"
+    axes.plot(ends, level * ends**exponent, "--k", linewidth=1, label=label or power)
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:

@@ -22,7 +22,7 @@ SUFFIXES = {
 }
 """Units by the ends of names. Users' own kinds of row state units only in names."""
 
-WIDEST = 36
+WIDEST = 28
 """Largest number of letters in a line of a label."""
 
 

@@ -348,3 +348,19 @@ def test_words_stand_left_numbers_right_brackets_stay_and_the_first_column_is_ne
     assert lines[2].startswith("n" * 30 + " how long")
     assert max(map(len, lines)) <= 80
     assert len(lines) > 5
+
+
+def test_a_narrow_terminal_folds_words_and_cuts_neither_numbers_nor_names(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    name = "noise of the poses in the servo"
+    row = (name, "1.56e-05 ± 2.1e-07", "-0.0093", "joint6.viscous")
+    print_table(("source", "size", "share\n%", "most in"), [row], ("source", "size", "most in"))
+    out = capsys.readouterr().out
+    words = out.split()
+    assert {"1.56e-05", "2.1e-07", "-0.0093", "joint6.viscous", *name.split()} <= set(words)
+    assert "…" not in out
+    assert max(len(line.rstrip()) for line in out.splitlines()) <= 40
+    # Twelve numbers need more letters than the terminal has.
+    numbers = [f"{k}.23456e-07" for k in range(12)]
+    print_table([f"column{k}" for k in range(12)], [numbers], ())
+    assert set(numbers) <= set(capsys.readouterr().out.split())

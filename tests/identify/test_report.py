@@ -2,6 +2,7 @@
 offline.
 """
 
+import io
 import json
 import math
 import re
@@ -16,6 +17,7 @@ from matplotlib.image import imread
 import identify
 from dynamics.kinematics.platform import Chart
 from identify.errors import OutputFolderError, RecordError
+from identify.files.atomic import figure_bytes
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
 from identify.record.model_runs import build_model_run, write_model_runs
 from identify.record.recording import read, write
@@ -113,6 +115,26 @@ def test_report_is_one_page_that_people_can_read_on_any_screen_and_figures_for_p
     assert set(drawn) == FIGURES == {path.stem for path in run_folder.figures.glob("*.pdf")}
     assert min(min(image.shape[:2]) for image in drawn.values()) > 300
     assert min(image[..., :3].std() for image in drawn.values()) > 0.02
+    # The camera images of the scene reach its lower edge.
+    cut = {name: edges_with_ink(image) for name, image in drawn.items() if name != "scene"}
+    assert not any(cut.values()), cut
+
+
+def edges_with_ink(image):
+    """Names of the edges of an image (rows, columns, 3 or 4) at which something dark is cut off."""
+    edges = {"left": image[:, 0], "right": image[:, -1], "top": image[0], "bottom": image[-1]}
+    return [name for name, pixels in edges.items() if pixels[..., :3].min() < 0.8]
+
+
+def test_words_of_the_figures_of_a_run_stand_within_their_files(result):
+    estimated = dict(list(result["identification"]["parameters"].items())[:14])
+    figures = {
+        "parameters": lambda: estimates.parameter_figure(estimated),
+        "validation_errors": lambda: fit.validation_figure(result["validation"]),
+    }
+    for name, draw in figures.items():
+        image = imread(io.BytesIO(figure_bytes(style.drawn(draw), ".png")))
+        assert not edges_with_ink(image), name
 
 
 SIZES = """

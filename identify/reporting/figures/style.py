@@ -60,6 +60,8 @@ STYLE: Any = {
     "lines.linewidth": 1.1,
     "lines.markersize": 3.5,
     "hatch.linewidth": 0.6,
+    # Hinted letters have other widths at each dpi, and a layout would hold for one dpi alone.
+    "text.hinting": "none",
     # Text is stored as text, which can be searched and copied.
     "pdf.fonttype": 42,
     "svg.fonttype": "none",
@@ -87,7 +89,9 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
         figure = draw()
         # Layout engines move the axes at every drawing, and files would differ.
         if figure.get_layout_engine():
-            figure.draw_without_rendering()
+            # The first layout can change the ticks, and the second makes room for their labels.
+            for _ in range(2):
+                figure.draw_without_rendering()
             # The engine "none" would still have every file drawn twice.
             figure.set_layout_engine(None)
         return figure
