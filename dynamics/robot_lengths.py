@@ -291,12 +291,7 @@ def _within_limits(robot: Robot) -> Robot:
             return limited
         limit = float(f"{TRAVEL_FACTOR * limit:.3g}")
         if limit < LEAST_TRAVEL * robot.travel_limit:
-            raise RobotFileError(
-                f"{robot.name} is near a singularity at home: least leverage "
-                f"{_at_home(robot).leverage.min():.3g}, must be >= {workspace.LEAST_LEVERAGE:g}; "
-                f"condition {_at_home(robot).platform_condition[0]:.3g}, must be <= "
-                f"{workspace.MOST_CONDITION:g}; choose other lengths"
-            )
+            raise RobotFileError(_near_singularity(limited, measures))
 
 
 def _far_from_limits(measures: workspace.WorkspaceMeasures) -> bool:
@@ -304,6 +299,33 @@ def _far_from_limits(measures: workspace.WorkspaceMeasures) -> bool:
         (measures.reach_margin > 0).all()
         and (measures.leverage >= workspace.LEAST_LEVERAGE).all()
         and (measures.platform_condition <= workspace.MOST_CONDITION).all()
+    )
+
+
+def _near_singularity(robot: Robot, measures: workspace.WorkspaceMeasures) -> str:
+    """Message about limits that are exceeded even within the travel limit of a robot."""
+    home = _at_home(robot)
+    said = [f"{SAMPLES - len(measures.theta)} of {SAMPLES} positions of the joints have no pose"]
+    if len(measures.theta):
+        reach = measures.reach_margin.min()
+        leverage, condition = measures.leverage.min(), measures.platform_condition.max()
+        if reach <= 0:
+            said.append(
+                f"reach margin {reach:.3g}, must be > 0, {home.reach_margin.min():.3g} at home"
+            )
+        if leverage < workspace.LEAST_LEVERAGE:
+            said.append(
+                f"leverage {leverage:.3g}, must be >= {workspace.LEAST_LEVERAGE:g}, "
+                f"{home.leverage.min():.3g} at home"
+            )
+        if condition > workspace.MOST_CONDITION:
+            said.append(
+                f"condition of the platform side {condition:.3g}, must be <= "
+                f"{workspace.MOST_CONDITION:g}, {home.platform_condition[0]:.3g} at home"
+            )
+    return (
+        f"{robot.name} comes near a singularity within a travel of only {robot.travel_limit:.3g} "
+        f"{robot.layout.joint_unit} about home: {'; '.join(said)}; choose other lengths"
     )
 
 

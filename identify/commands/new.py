@@ -48,6 +48,9 @@ def _length(what: str) -> Any:
 
 Length = float | None
 
+PROBABLY_MM = 20.0
+"""Length, m, from which the message about an impossible robot asks for the unit."""
+
 
 @new.command(cls=Command)
 def robot(
@@ -85,6 +88,7 @@ def robot(
       cmmsim check mine.toml
       cmmsim run quick --robot mine.toml
     """
+    from dynamics.errors import RobotFileError
     from dynamics.robot_file import read_robot_file
 
     given = {
@@ -98,9 +102,21 @@ def robot(
         "rod": rod,
     }
     lengths = {name: value for name, value in given.items() if value is not None}
-    made = _of_lengths(file, like, lengths) if lengths else None
-    text = made or _of_a_workshop(_copy("robot", like, file))
-    _write({_toml(file): text}, read_robot_file)
+    try:
+        made = _of_lengths(file, like, lengths) if lengths else None
+        text = made or _of_a_workshop(_copy("robot", like, file))
+        _write({_toml(file): text}, read_robot_file)
+    except RobotFileError as error:
+        large = [
+            f"{name.replace('_', '-')} {value:g} m"
+            for name, value in lengths.items()
+            if value >= PROBABLY_MM
+        ]
+        if large:
+            raise RobotFileError(
+                f"cannot write {file}: lengths are in m: {', '.join(large)}; are they in mm?"
+            ) from error
+        raise
     _say(quiet, file, f"judge it with: cmmsim check {file}")
 
 
@@ -352,7 +368,17 @@ def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
             raise OutputFolderError(
                 f"{path} exists already and is not replaced; name another file, or remove it"
             )
-    write_files({path: text.encode() for path, text in texts.items()}, parents=True, check=read)
+    first = next(iter(texts))
+
+    def check(temporary: Path) -> None:
+        try:
+            read(temporary)
+        except Exception as error:
+            # The user knows the file by the name that it will have.
+            error.args = (str(error).replace(temporary.name, first.name),)
+            raise
+
+    write_files({path: text.encode() for path, text in texts.items()}, parents=True, check=check)
 
 
 def _say(quiet: bool, file: Path, further: str) -> None:

@@ -70,6 +70,13 @@ def test_a_new_robot_of_other_lengths_is_written_and_a_length_it_does_not_have_i
         capfd.readouterr().err
     )
     assert not Path("other.toml").exists()
+    mm = ("--base-radius", 250, "--platform-radius", 150, "--crank", 80, "--link", 250)
+    for lengths, said in ((mm, "link 250 m"), (mm[:2], "base-radius 250 m")):
+        assert command("new", "robot", "other.toml", *lengths) == NOT_DONE
+        says = one_line(capfd.readouterr().err)
+        assert "cannot write other.toml: lengths are in m: base-radius 250 m" in says
+        assert said in says
+        assert len(says) < 160
 
 
 @pytest.mark.parametrize("name", built_in_names())
