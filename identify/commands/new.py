@@ -258,6 +258,11 @@ def record(
         )
     chosen = load_robot(robot)
     beside = description_file(file)
+    if file.exists() and not logs:
+        raise OutputFolderError(
+            f"{file} exists already and is not replaced; if it is your log, describe it with: "
+            f"cmmsim new record {file} {robot} --from {file}"
+        )
     # The path is absolute, because the description may be read from another folder.
     named = robot if robot in built_in_names("robot") else str(Path(robot).resolve())
     if logs:

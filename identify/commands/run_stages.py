@@ -234,9 +234,10 @@ def identify(
     template of both, with comments that explain the columns and the rules below. Its option --from
     describes a log of another program: an export of Motive or Vicon, or a bag of ROS 2 or MCAP.
 
-    A record begins at rest: before its first row the robot has stood still at the first reference
-    pose. It has one row per frame, without gaps. A lost frame has a row with empty measured
-    columns. Units are m, rad and s. If a rule is broken, the error names the line or the frame.
+    Units are m, rad and s. Times need not be frames, the record may begin in motion, and rows may
+    be missing: the logged commands then drive the model. If the rows are one frame apart, begin at
+    rest and have a reference, the model closes its own loop. A lost frame has empty measured
+    columns. If a rule is broken, the error names the line or the frame.
 
     Writes result.json, which is also the JSON, and covariance.nc into the folder. From a record of
     your own it also writes scenario.toml, experiment.nc and model.nc; continue with cmmsim report,

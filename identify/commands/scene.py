@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from identify.scene import Workcell
 
 PICTURES = (".png", ".pdf", ".svg")
+PAGES = (".html", ".htm")
 SENSOR = "ctrack780"  # shown with a robot that is named alone
 ROBOT_KEYS = {"parameters", "legs", "family"}
 SENSOR_KEYS = {"rig", "stickers", "based_on"}
@@ -103,6 +104,11 @@ def show(
     if png is not None and png.suffix not in PICTURES:
         raise OutputFolderError(
             f"--png {png} ends in {png.suffix or 'nothing'}; valid: {', '.join(PICTURES)}"
+        )
+    if out is not None and out.suffix not in PAGES:
+        raise OutputFolderError(
+            f"--out {out} ends in {out.suffix or 'nothing'}, but writes a page; valid: "
+            f"{', '.join(PAGES)}; a picture is written by --png {out}"
         )
     cell, notes = chosen_cell(names)
     print_warnings(notes)

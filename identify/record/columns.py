@@ -9,6 +9,7 @@ where the log holds the pose of the tracked body in the log's own frame, frame_f
 """
 
 import re
+from itertools import permutations
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
@@ -39,6 +40,11 @@ COVARIANCES_SAID = "6 standard deviations, 21 of the upper triangle, or 36 row b
 EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
 
 EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
+
+EULER_ORDERS = tuple(
+    f"euler_{''.join(letters)}" for axes in ("XYZ", "xyz") for letters in permutations(axes)
+)
+"""Sequences about three different axes."""
 
 CONVENTIONS = (*COUNTS, *EULER_USUAL, "...")
 
@@ -156,7 +162,8 @@ class PoseColumns(Log):
     @property
     def other_conventions(self) -> tuple[str, ...]:
         """Other conventions with as many columns, for which this one is often mistaken."""
-        alike = {3: ("rotation_vector", *EULER_USUAL), 4: ("quaternion_xyzw", "quaternion_wxyz")}
+        turned = dict.fromkeys((*EULER_USUAL, *EULER_ORDERS))
+        alike = {3: ("rotation_vector", *turned), 4: ("quaternion_xyzw", "quaternion_wxyz")}
         return tuple(
             name for name in alike.get(len(self.orientation), ()) if name != self.convention
         )

@@ -7,7 +7,7 @@ used. Its additional table `[record]` holds further measurements, and `[columns]
 columns of a log are called.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from dynamics import Robot, load_robot
 from dynamics.files import is_file, is_name, parse_toml, read_text
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.record.columns import Columns
+from identify.record.columns import EULER_ORDERS, Columns
 from identify.record.csv_record import read_table
 from identify.record.from_telemetry import record_of
 from identify.record.load import store_load
@@ -29,7 +29,13 @@ from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
 from identify.record.readers.mapped import read_mapped
 from identify.record.recording import read
-from identify.record.suspicions import fits, suspicions
+from identify.record.suspicions import (
+    EXPLAINED,
+    better_order,
+    fits,
+    suspicions,
+    unexplained,
+)
 from identify.record.telemetry import Telemetry
 from identify.scenario import Scenario
 from identify.scenario.payload import Payload
@@ -152,15 +158,27 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
     """Return what is likely wrong with a log, and the convention of rotations that would fit."""
     found = suspicions(telemetry, robot)
     columns = about.columns
-    if not found or columns is None:
+    if columns is None:
         return found
-    for convention in columns.measured.other_conventions:
-        measured = columns.measured.model_copy(update={"convention": convention})
-        tried = replace(about, columns=columns.model_copy(update={"measured": measured}))
-        with suppress(RecordError):
-            if fits(read_telemetry(path, tried, robot), robot):
-                found[-1] += f"; with convention = {convention!r} of the poses it would fit"
-                break
+
+    def others() -> Iterator[tuple[str, Telemetry]]:
+        for convention in columns.measured.other_conventions:
+            measured = columns.measured.model_copy(update={"convention": convention})
+            tried = replace(about, columns=columns.model_copy(update={"measured": measured}))
+            with suppress(RecordError):
+                yield convention, read_telemetry(path, tried, robot)
+
+    # A wrong order also turns signs and correlations of joints, so that it is judged first.
+    if columns.measured.convention in EULER_ORDERS:
+        share = unexplained(telemetry, robot)
+        if share > EXPLAINED:
+            shares = {convention: unexplained(one, robot) for convention, one in others()}
+            if said := better_order(share, shares):
+                return [said]
+    if found:
+        fitting = (convention for convention, one in others() if fits(one, robot))
+        if convention := next(fitting, ""):
+            found[-1] += f"; with convention = {convention!r} of the poses it would fit"
     return found
 
 

@@ -5,7 +5,7 @@ drives and the errors of the geometry. If they do not, the poses are tried in ot
 other axes and mirrored, and the commands in other units, directions, orders and zeros.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import permutations, product
 
 import numpy as np
@@ -24,6 +24,18 @@ TRIED = 200
 
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 """Lags, s, of the motion behind the commands that are tried with other units and axes."""
+
+FILTER_S = (-0.1, -0.05, 0.0, 0.05, 0.1)
+"""Times, s, of the taps of the filter by which a joint follows its command."""
+
+EXPLAINED = 0.02
+"""Share of the motion left unexplained by the commands below which no other order is tried."""
+
+BETTER = 0.25
+"""Largest ratio of the unexplained shares of two orders at which the other one counts as right."""
+
+EQUAL = 1.5
+"""Largest ratio of the unexplained shares of two orders between which the motion cannot choose."""
 
 IN_REACH = 0.5
 """Smallest share of poses in reach. With a smaller share, other units and axes are tried."""
@@ -80,6 +92,43 @@ def fits(telemetry: Telemetry, robot: Robot) -> bool:
     time, coordinates = joint_motion(telemetry, robot)
     held = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
     return bool(np.diagonal(_correlations(held, coordinates)).min() > FITS)
+
+
+def unexplained(telemetry: Telemetry, robot: Robot) -> float:
+    """Return the share of the joints' motion that the commands do not explain.
+
+    Each joint follows its own command through a linear filter with the lags `LAGS_S`. The share is
+    that of the variance, the mean over the joints. It is 1 if too few poses are in reach.
+    """
+    poses = telemetry.poses
+    if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
+        return 1.0
+    time, coordinates = joint_motion(telemetry, robot)
+    lag = lag_of(telemetry, robot).seconds
+    held = np.stack([_commands_at(telemetry, time - lag + later) for later in FILTER_S], axis=-1)
+    shares = []
+    for commands, motion in zip(np.moveaxis(held, 1, 0), coordinates.T, strict=True):
+        filtered = np.column_stack([commands, np.ones(len(motion))])
+        left = motion - filtered @ np.linalg.lstsq(filtered, motion, rcond=None)[0]
+        shares.append(left.var() / max(motion.var(), np.finfo(float).tiny))
+    return float(np.mean(shares))
+
+
+def better_order(stated: float, shares: Mapping[str, float]) -> str:
+    """Return which conventions of Euler angles fit better than the stated one, or an empty string.
+
+    ``stated`` is the share of the motion that is `unexplained` with the stated convention, and
+    ``shares`` holds those of other ones by their names.
+    """
+    best = min(shares.values(), default=1.0)
+    if best > BETTER * stated:
+        return ""
+    right = sorted((share, name) for name, share in shares.items() if share <= EQUAL * best)
+    named = " or ".join(repr(name) for _, name in right)
+    return (
+        f"the order of the Euler angles is likely wrong: the commands leave {stated:.0%} of the "
+        f"joints' motion unexplained, and {best:.1%} with convention = {named}"
+    )
 
 
 def joint_motion(telemetry: Telemetry, robot: Robot) -> tuple[Array, Array]:

@@ -185,11 +185,15 @@ def _of_the_motion(data: RunData) -> dict[str, Picture]:
         "The exciting trajectory as a path in space, and the orientation along it; the same times "
         "are marked in both."
     )
+    over_time = "The desired exciting trajectory over time."
+    if "reference_position" not in data.experiment:
+        path = path.replace("The exciting trajectory", "The measured motion")
+        over_time = "The measured poses over time. The record has no desired trajectory."
     return {
         "path": Picture(lambda: paths.path_figure(time, reference), path),
         "excitation": Picture(
             lambda: paths.excitation_figure(time, reference),
-            "The desired exciting trajectory over time.",
+            over_time,
         ),
     }
 

@@ -158,7 +158,8 @@ def validation_section(data: RunData) -> Section:
 
 def provenance_section(data: RunData) -> Section:
     """List the scenario, versions and times that are needed to repeat the run."""
-    changed = tables.settings_table(data.result, data.scenario_toml)
+    designed = "reference_position" in data.experiment
+    changed = tables.settings_table(data.result, data.scenario_toml, designed)
     made = f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}."
     text = [made, "Every picture is also in the folder figures, as PDF for print and as PNG."]
     if not changed.rows:

@@ -261,14 +261,19 @@ def seconds_table(result: dict[str, Any]) -> Table:
     return Table("Time of the stages", ("stage", "seconds"), rows, folded=True)
 
 
-def settings_table(result: dict[str, Any], recorded: str) -> Table:
+def settings_table(result: dict[str, Any], recorded: str, designed: bool = True) -> Table:
     """Return the differences between the recorded scenario and a built-in one.
 
     ``recorded`` is the scenario of the record (TOML). Settings that were changed for the
-    identification are included.
+    identification are included. Those of the excitation are left out unless the motion was
+    ``designed`` by them.
     """
     base, changed = changed_settings(recorded, result.get("settings"))
-    rows = tuple((one.key, one.value, one.built_in, one.meaning) for one in changed)
+    rows = tuple(
+        (one.key, one.value, one.built_in, one.meaning)
+        for one in changed
+        if designed or not one.key.startswith("excitation.")
+    )
     return Table(
         f"What differs from the scenario {base}", ("key", "value", f"in {base}", "meaning"), rows
     )

@@ -283,7 +283,8 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         "s",
         None,
         f"the motion follows the commands by {1e3 * lag.seconds:.1f} ms, with a correlation of "
-        f"{lag.correlation:.3f}: drives, friction, latency and the clocks",
+        f"{lag.correlation:.3f}: drives, friction, latency and the clocks; less than "
+        f"{-BEFORE_S:g} s, a motion before its commands, or a correlation below {FOLLOWS:g} fails",
     )
     delay = logged.delay
     timing = logged.side.timing

@@ -9,13 +9,16 @@ import tomllib
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.photographs.measuring import COLUMNS, MeasuredPair
 from identify.commands.help import DONE, NOT_DONE
 from identify.errors import RecordError, ScenarioError
+from identify.record.own_record import log_suspicions, read_description, read_own_records
 from identify.record.recording import poses
 from tests.identify.commands import command, one_line
+from tests.identify.synthetic import rss6
 from tests.identify.test_readers import (
     SIGNS,
     TOLERANCE,
@@ -98,6 +101,43 @@ def test_a_proposal_for_vicon_asks_which_body_and_which_convention(record, tmp_p
     assert found["measured"]["angle_unit"] == "deg"
     with pytest.raises(RecordError, match=r"'\?' is not a convention: quaternion_xyzw"):
         telemetry_of(trial)
+
+
+def test_a_proposal_keeps_the_order_of_angles_and_a_wrong_order_is_found_with_what_fits(
+    record,  # noqa: F811
+    tmp_path,
+):
+    log = tmp_path / "lab.csv"
+    table = pd.read_csv(as_table(tmp_path, record))
+    ok = record["measured_ok"].values == 1
+    pose = poses(record, "measured")
+    turned = np.full((len(ok), 3), np.nan)
+    turned[ok] = Rotation.from_euler("XYZ", pose[ok, 3:]).as_euler("ZYX", degrees=True)
+    own = {f"tcp_{axis}_mm": 1e3 * pose[:, k] for k, axis in enumerate("xyz")}
+    angles = [f"{name}_deg" for name in ("yaw", "pitch", "roll")]
+    own |= dict(zip(angles, turned.T, strict=True))
+    commands = [name for name in table if name.startswith("command_") and name.endswith("_rad")]
+    pd.DataFrame({"time_s": table["time_s"]} | own | dict(table[commands])).to_csv(log, index=False)
+    found = proposed(log, log)
+    assert found["measured"]["position"] == ["tcp_x_mm", "tcp_y_mm", "tcp_z_mm"]
+    assert found["measured"]["orientation"] == angles
+    said = log.with_suffix(".toml").read_text()
+    assert "for this order of the columns: euler_ZYX about the body's own axes" in said
+    answer(log, "convention", '"euler_XYZ"')
+    said = r"unexplained, and .* with convention = .*'euler_ZYX'"
+    with pytest.raises(RecordError, match=said):
+        read_own_records([log])
+    # The natural answer for yaw, pitch and roll, but with the columns in another order.
+    given = ", ".join(f'"{name}"' for name in angles)
+    other = ", ".join(f'"{name}"' for name in angles[::-1])
+    change(log.with_suffix(".toml"), "euler_XYZ", "euler_ZYX")
+    change(log.with_suffix(".toml"), given, other)
+    with pytest.raises(RecordError, match=r"with convention = .*'euler_xyz'"):
+        read_own_records([log])
+    change(log.with_suffix(".toml"), other, given)
+    check(log, record)
+    about = read_description(log.with_suffix(".toml"), log)
+    assert not log_suspicions(log, about, telemetry_of(log), rss6())
 
 
 def test_a_proposal_for_a_bag_needs_no_answer(record, tmp_path, read_here):  # noqa: F811

@@ -431,6 +431,17 @@ def test_a_record_without_truth_has_a_report_that_says_what_nobody_can_tell(run_
         np.sqrt(np.diag(data.experiment["measured_covariance"][0]))
     )
     assert list(identify.run_figures(run_folder.path)) == list(shown)
+    assert "excitation.duration_s" in text
+    wanted = ("reference_position", "reference_orientation")
+    undirected = replace(data, experiment=data.experiment.drop_vars(wanted))
+    assert "measured poses" in pictures(undirected)["excitation"].caption
+    assert "desired" in shown["excitation"].caption
+    scenario = load_scenario("quick", **{"excitation.harmonics": 3}).to_toml()
+    keys = [
+        {row[0] for row in tables.settings_table(data.result, scenario, designed).rows}
+        for designed in (True, False)
+    ]
+    assert keys[0] - keys[1] == {"excitation.harmonics"}
 
 
 def test_a_scene_whose_robot_is_gone_is_not_drawn_and_the_page_says_why(finished_run):

@@ -295,6 +295,7 @@ def test_a_robot_that_fits_no_sensor_is_shown_alone_and_a_sensor_without_a_robot
         (["rss6", "ups6"], "robots"),
         (["pyproject.toml"], "neither a robot nor a sensor"),
         (["rss6", "--png", "a.gif"], ".pdf"),
+        (["rss6", "--out", "a.png"], "a picture is written by --png a.png"),
         (["rss6", "--png", "/proc/none/a.png"], "cannot write /proc/none/a.png"),
         (["rss6", "--out", "/proc/none/a.html"], "cannot write /proc/none/a.html"),
     ],

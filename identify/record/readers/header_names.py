@@ -115,6 +115,9 @@ def bodies_of(place: Place) -> Iterator[Body]:
             positions.setdefault(stem, {})[last[-1]] = name
         elif any(last in angles for angles in ANGLES) or re.fullmatch("[rm][0-3][0-3]", last):
             turns.setdefault(stem, {})[last] = name
+    if len(positions) == len(turns) == 1:
+        # There is one pose, even if only its position names the body, as in tcp_x and yaw.
+        turns = dict(zip(positions, turns.values(), strict=True))
     for stem, three in positions.items():
         if len(three) == 3 and stem in turns:
             turned, convention = _turned(turns[stem])
@@ -133,8 +136,18 @@ def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
         if all(one in named for one in angles):
             if angles[0] == "rx" and "qw" in named:
                 return (*(named[one] for one in angles), named["qw"]), "quaternion_xyzw"
-            return tuple(named[one] for one in angles), None
+            # The order of the columns often is that of the turns.
+            return tuple(column for one, column in named.items() if one in angles), None
     return (), None
+
+
+def axes_of(angles: Sequence[str]) -> str:
+    """Return the axes of three angles by their names, such as "zyx", or "" if they tell none."""
+    last = [(words_of(name) or [""])[-1].lower() for name in angles]
+    for known in (*ANGLES, ("qx", "qy", "qz")):
+        if set(last) == set(known):
+            return "".join("xyz"[known.index(one)] for one in last)
+    return ""
 
 
 def joints_of(place: Place, robot: Robot) -> Iterator[Joints]:

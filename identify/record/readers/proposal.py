@@ -27,6 +27,7 @@ from identify.record.readers.header_names import (
     Body,
     Joints,
     Place,
+    axes_of,
     bodies_of,
     has_word,
     joints_of,
@@ -40,6 +41,7 @@ TIMES = ("time", "t", "timestamp", "stamp", "secs")
 LOG_TIME = "log_time"
 
 EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz about fixed axes"
+"""Conventions of three angles whose names tell no axes."""
 
 
 @dataclass
@@ -124,9 +126,7 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, ro
     )
     made.lines.append(f"orientation = {_text(list(body.orientation))}")
     stated = f"; the file says {header.rotation}" if header.rotation else ""
-    choices = EULER_CHOICES if len(body.orientation) == 3 else "quaternion_xyzw or quaternion_wxyz"
-    rotated = "rotation_vector, " if len(body.orientation) == 3 else ""
-    why = f"{rotated}{choices}{stated}"
+    why = f"{_choices(body.orientation)}{stated}"
     # The names in a record of our own also determine the convention of its poses.
     own = columns_of(robot)
     is_own = (*body.position, *body.orientation) == own[table].names
@@ -149,6 +149,20 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, ro
         "# base_from_frame = [0, 0, 0, 0, 0, 0]  # pose of the log's frame in the robot's base",
         "# body_from_platform = [0, 0, 0, 0, 0, 0]  # pose of the platform in the tracked body",
     ]
+
+
+def _choices(orientation: Sequence[str]) -> str:
+    """Return the conventions that are possible for the columns of an orientation."""
+    if len(orientation) != 3:
+        return "quaternion_xyzw or quaternion_wxyz"
+    axes = axes_of(orientation)
+    if not axes:
+        return f"rotation_vector, {EULER_CHOICES}"
+    vector = "rotation_vector, " if axes == "xyz" else ""
+    return (
+        f"for this order of the columns: {vector}euler_{axes.upper()} about the body's own axes, "
+        f"or euler_{axes} about fixed axes"
+    )
 
 
 def _propose_joints(made: Proposal, joints: Joints, rows: Place, robot: Robot) -> None:

@@ -1,5 +1,6 @@
 """Columns of a log by the names that they have in their file."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
@@ -78,6 +79,7 @@ class Stream:
         except ValueError:
             raise RecordError(
                 f"{self.rows.place(row)}: {name} is {str(cell)[:40]!r}, which is not a number"
+                f"{_comma_hint(cell)}"
             ) from None
 
     def moments(self, name: str, unit: str, rate_hz: float) -> list[Decimal]:
@@ -98,10 +100,17 @@ class Stream:
             except (InvalidOperation, ValueError):
                 raise RecordError(
                     f"{self.rows.place(row)}: the time {name} is {str(cell)[:40]!r}, which is not "
-                    "a number"
+                    f"a number{_comma_hint(cell)}"
                 ) from None
             found.append(moment * factor)
         return found
+
+
+def _comma_hint(cell: Cell) -> str:
+    """Return what to do about a number with a decimal comma, or an empty string."""
+    if isinstance(cell, str) and re.fullmatch(r"[-+]?\d*,\d+(e[-+]?\d+)?", cell, re.IGNORECASE):
+        return "; it has a decimal comma: export the log with decimal points"
+    return ""
 
 
 class LoggedFile(Protocol):
