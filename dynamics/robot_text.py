@@ -74,6 +74,8 @@ def _columns(legs: Sequence[Leg]) -> list[str]:
         column = [getattr(leg, name) for leg in legs]
         if name == "type" or all(value is None for value in column):
             continue
+        meaning = type(legs[0]).model_fields[name].description
+        lines += [f"# {meaning}"] if meaning else []
         if all(np.array_equal(value, column[0]) for value in column):
             lines.append(f"{name} = {_value(column[0])}")
         elif isinstance(column[0], np.ndarray):

@@ -32,6 +32,7 @@ from identify.files.run_folder import (
     RunFolder,
     load_result,
     new_run_folder,
+    refuse_finished,
 )
 from identify.progress import print_warnings, terminal_progress
 from identify.runtime import interruptible_imports
@@ -77,13 +78,15 @@ def run(
                                               joints off by 0.1 mm: a wrong
                                               model, seen in the residuals
     """
+    chosen = chosen_scenario(scenario, settings, robot)
+    path = out or Path("runs") / f"{chosen.name}-{seed}"
+    # A finished run is refused before anything that takes long.
+    refuse_finished(path)
     with interruptible_imports():
         from identify.setup import Setup
         from identify.verification.robot_check import run_warning
 
-    chosen = chosen_scenario(scenario, settings, robot)
     setup = Setup(chosen, seed).on_this_machine()
-    path = out or Path("runs") / f"{chosen.name}-{seed}"
     # An experiment that was begun in this folder is continued, so its files are allowed there.
     begun = _pipeline().is_begun(setup, path)
     folder = context.with_resource(new_run_folder(path, BEGUN if begun else UNFINISHED))

@@ -26,7 +26,7 @@ from dynamics.files import parse_json, read_text
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.progress import Progress, SilentProgress
-from identify.scenario.sections import Rig
+from identify.scenario.sections import RIG_KNOWN, Rig
 
 LARGEST_RATIO = 1.5
 """Largest ratio of focal lengths, or of baselines, at which two rigs count as the same."""
@@ -105,6 +105,14 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
     Raises ScenarioError if there is no such file, if it holds no calibration, or if the calibration
     is of another rig. The message states the difference.
     """
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "no file"
+        inside = path / "calibration.json"
+        hint = f"; is {str(inside)!r} meant?" if inside.is_file() else ""
+        raise ScenarioError(
+            f"rig.known = {str(path)!r} is {what}; valid: {', '.join(RIG_KNOWN)}, or the path of "
+            f"the calibration.json of `cmmsim calibrate`{hint}"
+        )
     try:
         text = read_text(path, str(path), ScenarioError)
         content = parse_json(text, str(path), ScenarioError)

@@ -117,10 +117,20 @@ def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[Run
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
     with lock_folder(folder):
         if any(found.name not in (LOCK, *also) for found in folder.iterdir()):
-            raise OutputFolderError(
-                f"output folder {folder} is not empty; name another with --out, or remove it"
-            )
+            raise _not_empty(folder)
         yield RunFolder(folder)
+
+
+def refuse_finished(path: Path | str) -> None:
+    """Raise OutputFolderError if a folder has the report of a finished run."""
+    if RunFolder(Path(path)).report.exists():
+        raise _not_empty(Path(path))
+
+
+def _not_empty(folder: Path) -> OutputFolderError:
+    return OutputFolderError(
+        f"output folder {folder} is not empty; name another with --out, or remove it"
+    )
 
 
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")

@@ -213,12 +213,11 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
             levels = _beside(_levels(study, rows, factor), place, len(curves))
             look = looks.setdefault(label, len(looks))
             _curve(axes, levels, law_data(law, rows), label, look)
-        exponent = law.exponent or 0.0
-        _theory_line(axes, have[factor], law_data(law, have), exponent, "theory")
+        _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
         scale(axes, _levels(study, have, factor))
         axes.set_title(
             f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})\n"
-            f"theory: {exponent:g}",
+            f"theory: {law.exponent or 0.0:g}",
             fontsize="medium",
         )
         axes.set_xlabel(axis_label(factor, study))
@@ -311,12 +310,9 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, look: int) 
     )
 
 
-def _theory_line(
-    axes: Axes, factor: pd.Series, values: Array, exponent: float, label: str = ""
-) -> None:
+def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
     """Draw the power law with this exponent through the middle of the data.
 
-    Without a label, the legend shows the power.
     Nothing is drawn if a value of the factor is not positive, because a power law needs positive
     values.
     """
@@ -325,8 +321,7 @@ def _theory_line(
         return
     level = np.sqrt(np.mean((values / x**exponent) ** 2))
     ends = np.geomspace(x.min(), x.max(), 50)
-    power = f"theory: $y \\propto x^{{{exponent:g}}}$"
-    axes.plot(ends, level * ends**exponent, "--k", linewidth=1, label=label or power)
+    axes.plot(ends, level * ends**exponent, "--k", linewidth=1, label="theory")
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:

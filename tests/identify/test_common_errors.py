@@ -307,6 +307,14 @@ def test_a_calibration_of_another_rig_or_one_that_is_none_is_refused_in_one_line
             stated_covariance(calibration(path, rig, **changes), rig)
         assert words in str(refused.value), refused.value
         assert "\n" not in str(refused.value)
+    (tmp_path / "calibration.json").touch()
+    for wrong, words in (
+        (tmp_path / "calibratd", "is no file; valid: exact, calibrated, photographs, or the path"),
+        (tmp_path, "calibration.json' meant?"),
+    ):
+        with pytest.raises(ScenarioError) as refused:
+            stated_covariance(wrong, rig)
+        assert words in str(refused.value)
 
 
 def test_records_that_share_a_draw_do_not_average_it():

@@ -61,6 +61,7 @@ def test_a_new_robot_of_other_lengths_is_written_and_a_length_it_does_not_have_i
     mine = load_robot("mine.toml")
     assert (mine.name, mine.geometry.legs[0].crank_length) == ("mine", 0.2)
     text = Path("mine.toml").read_text()
+    assert "# from B to the crank's tip, m\ncrank_length = 0.2" in text
     assert "base_radius 0.4 m, platform_radius 0.1 m, crank 0.2 m, link 0.3 m" in " ".join(
         text.replace("#", "").split()
     )
@@ -145,6 +146,7 @@ def test_a_new_record_is_read_and_asks_for_its_rows(name, capfd):
 
 def test_nothing_is_replaced_and_what_cannot_be_written_leaves_nothing(capfd):
     Path("there.toml").write_text("mine")
+    Path("lab.csv").write_text("mine")
     for words, says in (
         (("robot", "there.toml"), "there.toml exists already and is not replaced"),
         (("record", "there.csv"), "there.toml exists already and is not replaced"),
@@ -155,12 +157,13 @@ def test_nothing_is_replaced_and_what_cannot_be_written_leaves_nothing(capfd):
             "unknown sensor 'eye' after --like; valid: ctrack780, ctrack780_29hz",
         ),
         (("record", "a.toml"), "must end in .csv"),
+        (("record", "lab.csv", "ups6"), "cmmsim new record lab.csv ups6 --from lab.csv"),
         (("record", "a.csv", "none"), "unknown robot `none`"),
     ):
         assert command("new", *words) == NOT_DONE
         assert says in one_line(capfd.readouterr().err)
     assert Path("there.toml").read_text() == "mine"
-    assert [path.name for path in Path().iterdir()] == ["there.toml"]
+    assert {path.name for path in Path().iterdir()} == {"there.toml", "lab.csv"}
 
 
 @pytest.mark.parametrize("kept", SCHEMAS, ids=lambda path: path.stem)

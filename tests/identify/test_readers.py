@@ -391,7 +391,10 @@ WRONG_TABLES = [
     (cell("time_s", 7, "soon"), "line 9: the time time_s is 'soon', which is not a number"),
     (cell("command_2_rad", 3, ""), "line 5: the command command_2_rad is empty or not finite"),
     (cell("reference_x_m", 4, ""), "line 6: the desired pose has an empty cell"),
-    (cell("measured_x_m", 2, "1,5"), "line 4: measured_x_m is '1,5', which is not a number"),
+    (
+        cell("measured_x_m", 2, "1,5"),
+        "line 4: measured_x_m is '1,5', which is not a number; it has a decimal comma: export",
+    ),
     (
         described_as('"measured_y_m", "measured_z_m"', '"measured_y_m", "measured_y_m"'),
         r"\[columns\] measured: column 'measured_y_m' is named twice",
