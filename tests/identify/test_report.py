@@ -130,7 +130,8 @@ def test_words_of_the_figures_of_a_run_stand_within_their_files(result):
     estimated = dict(list(result["identification"]["parameters"].items())[:14])
     figures = {
         "parameters": lambda: estimates.parameter_figure(estimated),
-        "validation_errors": lambda: fit.validation_figure(result["validation"]),
+        "validation_errors": lambda: fit.validation_figure(result),
+        "correlation": lambda: estimates.correlation_figure(np.eye(2), list(estimated)[:2]),
     }
     for name, draw in figures.items():
         image = imread(io.BytesIO(figure_bytes(style.drawn(draw), ".png")))

@@ -148,7 +148,7 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     The area of a dot is the size of a correlation. The dot is open if the correlation is negative.
     If nothing is identified, the figure has a line of text instead.
     """
-    side = min(WIDTH, max(3.0, 1.4 + 0.2 * len(names)))
+    side = min(WIDTH, max(4.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
     axes = figure.subplots()
     if not len(names):
