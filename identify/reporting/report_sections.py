@@ -222,8 +222,8 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
     return [
         f"The single parameters, sums and gains that poses can show are {directions} independent "
         "quantities, up to one factor that is common to all of them. This record determines "
-        f"{directions - unshown} of them better than the initial guess does, which is less than "
-        "identified."
+        f"{directions - unshown} of them better than the initial guess does. A quantity counts as "
+        "identified only if it is also known well enough."
     ]
 
 

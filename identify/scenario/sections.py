@@ -226,7 +226,9 @@ class Identification(Section):
         description="whether only masses and moments of inertia of rigid bodies are admitted; "
         "some of the paper's are not",
     )
-    max_iterations: int = quantity(30, "1", "largest number of iterations", ge=1, le=1000)
+    max_iterations: int = quantity(
+        30, "1", "largest number of iterations of each search", ge=1, le=1000
+    )
     cost_tolerance: float = quantity(
         1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1
     )

@@ -80,6 +80,27 @@ def test_what_is_wrong_with_the_poses_is_found_with_its_size(record):
     assert "stated are 15 um, 0.3" in found["position noise"].text
 
 
+def test_rows_that_are_missing_are_told_from_commands_that_changed(record):
+    sound = recorded_telemetry(record, "mine.nc")
+    there = np.ones(600, dtype=bool)
+    there[100:140] = False
+
+    def without(log, *names):
+        values = {name: getattr(log, name) for name in names}
+        return replace(log, **{k: None if v is None else v[there] for k, v in values.items()})
+
+    found = findings(
+        replace(
+            sound,
+            poses=without(sound.poses, "time", "pose", "ok", "covariance"),
+            commands=without(sound.commands, "time", "command", "written"),
+        )
+    )
+    assert "commands changed in 1 of 2 gaps" not in found["longest gap"].text
+    assert found["longest gap"].text.endswith("rows of commands are missing in 1")
+    assert found["lost poses"].text == "42 of 600 poses are empty or missing, in 2 gaps"
+
+
 def test_what_is_wrong_with_the_commands_is_found_with_its_size(record):
     sound = recorded_telemetry(record, "mine.nc")
     commands = sound.commands
