@@ -340,7 +340,7 @@ def test_an_own_cause_is_asked_beside_those_of_the_catalogue(allowed):
         ("nothing", "changes no pose of the model"),
         ("no_run", "must return a LoopModel, returned float"),
         ("raising", "raised ValueError: too large"),
-        ("absent", "cannot be imported"),
+        ("absent", "has no absent"),
     ],
 )
 def test_an_own_cause_that_is_no_column_is_refused_in_one_line(name, said, allowed):
