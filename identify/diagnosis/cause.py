@@ -108,6 +108,12 @@ class Cause:
     renewed : callable, optional
         Function (problem with the causes, parameters) that returns this cause with its effect along
         the motion there, if its effect depends on it.
+    anew : callable, optional
+        Function (problem with other causes, parameters) that returns this cause as it is asked at
+        their optimum, if its sizes are relative to the motion.
+    exact : bool
+        True if the model with this cause is the true one. False: it follows to first order, or
+        joints that stick keep a fit from its optimum.
     tried : tuple of float
         Sizes at which the cause is looked for, where a small one shows nothing. Empty: about zero.
     """
@@ -121,6 +127,8 @@ class Cause:
     least: float = -np.inf
     tried: tuple[float, ...] = ()
     effect: Effect | None = None
+    anew: "Callable[[OutputErrorProblem, Array], Cause] | None" = None
+    exact: bool = False
     alone: bool = True
     exclusive: bool = False
     companion: "Cause | None" = None

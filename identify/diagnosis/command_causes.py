@@ -46,6 +46,7 @@ def scales() -> tuple[Cause, ...]:
             change=in_each_run(scaled),
             step=SCALE_STEP,
             effect=OnCommands(lambda run, place: run.logged),
+            exact=True,
             remedy=lambda size: (
                 f"--set model.command_scale_std={prior_std(size, SCALE_STD):g}, or mend the ratio "
                 "of the gears or the encoders"
@@ -85,6 +86,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             change=in_each_run(acting_later),
             step=CLOCK_STEP_S,
             effect=OnCommands(lambda run, place: delayed(run)),
+            exact=True,
             remedy=remedied,
             least=-earliest,
         ),
@@ -95,6 +97,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
             change=in_each_run(drifting),
             step=CLOCK_STEP_S / longest,
             effect=OnCommands(lambda run, place: delayed(run) * seconds_of(run)[:, None]),
+            exact=True,
             remedy=lambda size: (
                 f"correct the times of the commands by {1e6 * size:.3g} us a second, or give "
                 "cameras and drives one clock"

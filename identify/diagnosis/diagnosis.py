@@ -12,19 +12,11 @@ from scipy.special import chdtrc
 
 from identify.diagnosis.cause import Cause, InList
 from identify.diagnosis.ranking import Ranked, Rows
-from identify.diagnosis.selection import Selected, Selection
+from identify.diagnosis.selection import MOST_OF_IT, Selected, Selection
 from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whiteness
 
 if TYPE_CHECKING:
     import pandas as pd
-
-MOST_OF_IT = 0.9
-"""Share of the misfit that the causes must explain for it to count as explained.
-
-A cause that is there leaves noise once it is fitted. Groups of many numbers can take up most of the
-effect of a cause outside the catalogue.
-"""
-
 
 NAMED = 3
 """Number of causes that one line names of those that cannot be told apart from another."""

@@ -74,6 +74,7 @@ def _zero(joint: int, unit: str) -> Cause:
             "geometry finds all zeros from poses at rest"
         ),
         effect=OnCommands(shifts),
+        exact=True,
     )
 
 
@@ -96,4 +97,5 @@ def _number(name: str, unit: str, direction: Array) -> Cause:
             "cmmsim geometry"
         ),
         effect=OnGeometry(direction),
+        exact=True,
     )

@@ -199,7 +199,8 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
 def torque_limit(run: LoopModel, peak: float) -> Cause:
     """Return a limit of the torques below that of the model. peak: its largest torque.
 
-    Where a robot carries its weight, motion adds only a few per cent to the torque.
+    Sizes are shares of this torque, which is another one at an optimum with other causes. Where a
+    robot carries its weight, motion adds only a few per cent to the torque.
     """
     layout = run.robot.layout
     unit = layout.unit("joint1.coulomb")
@@ -208,6 +209,10 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
     def limited(settings: LoopSettings, size: float) -> LoopSettings:
         drives = replace(settings.drives, torque_limit=peak * (1.0 - min(size, 0.99)))
         return replace(settings, drives=drives)
+
+    def anew(there: OutputErrorProblem, at: Array) -> Cause:
+        torques = [np.abs(one.simulate(at).torque).max() for one in there.runs]
+        return torque_limit(run, float(max(torques)))
 
     return Cause(
         name="torque limit of the drives",
@@ -221,6 +226,7 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
         ),
         least=0.0,
         tried=(0.003, 0.01, 0.03, 0.1),
+        anew=anew,
     )
 
 
@@ -306,4 +312,5 @@ def _gain_difference(joint: int, kind: int, gain: float, unit: str) -> Cause:
         remedy=lambda size: "--set model.gains=each",
         least=LEAST_GAIN * gain,
         effect=OnGain(joint, kind),
+        exact=True,
     )

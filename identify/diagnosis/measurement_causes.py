@@ -70,6 +70,7 @@ def _shared(name: str, place: int, std: float) -> Cause:
             f"standard deviation {std:.2g} that the record states"
         ),
         effect=OnPoses(lambda run, k: run.common.changes[:, :, place]),
+        exact=True,
     )
 
 
@@ -107,6 +108,7 @@ def _gross(number: int, frame: int, component: int) -> Cause:
         step=float(STEPS[component]),
         remedy=lambda size: f"mark frame {frame}{which} as lost: measured_ok = 0",
         effect=OnPoses(changes),
+        exact=True,
         alone=False,
     )
 

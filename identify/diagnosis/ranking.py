@@ -22,6 +22,7 @@ from scipy.special import chdtrc
 
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause
+from identify.diagnosis.fit import Point
 from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.explanation import (
     Misfit,
@@ -103,6 +104,11 @@ class Rows:
         """Return the places of residuals (m,) of a problem."""
         frames = tuple(run.ok for run in problem.runs)
         return cls(len(residual) - 6 * sum(int(one.sum()) for one in frames), frames)
+
+    @property
+    def count(self) -> int:
+        """Number of residuals of poses."""
+        return 6 * sum(int(one.sum()) for one in self.frames)
 
     def of_poses(self, rows: Array) -> Array:
         """Return the part of residuals (m, ...) that is of poses."""
@@ -186,6 +192,17 @@ def rank(
     chance = min(_exactly(first, len(every), left, rows).chance, chance)
     found_first = replace(first, chance=chance)
     return (found_first, *(one for one in ranked if one is not first))
+
+
+def explained_by_all(point: Point, columns: Array) -> float:
+    """Return the statistic of all causes together at an optimum: no candidate has a larger one.
+
+    columns (m, k) of the causes.
+    """
+    beside = point.beside_all
+    usable = np.where(np.isfinite(columns).all(axis=0), columns, 0.0)
+    _, rest = in_few_rows(beside.part(usable), beside.part(point.residual))
+    return float(rest @ rest)
 
 
 def in_few_rows(columns: Array, residual: Array) -> tuple[Array, Array]:

@@ -2,30 +2,45 @@
 
 Causes that were selected before stay free beside the parameters. Of all that are fitted, those
 whose sizes chance explains are left out again (backward elimination).
+
+The first cause is chosen while those beside it are not known. Of candidates that explain nearly
+all alike, a wrong one can take up some of what the others do. So where the selection needs many
+causes, or leaves some of the misfit, it begins anew with the other candidates that explained nearly
+all, and the one with the least cost + k ln n for its k sizes counts (Schwarz's criterion).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynamics import DynamicsError
-from identify.arrays import Array
 from identify.diagnosis.asking import Asked, ask
-from identify.diagnosis.cause import Cause
-from identify.diagnosis.fit import Point, fit
-from identify.diagnosis.linearisation import Linearisation
+from identify.diagnosis.candidate_fits import (
+    INEXACT,
+    RIVALS,
+    Selected,
+    State,
+    Way,
+    beyond_noise,
+    excluded,
+    fitted,
+    fitted_candidates,
+    with_fitted,
+)
+from identify.diagnosis.cause import Cause, with_causes
+from identify.diagnosis.fit import Point
 from identify.diagnosis.ranking import (
     ALIKE,
     EXACT,
     NEAR,
     Ranked,
     Rows,
-    indistinguishable,
+    explained_by_all,
     misfit_of,
     rank,
 )
+from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
@@ -35,40 +50,15 @@ CHANCE = 0.01
 MOST = 3
 """Largest number of causes or groups that are selected."""
 
-CLOSE = 0.8
-"""Share of the best statistic from which on a cause that is tried at a size is fitted, too."""
+SEVERAL = 2
+"""Number of causes above which a selection begins anew with another first one."""
 
-LOOSE = 0.3
-"""The same share, where the best candidate leaves some of the misfit when it is fitted."""
+MOST_OF_IT = 0.9
+"""Share of the misfit that the causes must explain for it to count as explained.
 
-RIVALS = 3
-"""Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
+A cause that is there leaves noise once it is fitted. Groups of many numbers can take up most of the
+effect of a cause outside the catalogue.
 """
-
-INEXACT = 1e-3
-"""Share of a fitted cost by which two fits can differ, as each follows the motion only so far."""
-
-
-@dataclass(frozen=True)
-class Selected:
-    """Selected candidate.
-
-    Attributes
-    ----------
-    ranked : Ranked
-        The candidate as it was ranked.
-    places : tuple of int
-        Places of those of its causes whose sizes chance does not explain.
-    gain : float
-        Fall of the cost as it was fitted.
-    alike : tuple of str
-        Names of the candidates that cannot be told apart from it.
-    """
-
-    ranked: Ranked
-    places: tuple[int, ...]
-    gain: float
-    alike: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -87,24 +77,6 @@ class Selection:
     after: Misfit
 
 
-@dataclass(frozen=True)
-class State:
-    """Selected candidates so far, their optimum, and what is asked there.
-
-    places: those of the fitted causes in the catalogue. causes: the catalogue with the causes as
-    they were fitted. fresh: whether columns are those at this optimum. ranking: of the candidates
-    that are left.
-    """
-
-    chosen: tuple[Selected, ...]
-    places: tuple[int, ...]
-    point: Point
-    causes: tuple[Cause, ...]
-    asked: Asked
-    ranking: tuple[Ranked, ...]
-    fresh: bool = True
-
-
 def select(
     problem: OutputErrorProblem, point: Point, causes: Sequence[Cause], asked: Asked
 ) -> Selection:
@@ -114,34 +86,75 @@ def select(
     """
     rows = Rows.of(problem, point.residual)
     first = rank(asked.causes, asked.columns, point.residual, point.beside, rows)
-    now = State((), (), point, tuple(causes), asked, first)
-    while len(now.chosen) < MOST:
-        more = _with_next(problem, now, point.cost, rows)
-        if more is None:
+    start = State((), (), point, tuple(causes), asked, first)
+    ways = _next_fits(problem, start, rows)
+    ended = start
+    for place, one in enumerate(ways):
+        if place and not (_explains_most(rows, point, one.fit.point) and _doubtful(rows, ended)):
             break
-        now = _exchanged(problem, more, point.cost, rows) if more.fresh else more
-    before, after = (misfit_of(rows, one.residual) for one in (point, now.point))
-    return Selection(now.chosen, now.places, now.point, first, before, after)
+        found = _followed(problem, _with_fit(problem, start, one, rows), point.cost, rows)
+        ended = found if not place or _criterion(found) < _criterion(ended) else ended
+    ended = _simplified(problem, ended, rows)
+    before, after = (misfit_of(rows, one.residual) for one in (point, ended.point))
+    return Selection(ended.chosen, ended.places, ended.point, first, before, after)
 
 
-def _with_next(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State | None:
-    """Return the state with the best of the candidates that are left, or None if none counts.
+def _followed(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State:
+    """Return the state in which no further candidate counts. cost: that without any cause."""
+    while len(now.chosen) < MOST:
+        ways = _next_fits(problem, now, rows)
+        if not ways:
+            break
+        now = _with_fit(problem, now, ways[0], rows)
+        now = _exchanged(problem, now, cost, rows) if now.fresh else now
+    return now
 
-    cost: that without any cause.
-    """
+
+def _explains_most(rows: Rows, without: Point, there: Point) -> bool:
+    """Tell whether the causes at an optimum explain nearly all of the misfit without them."""
+    left, whole = (beyond_noise(rows, one.cost) for one in (there, without))
+    return left <= (1 - MOST_OF_IT) * whole
+
+
+def _doubtful(rows: Rows, ended: State) -> bool:
+    """Tell whether a selection needs many causes, or leaves some of the misfit."""
+    return len(ended.chosen) > SEVERAL or misfit_of(rows, ended.point.residual).significant
+
+
+def _criterion(state: State) -> float:
+    """Return cost + k ln n of a state with k sizes."""
+    return state.point.cost + np.log(len(state.point.residual)) * len(state.places)
+
+
+def _next_fits(problem: OutputErrorProblem, now: State, rows: Rows) -> tuple[Way, ...]:
+    """Return the fits of the candidates that are left, the best first, if any of them counts."""
     if not now.ranking or now.ranking[0].chance > CHANCE:
-        return None
-    # columns follow what was fitted only so far, and those that are not new less
-    followed = 1 - (EXACT if now.fresh else ALIKE) ** 2
-    if now.ranking[0].score.statistic < followed * (cost - now.point.cost):
-        return None
-    trial, alike = _best_fitted(problem, now, rows)
-    if trial is None:
-        return None
-    names = tuple(one.candidate.name for one in alike[1:])
-    one = Selected(alike[0], trial.added, now.point.cost - trial.point.cost, names)
-    chosen = _of_places((*now.chosen, one), trial.places)
-    return _state(problem, now, chosen, trial.places, trial.point, rows)
+        return ()
+    if now.ranking[0].score.statistic < _not_followed(now.chosen, now.causes, now.fresh):
+        return ()
+    return fitted_candidates(problem, now, rows)
+
+
+def _with_fit(problem: OutputErrorProblem, now: State, one: Way, rows: Rows) -> State:
+    """Return the state with a candidate that was fitted."""
+    names = tuple(other.candidate.name for other in one.alike)
+    gain = now.point.cost - one.fit.point.cost
+    added = Selected(one.candidate, one.fit.added, gain, names)
+    chosen = _of_places((*now.chosen, added), one.fit.places)
+    return _state(problem, now, chosen, one.fit.places, one.fit.point, rows)
+
+
+def _not_followed(chosen: Sequence[Selected], causes: Sequence[Cause], fresh: bool) -> float:
+    """Return how much of the misfit the model may leave that its causes explain in truth.
+
+    Columns that are not those of the optimum follow less, and causes that are exact leave nothing.
+    """
+    share = 1 - (EXACT if fresh else ALIKE) ** 2
+    return share * sum(
+        one.gain
+        for one in chosen
+        if not fresh or not all(causes[place].exact for place in one.places)
+    )
 
 
 def _state(
@@ -158,21 +171,27 @@ def _state(
     All are asked anew while noise does not explain what is left. left_out: places of causes that
     are not asked.
     """
-    causes = _with_fitted(before.causes, places, point.causes)
+    causes = with_fitted(before.causes, places, point.causes)
     fresh = misfit_of(rows, point.residual).significant
     if fresh:
+        fitted_model = with_causes(problem, point.causes, point.sizes)
+        causes = tuple(
+            one if one.anew is None or place in places else one.anew(fitted_model, point.parameters)
+            for place, one in enumerate(causes)
+        )
         asked = ask(problem, point, causes, places)
     else:
-        asked = replace(
-            before.asked, causes=_with_fitted(before.asked.causes, places, point.causes)
-        )
+        asked = replace(before.asked, causes=with_fitted(before.asked.causes, places, point.causes))
+    there = State(chosen, places, point, causes, asked, (), fresh)
+    if not fresh and explained_by_all(point, asked.columns) < _not_followed(chosen, causes, fresh):
+        return there
     ranking = tuple(
         one
         for one in rank(asked.causes, asked.columns, point.residual, point.beside_all, rows)
         if not set(one.candidate.places) <= {*places, *left_out}
-        and not _excluded(causes, one.candidate.places, places)
+        and not excluded(causes, one.candidate.places, places)
     )
-    return State(chosen, places, point, causes, asked, ranking, fresh)
+    return replace(there, ranking=ranking)
 
 
 def _exchanged(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State:
@@ -190,185 +209,80 @@ def _exchanged(problem: OutputErrorProblem, now: State, cost: float, rows: Rows)
         free = np.zeros(len(stay), dtype=bool)
         start = now.point.parameters
         try:
-            fitted = _fitted(problem, start, now.causes, places, sizes, sizes, free, None)
+            refitted = fitted(problem, start, now.causes, places, sizes, sizes, free, None)
         except DynamicsError:
             continue
         others = tuple(other for other in now.chosen if other is not one)
-        without = _state(problem, now, _of_places(others, fitted[0]), *fitted, rows, one.places)
-        found = _with_next(problem, without, cost, rows)
-        if found and found.point.cost < now.point.cost - max(NEAR, INEXACT * now.point.cost):
+        left = _of_places(others, refitted[0])
+        without = _state(problem, now, left, *refitted, rows, one.places)
+        ways = _next_fits(problem, without, rows)
+        enough = now.point.cost - max(NEAR, INEXACT * now.point.cost)
+        if ways and ways[0].fit.point.cost < enough:
+            found = _with_fit(problem, without, ways[0], rows)
             *kept, last = found.chosen
             gain = cost - found.point.cost - sum(other.gain for other in kept)
             return replace(found, chosen=(*kept, replace(last, gain=gain)))
     return now
 
 
-def _with_fitted(
-    causes: Sequence[Cause], places: tuple[int, ...], fitted: Sequence[Cause]
-) -> tuple[Cause, ...]:
-    """Return causes, those at some places as they were fitted."""
-    known = dict(zip(places, fitted, strict=True))
-    return tuple(known.get(place, one) for place, one in enumerate(causes))
+def _simplified(problem: OutputErrorProblem, now: State, rows: Rows) -> State:
+    """Return a state with simpler candidates in place of groups, where they explain as much.
 
-
-@dataclass(frozen=True)
-class FittedCandidate:
-    """Candidate that was fitted beside those before it.
-
-    added: places of its causes. places: those of all causes that are left, in the order of the
-    point's sizes.
+    A group of many numbers can be selected because it takes up what causes after it do. So, of
+    several that were selected, each group is taken off again to first order, and candidates of
+    fewer sizes are asked in its place.
     """
-
-    added: tuple[int, ...]
-    places: tuple[int, ...]
-    point: Point
-
-
-def _best_fitted(
-    problem: OutputErrorProblem, now: State, rows: Rows
-) -> tuple[FittedCandidate | None, tuple[Ranked, ...]]:
-    """Fit the best candidate of a state's ranking beside the causes that it has.
-
-    Where that leaves some of the misfit, others that columns cannot tell from it are fitted, too.
-    Returns the best fit, or None where none helps, and its candidate with all like it.
-    """
-    point, asked, places = now.point, now.asked, now.places
-    alike = indistinguishable(now.ranking, rows, point.beside_all.part(point.residual))
-    first = _trial(problem, point, asked, places, alike[0])
-    leaves = first is not None and misfit_of(rows, first.point.residual).significant
-    rival = _rival(asked.causes, alike[0], now.ranking, LOOSE if leaves else CLOSE)
-    others = () if rival is None else (rival,)
-    if leaves:
-        others = (*others, *alike[1 : 1 + RIVALS])
-    fits = [(alike[0], first)]
-    fits += [(one, _trial(problem, point, asked, places, one)) for one in others]
-    helping = [(one, fit) for one, fit in fits if fit is not None]
-    if not helping:
-        return None, alike
-    lead, best = min(helping, key=lambda pair: pair[1].point.cost)
-    near = best.point.cost + max(NEAR, INEXACT * best.point.cost)
-    if first is not None and first.point.cost <= near:
-        lead, best = alike[0], first
-    # fitted, the others can be told apart
-    apart = [id(one) for one, fit in fits if fit is None or fit.point.cost > near]
-    if lead is rival:
-        alike = ()
-    return best, (lead, *(one for one in alike if one is not lead and id(one) not in apart))
+    if len(now.chosen) == 1:
+        return now
+    for one in now.chosen:
+        if len(one.places) > 1 and now.causes[one.places[0]].alone:
+            now = _in_place_of(problem, now, one, rows)
+    return now
 
 
-def _trial(
-    problem: OutputErrorProblem, now: Point, asked: Asked, places: tuple[int, ...], best: Ranked
-) -> FittedCandidate | None:
-    """Fit a candidate beside the causes at some places, or return None where that does not help.
-
-    now: optimum with those at places. asked: causes there.
-    """
-    causes = asked.causes
-    # a group may be asked after one of its members
-    new = [k for k, place in enumerate(best.candidate.places) if place not in places]
-    own = tuple(best.candidate.places[k] for k in new)
-    beside = companions(causes, own)
-    added = (*own, *beside)
-    none = np.zeros(len(beside))
-    tried = [causes[place].tried[0] if causes[place].tried else 0.0 for place in own]
-    sizes = np.concatenate([now.sizes, tried, none])
-    expected = np.concatenate([now.sizes, best.score.sizes[new], none])
-    linear = None
-    if not any(tried):
-        linear = replace(now.linear, by_causes=np.hstack([now.columns, asked.columns[:, added]]))
-    try:
-        held = np.isin(np.arange(len(sizes)), len(now.sizes) + np.flatnonzero(tried))
-        kept, point = _fitted(
-            problem, now.parameters, causes, (*places, *added), sizes, expected, held, linear
-        )
-    except DynamicsError:
-        # the model with the cause does not run
-        return None
-    enough = now.cost - point.cost > np.log(len(now.residual))
-    return FittedCandidate(added, kept, point) if enough and set(added) & set(kept) else None
-
-
-def _rival(
-    causes: Sequence[Cause], best: Ranked, ranking: Sequence[Ranked], share: float
-) -> Ranked | None:
-    """Return a cause that may do better than the best candidate once it is fitted, or None.
-
-    The statistic of one that is tried at a size is the roughest, and at least a share of the best.
-    """
-    for one in ranking:
-        cause = causes[one.candidate.places[0]]
-        close = one.score.statistic > share * best.score.statistic
-        if cause.tried and close and cause.group != causes[best.candidate.places[0]].group:
-            return one
-    return None
-
-
-def companions(causes: Sequence[Cause], places: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the places of the companions that causes at some places have."""
-    wanted = [causes[place].companion for place in places]
-    return tuple(
-        place for place, one in enumerate(causes) if any(one is companion for companion in wanted)
+def _in_place_of(problem: OutputErrorProblem, now: State, one: Selected, rows: Rows) -> State:
+    """Return a state with a simpler candidate in place of one, or the same state."""
+    point = now.point
+    own = np.isin(now.places, one.places)
+    residual = point.residual - point.columns[:, own] @ point.sizes[own]
+    beside = point.beside.without(point.columns[:, ~own])
+    stay = tuple(place for place, out in zip(now.places, own, strict=True) if not out)
+    columns = now.asked.columns.copy()
+    columns[:, list(now.places)] = point.columns
+    found = score(
+        beside.part(point.columns[:, own]),
+        beside.part(residual),
+        np.linalg.norm(point.columns[:, own], axis=0),
     )
-
-
-def _excluded(causes: Sequence[Cause], asked: tuple[int, ...], places: tuple[int, ...]) -> bool:
-    """Tell whether causes at asked places cannot be there beside those at other places."""
-    taken = {causes[place].group for place in places if causes[place].exclusive}
-    return any(causes[place].group in taken for place in asked)
-
-
-def _fitted(
-    problem: OutputErrorProblem,
-    parameters: Array,
-    causes: Sequence[Cause],
-    places: tuple[int, ...],
-    sizes: Array,
-    expected: Array,
-    held: NDArray[np.bool_],
-    linear: Linearisation | None,
-) -> tuple[tuple[int, ...], Point]:
-    """Fit causes, and again without those that chance explains; return the places of the others.
-
-    places (k,): those of the causes in the catalogue. Raises LoopFailure if the model is unstable.
-    """
-    own = [causes[place] for place in places]
-    point = fit(problem, parameters, own, sizes, expected, held, linear)
-    kept = shown_sizes(point)
-    left = tuple(np.array(places)[kept].tolist())
-    if kept.all() or not kept.any():
-        return left, point
-    # those that are left may be explained by others of them
-    sizes = point.sizes[kept]
-    free = np.zeros(len(left), dtype=bool)
-    fitted = _with_fitted(causes, places, point.causes)
-    return _fitted(problem, point.parameters, fitted, left, sizes, sizes, free, None)
-
-
-def shown_sizes(point: Point) -> NDArray[np.bool_]:
-    """Tell which sizes (k,) of an optimum are worth a number of their own.
-
-    Backward elimination: the least significant one is left out while it lowers the cost by less
-    than ln n.
-    """
-    there = point.score()
-    limit = np.log(len(point.residual))
-    kept = np.ones(len(point.sizes), dtype=bool)
-    covariance = there.covariance()
-    sizes = point.sizes.copy()
-    while kept.any():
-        inside = np.flatnonzero(kept)
-        variances = np.diag(covariance)[inside]
-        # a cause that is there or not has no size that could be left out
-        falls = np.where(variances > 0, sizes[inside] ** 2 / np.maximum(variances, 1e-300), np.inf)
-        least = inside[int(np.argmin(falls))]
-        if falls.min() >= limit:
-            break
-        # the others move to where they are best without it
-        gain = covariance[:, least] / covariance[least, least]
-        sizes = sizes - gain * sizes[least]
-        covariance = covariance - np.outer(gain, covariance[least])
-        kept[least] = False
-    return kept
+    enough = ALIKE**2 * found.statistic
+    simpler = [
+        other
+        for other in rank(now.causes, columns, residual, beside, rows)
+        if other.score.freedoms < len(one.places)
+        and other.score.statistic >= enough
+        and not set(other.candidate.places) & set(stay)
+        and not excluded(now.causes, other.candidate.places, stay)
+        and not any(now.causes[place].tried for place in other.candidate.places)
+    ]
+    for other in simpler[:RIVALS]:
+        places = (*stay, *other.candidate.places)
+        sizes = np.concatenate([point.sizes[~own], other.score.sizes])
+        free = np.zeros(len(places), dtype=bool)
+        try:
+            left, there = fitted(
+                problem, point.parameters, now.causes, places, sizes, sizes, free, None
+            )
+        except DynamicsError:
+            continue
+        inside = tuple(place for place in other.candidate.places if place in left)
+        changed = replace(now, places=left, point=there)
+        if not inside or _criterion(changed) >= _criterion(now):
+            continue
+        taken = Selected(other, inside, one.gain + point.cost - there.cost, ())
+        chosen = tuple(taken if each is one else each for each in now.chosen)
+        causes = with_fitted(now.causes, left, there.causes)
+        return replace(changed, chosen=_of_places(chosen, left), causes=causes)
+    return now
 
 
 def _of_places(chosen: tuple[Selected, ...], places: tuple[int, ...]) -> tuple[Selected, ...]:

@@ -11,9 +11,12 @@ from scipy.stats import binom
 
 import identify
 from dynamics.geometry import RobotGeometry
+from identify.diagnosis.candidate_fits import shown_sizes
 from identify.diagnosis.cause import Cause, InList, in_each_run
 from identify.diagnosis.diagnose import diagnosis_from
 from identify.diagnosis.diagnosis import Size, remedies_of
+from identify.diagnosis.fit import Point
+from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.own_cause import own_cause
 from identify.diagnosis.score import OrthogonalComplement, score
 from identify.diagnosis.selection import CHANCE
@@ -185,6 +188,29 @@ def test_of_two_causes_both_are_named(monkeypatch):
     names = {one.name for one in found.findings}
     assert names == {"zero of joint 5", "scale of the commands"}
     assert found.explained == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+def test_a_small_cause_is_named_beside_one_that_is_far_larger(monkeypatch):
+    """The model with another zero is exact, so that what it leaves is of another cause."""
+    found = diagnosed(record_of(17, monkeypatch, with_zeros(0, 6e-3, 0, 0, 0, 0), latency_s=3e-3))
+    names = [one.name for one in found.findings]
+    assert names == ["zero of joint 2", "latency of the commands"]
+    assert found.findings[1].share < 2e-3
+    for one, true in zip(found.findings, (6e-3, 3e-3), strict=True):
+        assert abs(one.sizes[0].value - true) < 4 * one.sizes[0].std
+    assert not found.left.significant
+
+
+def test_a_cause_that_is_tried_at_a_size_is_not_left_out_by_its_derivative():
+    rng = np.random.default_rng(1)
+    by_parameters, columns = rng.standard_normal((60, 3)), rng.standard_normal((60, 2))
+    plain = Cause("plain", "1", "a", in_each_run(lambda run, size: run), 1.0, str)
+    causes = (plain, replace(plain, name="tried", tried=(0.1,)))
+    linear = Linearisation(rng.standard_normal(60), by_parameters, columns)
+    beside = OrthogonalComplement.of(by_parameters)
+    point = Point(causes, np.zeros(3), np.array([1e-9, 1e-9]), linear, beside)
+    assert shown_sizes(point).tolist() == [False, True]
 
 
 @pytest.mark.slow
