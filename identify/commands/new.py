@@ -247,6 +247,7 @@ def record(
     from identify.record.record_template import (
         FRAME_RATE_HZ,
         SCHEMA,
+        columns_text,
         description_text,
         proposed,
         table_text,
@@ -273,7 +274,8 @@ def record(
         asked = f"answer {', '.join(proposal.asked)} in it, " if proposal.asked else ""
         _say(quiet, beside, f"{asked}fill in the rest, then: cmmsim check {file}")
         return
-    description = _with_schema(SCHEMA, description_text(chosen, named, file.name))
+    text = description_text(chosen, named, file.name) + columns_text()
+    description = _with_schema(SCHEMA, text)
     _write({file: table_text(chosen), beside: description}, lambda path: read_own_records([path]))
     _say(quiet, file, f"fill in its rows and {beside}, then: cmmsim identify --record {file}")
 

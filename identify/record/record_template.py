@@ -3,11 +3,13 @@
 For a log of the user's own, the TOML file also has a proposal for the names of its columns.
 """
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 
 from dynamics import Robot
+from identify.record.columns import CommandColumns, PoseColumns
 from identify.record.csv_record import RULES, columns_of
 from identify.record.own_record import DESCRIPTION, Measured, with_whole_frames
 from identify.record.readers.mapped import open_log
@@ -49,6 +51,28 @@ def table_text(robot: Robot) -> str:
     lines = [f"# {line}".rstrip() for line in comments] + [
         ",".join(cells) for cells in [header, *rows]
     ]
+    return "\n".join(lines) + "\n"
+
+
+def columns_text() -> str:
+    """Return an empty ``[columns]`` with all keys as comments, for a table with other names.
+
+    Keys that must be answered have the value "?", and the others their default.
+    """
+    lines = [
+        "",
+        '# If the columns of the table are called otherwise, remove the "# " before the tables and',
+        '# the keys that you need, and replace each "?".',
+        "# cmmsim new record --from LOG proposes the answers.",
+    ]
+    for table, model in (("measured", PoseColumns), ("command", CommandColumns)):
+        lines += ["", f"# [columns.{table}]"]
+        for key, field in model.model_fields.items():
+            must = field.is_required() or (table, key) == ("measured", "time")
+            default = '"?"' if must else json.dumps(field.default)
+            shown = f"# {key} = {default}" if must or field.default is not None else f"# {key} ="
+            lines += [*wrap(f"# {field.description}", WIDTH, subsequent_indent="# "), shown]
+    lines += ["", "# [columns.reference] has the keys of [columns.measured]: desired poses"]
     return "\n".join(lines) + "\n"
 
 

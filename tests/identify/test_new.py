@@ -15,6 +15,7 @@ from cmmsim.files.sensor_file import built_in_names, sensor_schema
 from dynamics import built_in_robots, load_robot
 from dynamics.robot_file import robot_schema
 from identify.commands.help import DONE, NOT_DONE
+from identify.record.columns import CommandColumns, PoseColumns
 from identify.record.own_record import record_schema
 from identify.scenario import load_scenario, scenario_names
 from identify.scenario.scenario import scenario_schema
@@ -139,6 +140,10 @@ def test_a_new_record_is_read_and_asks_for_its_rows(name, capfd):
     assert command("identify", "--record", "mine.csv", "--out", "never", "--quiet") == NOT_DONE
     assert "the record has 2 frames" in one_line(capfd.readouterr().err)
     assert schema_named_in("mine.toml") == record_schema()
+    columns = Path("mine.toml").read_text().partition("# [columns.measured]")[2]
+    for key in {**PoseColumns.model_fields, **CommandColumns.model_fields}:
+        assert f"# {key} =" in columns
+    assert '# convention = "?"' in columns
     assert "a model can close its own loop" in " ".join(
         Path("mine.csv").read_text().replace("#", "").split()
     )

@@ -241,7 +241,8 @@ def budget_figure(budget: Budget) -> Figure:
             label=budget.words[source],
         )
         left += shares[:, source]
-    labels = [f"{budget.quantities[k]}: {budget.std[k]:.2g} {budget.units[k]}" for k in shown]
+    units = [one.replace("urad", "µrad").replace("um", "µm") for one in budget.units]
+    labels = [f"{budget.quantities[k]}: {budget.std[k]:.2g} {units[k]}" for k in shown]
     axes.set_yticks(rows, labels, fontsize=6)
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_xlim(0, 100)
