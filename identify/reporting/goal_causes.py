@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from cmmsim.uncertainty.drift_evidence import MOSTLY_MOVED
 from identify.files.run_folder import predicted_row, rms_row
 from identify.reporting import goals
 from identify.reporting.goals import Goal, explanation_goals, far_off, unseen
@@ -28,9 +29,6 @@ MOSTLY_GUESS = 0.5
 
 ALIKE = 0.99
 """Correlation from which on two parameters act almost alike."""
-
-MOSTLY_MOVED = 0.9
-"""Share of a deviation of the stickers from which on movements of the cameras are its cause."""
 
 STOPPED = "stopped after max_iterations"
 """Beginning of the reason why a search stopped before it had converged."""

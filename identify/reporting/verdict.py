@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from cmmsim.uncertainty.drift_evidence import MOSTLY_MOVED
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.explanation import whiteness
@@ -226,12 +227,18 @@ def _drift_warning(result: dict[str, Any]) -> str | None:
     return (result.get("drift_watch") or {}).get("warning")
 
 
+def _moved(result: dict[str, Any]) -> bool:
+    """Tell whether a movement of the cameras explains what the drift watch has noticed."""
+    return bool(result["drift_watch"].get("explained", 1.0) >= MOSTLY_MOVED)
+
+
 def _cause(consistent: bool | None, result: dict[str, Any]) -> str:
     # If the cameras have moved, the measurement is wrong for any model.
     if warning := _drift_warning(result):
+        again = "Calibrate them again; the" if _moved(result) else "The"
         return (
-            f"{warning[0].upper()}{warning[1:]}. Calibrate them again; the record cannot tell "
-            "whether the model is right."
+            f"{warning[0].upper()}{warning[1:]}. {again} record cannot tell whether the model is "
+            "right."
         )
     if consistent:
         return (
@@ -254,7 +261,12 @@ EXPLAINED = "The identified model explains the record to within the cameras' noi
 
 def _disagreement(consistent: bool | None, result: dict[str, Any]) -> str:
     if _drift_warning(result):
-        return "Model and measurement disagree, and the cameras have lost their calibration."
+        found = (
+            "the cameras have lost their calibration"
+            if _moved(result)
+            else "stickers are not where the cameras should see them"
+        )
+        return f"Model and measurement disagree, and {found}."
     if consistent:
         return "The model does not describe the robot."
     return "Model and measurement disagree, because of an error of the model or of the cameras."
