@@ -54,12 +54,13 @@ LARGEST_MOVE = 0.3
 # The radius comes from the fits if more than this fraction of them succeed, otherwise from the
 # covered area.
 FEWEST_FITTED = 0.5
-# Samples along each side of the square around a dot in which its area is measured.
+# Samples along each side of the square that encloses a dot's cell, the disc in which its area is
+# measured.
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
 EXTREME_PERCENTILES = (2.0, 98.0)
-# The noise of a photograph is unknown, and edges are blurred. All grey values therefore have equal
-# weight, and the limit rejects only shapes that are not ellipses (residuals of 25 grey values rms).
+# The noise of a photograph is unknown. It is set to 5 grey values in all pixels, which then have
+# equal weight. Residuals of 25 grey values rms, the limit, are those of shapes other than ellipses.
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
@@ -252,10 +253,7 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
 def _without_neighbours(
     windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float
 ) -> Array:
-    """Return windows (n, h, h) with only the dot's ground beyond ``reach`` dot radii.
-
-    The pixels there are set to the grey value of the ground.
-    """
+    """Return windows (n, h, h) with the grey value of the ground beyond ``reach`` dot radii."""
     # Imported late, because importing numba takes time.
     from cmmsim.detection.start_kernels import isolate_dots
 
@@ -380,7 +378,7 @@ def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Ar
 
 
 def _blob_detector(pixels: int) -> Any:
-    """Return OpenCV's detector of bright blobs, for images of a number of pixels."""
+    """Return OpenCV's detector of bright blobs, for an image of ``pixels`` pixels."""
     opencv: Any = cv2  # the type stubs of OpenCV lack the blob detector
     options = opencv.SimpleBlobDetector_Params()
     options.filterByColor = True

@@ -1,4 +1,4 @@
-"""Print of the stickers of a sensor file: its sizes, and what is drawn for each sticker."""
+"""Errors of the print of a sensor file's stickers: their sizes, and random errors of each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def print_sizes(file: SensorFile) -> PrintSizes:
 
 
 def drawn_print(file: SensorFile, count: int, stream: int) -> tuple[Array, Array]:
-    """Return the coefficients of print (n, 5) and outline (n, 8) of a body's n stickers.
+    """Draw the coefficients of brightness (n, 5) and outline (n, 8) of a body's n stickers.
 
     ``stream`` is the number of the body, 0 for the platform and 1 for the base.
     """

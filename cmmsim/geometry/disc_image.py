@@ -11,12 +11,13 @@ perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's ce
 (X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to a curve, to which an ellipse is fitted.
 With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). Let t
 be the tangent of the unit circle, and J A a the shift of the centre of the fitted ellipse. A fit to
-grey values minimises the squared distance between curve and ellipse along the curve: the
-integral of (u'w - u'a)² / |J A t| over the angle of u, which gives
+grey values minimises the squared normal distance between curve and ellipse, integrated along the
+curve. Up to a factor, this is the integral of (u'w - u'a)² / |J A t| over the angle of u, and gives
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
-For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
+If J A maps the unit circle to a circle, and w_i = ½ H_ijk u_j u_k, this is
+a_i = (H_ijj + 2 H_jij) / 8.
 
 **Coverage.** By Green's theorem the area of the ellipse within a pixel is a sum of two parts. The
 first is the integral of (x - left) dy over the arcs of the rim inside the pixel, where left is the
@@ -64,7 +65,8 @@ def project_discs(
 
     Discs have centres (n, 3) m and unit normals (n, 3) in camera axes, and radii (n,) m. They must
     lie wholly in front of the camera. An ellipse is the image of the unit disc under
-    x -> centre + A x. Centres are (n, 2) px, and shapes A, which are symmetric, (n, 2, 2) px.
+    x -> centre + A x. The returned centres are (n, 2) px, and the returned shapes A are symmetric,
+    (n, 2, 2) px.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import project_all

@@ -1,9 +1,10 @@
 """Causes in bodies and joints: centres of mass, products of inertia, passive and uneven friction.
 
-Each is a torque that the joints need beside those of the model. The torques of bodies are columns
-of the regressor of full bodies along the motion of the model. Those of passive joints are the
-columns of `dynamics.rigid_body.passive_friction`. The torques act on the model as changes of its
-commands (`identify.model.joint_torques`). Before the motion begins, the drives hold what they need.
+Each cause is a torque that the joints need in addition to the torques of the model. Torques of
+bodies are columns of the regressor of full bodies (ten inertial parameters each), along the motion
+of the model. Torques of passive joints are columns of `dynamics.rigid_body.passive_friction`. All
+act on the model as changes of its commands (`identify.model.joint_torques`). The drives already
+hold these torques before the motion begins, so that only their change since then acts.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,10 +45,10 @@ LEAST_OFFSET = 0.01
 
 @dataclass(frozen=True)
 class Needed:
-    """Torques that a cause of size one needs at the joints.
+    """Additional torques that the joints need if a cause has the size one.
 
-    torques: one array (N, n) for each run, N m or N. along: function of the motions of the runs
-    that returns these torques, where they depend much on the motion.
+    torques: one array (N, n) for each run, N m or N. along: function that returns these torques for
+    other motions of the runs. None if they depend little on the motion.
     """
 
     name: str
@@ -64,7 +65,7 @@ def body_causes(
 ) -> tuple[Cause, ...]:
     """Return the causes in bodies and joints of a problem at its optimum (p,).
 
-    runs: those of the model.
+    runs: the model's simulated run for each record.
     """
     motions = [run_motion(run, found) for run, found in zip(problem.runs, runs, strict=True)]
     needed = [
@@ -100,7 +101,7 @@ def _cause(one: Needed) -> Cause:
 def _remedy(
     remedy: str | InList | Callable[[float], str],
 ) -> Callable[[float], str] | InList:
-    """Return the remedy of a cause. A text does not depend on its size."""
+    """Return the remedy of a cause. A text becomes a function that ignores the size."""
     return (lambda size: remedy) if isinstance(remedy, str) else remedy
 
 
@@ -120,8 +121,8 @@ def _added(one: Needed) -> Change:
 def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]) -> list[Needed]:
     """Return centres of mass and products of inertia of the platform and of the bodies of legs.
 
-    Bodies of one kind are equally uneven, each in its own axes. Full bodies are left out, as the
-    model has these parameters.
+    All bodies of one kind have the same offset or product, each in its own axes. Full bodies are
+    left out, as the model has these parameters.
     """
     layout = robot.layout
     masses = layout.bodies_of(parameters[layout.rigid])[:, 0]
@@ -194,7 +195,7 @@ def _passive_torques(
 def _at_the_joints(
     motions: Sequence[RunMotion], columns: Sequence[Array], place: int
 ) -> tuple[Array, ...]:
-    """Return the torques (N, n) of one of some columns of wrenches (N, 6, k) along each motion."""
+    """Return the torques (N, n) for the column `place` of wrenches (N, 6, k), along each motion."""
     pairs = zip(motions, columns, strict=True)
     return tuple(by_the_joints(one, wrenches[:, :, place]) for one, wrenches in pairs)
 
@@ -221,7 +222,10 @@ def _uneven_friction(run: LoopModel, motions: Sequence[RunMotion]) -> list[Neede
     def remedy(size: float) -> str:
         if integrates:
             return f"--set {key}={prior_std(size, LEAST_OFFSET):g}"
-        return "state how well the zeros of the joints are known, as an offset of friction is one"
+        return (
+            "state how well the zeros of the joints are known: with this law of the drives, an "
+            "offset of friction acts like an error of a zero"
+        )
 
     rates = [one.joint_rates for one in motions]
     typical = np.sqrt(np.mean(np.concatenate(rates) ** 2, axis=0))

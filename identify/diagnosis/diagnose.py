@@ -1,4 +1,4 @@
-"""Diagnosis of records: from what was identified of them to the causes that explain the rest."""
+"""Diagnosis of records: the causes of the misfit that remains after an identification."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ import numpy as np
 from dynamics import Robot
 from identify.arrays import Array
 from identify.diagnosis.asking import ask_first
-from identify.diagnosis.body_causes import body_causes
+from identify.diagnosis.catalogue import catalogue
 from identify.diagnosis.cause import Cause
-from identify.diagnosis.command_causes import command_causes
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
-from identify.diagnosis.geometry_causes import geometry_causes
-from identify.diagnosis.loop_causes import loop_causes
-from identify.diagnosis.measurement_causes import measurement_causes
 from identify.diagnosis.own_cause import check_columns
 from identify.diagnosis.ranking import Rows
 from identify.diagnosis.selection import select
@@ -89,13 +85,14 @@ def diagnose(
 def diagnosed(
     asked: Asked, result: IdentificationResult, causes: Sequence[Cause] = ()
 ) -> Diagnosis:
-    """Return what `diagnose` does, from its checked inputs, and with the same errors."""
+    """Return the same as `diagnose`, for checked inputs. Raises the same exceptions."""
     began = time.perf_counter()
     side = asked.side.with_drive(result.drive.law)
     problem = output_error_problem(asked.records, side, asked.settings)
     errors = result.common_errors.learned
     costs = dict(zip(result.searches, result.costs, strict=True))["command_driven"]
-    # with common errors, those of the last search are not those of the model under commands
+    # Common errors are those of the last search. The optimum of the model under commands then has
+    # others, and must be searched.
     settled = not errors and len(costs) <= asked.settings.max_iterations
     found = diagnosis_from(problem, result.driven_estimate, causes, errors, settled)
     return replace(found, seconds=time.perf_counter() - began)
@@ -112,12 +109,12 @@ def diagnosis_from(
     """Return the diagnosis of a problem, from parameters (p,) near its optimum.
 
     The joints are driven by the logged commands, since the residuals of a right model are white
-    only then. own: causes beside those of the catalogue. errors: estimates, by name, of the errors
-    that all poses of the first record have in common, from which the search for them begins.
-    settled: whether the parameters are the optimum under the logged commands already.
+    only then. own: causes in addition to those of the catalogue. errors: estimates of the first
+    record's common errors, by name. The search for common errors starts from them. settled: whether
+    the parameters are the optimum under the logged commands already.
 
-    Raises EstimationError for a cause of one's own that has no column and for drives that took
-    torques, and LoopFailure if the model is unstable.
+    Raises EstimationError for a cause of one's own that has no effect, and for drives that took
+    torques. Raises LoopFailure if the model is unstable.
     """
     began = time.perf_counter()
     if any(run.settings.drives.torques for run in problem.runs):
@@ -131,7 +128,7 @@ def diagnosis_from(
         scale = bounds.spread(coordinates, problem.guess.std)
         at_bound = coordinates <= bounds.lower + AT_BOUND * scale
     else:
-        # an estimate that is still under way would be accused of what it has not reached yet
+        # Before convergence, causes would be blamed for misfit that the search has yet to remove.
         problem = replace(problem, stop=replace(problem.stop, max_iterations=MOST_STEPS))
         found = search_with_common_errors(problem, [start], lambda n=1: None)
         problem = found.linearised()
@@ -145,24 +142,8 @@ def diagnosis_from(
     return diagnosis_of(selected, causes, rows, time.perf_counter() - began)
 
 
-def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the causes that model and record can have, of a problem at its optimum (p,).
-
-    Companions of others stand behind them all.
-    """
-    runs = [run.simulate(parameters) for run in problem.runs]
-    causes = (
-        *command_causes(problem),
-        *geometry_causes(problem),
-        *loop_causes(problem, parameters, runs),
-        *body_causes(problem, parameters, runs),
-        *measurement_causes(problem, parameters),
-    )
-    return (*causes, *(one.companion for one in causes if one.companion is not None))
-
-
 def _with_errors(problem: OutputErrorProblem, errors: Mapping[str, float]) -> OutputErrorProblem:
-    """Return a problem whose first run has these common errors, if they are all that it can have.
+    """Return a problem whose first run has these common errors, if it can have exactly these.
 
     Of other records nothing is known, and they begin without errors.
     """

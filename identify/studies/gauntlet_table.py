@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from identify.files.run_folder import save_files
 from identify.files.versions import versions
-from identify.studies.rows.gauntlet.catalogue import TROUBLES
+from identify.studies.rows.gauntlet.drawn_troubles import TROUBLES
 from identify.studies.rows.gauntlet.verdict import GROUPS
 from identify.studies.study_file import Study
 

@@ -39,7 +39,7 @@ BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -
         ),
         (
             {"renderer": "blender"},
-            "renderer: unknown renderer 'blender': valid are analytic, auto, pyrender, scene, stat",
+            "renderer: unknown renderer 'blender': valid are analytic, auto, mitsuba, pyren",
         ),
         # what contradicts itself
         ({"camera.black_level": 256.0}, "camera: .*black_level 256 must lie below .* 255"),

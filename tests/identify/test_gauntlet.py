@@ -31,7 +31,7 @@ from identify.studies.rows.gauntlet.case import (
     recorded,
     run_case,
 )
-from identify.studies.rows.gauntlet.catalogue import INSIDE, OUTSIDE, TROUBLES, drawn_troubles
+from identify.studies.rows.gauntlet.drawn_troubles import INSIDE, OUTSIDE, TROUBLES, drawn_troubles
 from identify.studies.rows.gauntlet.trouble import Trouble, typed
 from identify.studies.rows.gauntlet.troubled_plants import PlantWithPlay, late_plant
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge

@@ -399,7 +399,7 @@ def others(value, annotation):
     if isinstance(value, (int, float)):
         return [type(value)(other) for other in (1.25 * value, value + 1, 0.8 * value, 0.001)]
     if value is None:
-        return [100.0, 1e-5]
+        return [100.0, 1e-5, [-0.9, 0.9]]
     return [other for other in get_args(annotation) or CRITERIA if other != value]
 
 

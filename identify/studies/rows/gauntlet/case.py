@@ -19,7 +19,7 @@ from identify.random_streams import child, integer_seed
 from identify.scenario import scenario_from_toml
 from identify.setup import Setup
 from identify.studies.rows.coverage import intervals_hold
-from identify.studies.rows.gauntlet.catalogue import Wrong, drawn_troubles
+from identify.studies.rows.gauntlet.drawn_troubles import Wrong, drawn_troubles
 from identify.studies.rows.gauntlet.trouble import Laboratory, Remedied, Trouble, typed
 from identify.studies.rows.identified import designed_trajectories, row_setup
 from identify.studies.rows.kind import robot_named

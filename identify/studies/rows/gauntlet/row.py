@@ -1,6 +1,6 @@
 """Rows of kind `gauntlet`: something is wrong, and the diagnosis must find it.
 
-The trouble of a row is drawn from its seed, see `identify.studies.rows.gauntlet.catalogue`. The
+The trouble of a row is drawn from its seed, see `drawn_troubles`. The
 sensor adds noise with the covariance that is stated at the home pose. Figures of a row are numbers:
 a kind of trouble is its place in `TROUBLES`, and a group of causes is its place in `GROUPS`.
 """
@@ -23,7 +23,7 @@ from identify.studies.rows.gauntlet.case import (
     laboratory,
     run_case,
 )
-from identify.studies.rows.gauntlet.catalogue import TROUBLES, Wrong
+from identify.studies.rows.gauntlet.drawn_troubles import TROUBLES, Wrong
 from identify.studies.rows.gauntlet.trouble import Trouble
 from identify.studies.rows.gauntlet.verdict import GROUPS, judge
 from identify.studies.rows.identified import READS, memory

@@ -83,7 +83,7 @@ class Trouble:
     Attributes
     ----------
     kind : str
-        Name of the kind of trouble, see `identify.studies.rows.gauntlet.catalogue.TROUBLES`.
+        Name of the kind of trouble, see `identify.studies.rows.gauntlet.drawn_troubles.TROUBLES`.
     size : float
         Size in the unit of the cause.
     unit : str
