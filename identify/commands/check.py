@@ -145,7 +145,7 @@ def _tell(
     }
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
+        said = "; ".join(f"{finding.check}: {finding.brief}" for finding in failed)
         raise VerificationError(
             f"{len(failed)} of {len(findings)} findings about {about} fail: {said}"
         )

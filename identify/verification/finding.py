@@ -1,7 +1,11 @@
 """Result of one check of a robot or of a record."""
 
 from dataclasses import asdict, dataclass
+from textwrap import shorten
 from typing import Any
+
+LONGEST = 160
+"""Largest number of characters of a finding in a message, unless it holds a remedy."""
 
 
 @dataclass(frozen=True)
@@ -19,6 +23,13 @@ class Finding:
     unit: str
     leg: int | None
     text: str
+
+    @property
+    def brief(self) -> str:
+        """The text, without the end of a long list. A remedy is a command, and is never cut."""
+        if "cmmsim " in self.text:
+            return self.text
+        return shorten(self.text, LONGEST, placeholder=" …")
 
     def entry(self) -> dict[str, Any]:
         """Return the finding as a JSON entry."""

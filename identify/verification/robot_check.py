@@ -105,7 +105,7 @@ def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
         return None
     more = f"; further faults: {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
     return (
-        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].text}{more}; the run "
+        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].brief}{more}; the run "
         f"begins nevertheless; cmmsim check {file} shows all findings"
     )
 

@@ -143,6 +143,7 @@ def test_the_command_prints_and_writes_its_table_with_an_estimator_of_ones_own(
         encoding="utf-8",
     )
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
     chosen = ("--only", "warm_start", "--only", "encoders", "--add", "mine:believer")
     assert command("estimators", "--out", folder, *chosen, "--torque-noise", 0.1) == 0
     shown = " ".join(capsys.readouterr().out.split())

@@ -53,10 +53,12 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
 @pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", built_in_names("robot"))
-def test_a_built_in_robot_passes_but_for_the_inertias_that_the_paper_prints(name, tmp_path):
+def test_a_built_in_robot_passes_but_for_known_faults(name, tmp_path):
+    """The paper prints inertias that no body has, and the travel of rus6 ends at a singularity."""
     command("check", name, "--quiet", "--json", tmp_path / "found.json")
     failed = {check for check, entry in _found(tmp_path / "found.json").items() if not entry["ok"]}
-    assert failed == ({"inertias"} if name == "rss6" else set())
+    known = {"rss6": {"inertias"}, "rus6": {"condition over the travel"}}
+    assert failed == known.get(name, set())
 
 
 def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp_path, capfd):

@@ -13,7 +13,6 @@ from identify.estimation.bounds import parameter_bounds
 from identify.estimation.intervals import bounded_estimate
 from identify.estimation.prior import starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.record.from_telemetry import record_of
 from identify.studies.rows.calibrated import drawn_truth, log_of_moving_robot, moving_frames
 from identify.studies.rows.kind import PROBABILITY
 from identify.studies.uniformity import (
@@ -23,10 +22,10 @@ from identify.studies.uniformity import (
     uniformity_figure,
 )
 from tests.identify.record_forms import (
-    COVARIANCE,
     LATENCY_S,
     at_times,
     logged,
+    record_from,
     scenario_of,
     with_rows,
 )
@@ -85,7 +84,7 @@ def test_a_record_without_its_beginning_is_what_the_reader_of_such_a_log_makes()
     record["command_time"] = ("time", record["time"].values + LATENCY_S)
     later = with_rows(logged(record, run), slice(90, None))
     times = later.poses.time
-    expected = record_of(at_times(later, times - times[0]), rss6(), scenario, COVARIANCE)
+    expected = record_from(at_times(later, times - times[0]), scenario)
     found = log_of_moving_robot(record, 1.5, rss6())
     assert found.sizes["time"] == expected.sizes["time"] > 80
     for name in ("time", "acting", "command", "measured_position", "measured_orientation"):
