@@ -16,6 +16,7 @@ from identify.commands.options import BUILT_IN, built_in_names, completion
 from identify.scenario import scenario_names
 from identify.scenario.timing import sensor_names
 from identify.studies.study_file import STUDIES
+from identify.verification.finding import Finding
 from tests.identify.commands import command, leaves, one_line
 
 COMMANDS = sorted(leaves())
@@ -65,20 +66,12 @@ def test_a_limit_that_is_missed_and_a_command_that_cannot_be_done_have_statuses_
     tmp_path, capfd, monkeypatch
 ):
     assert len(STATUSES) == 6
-    monkeypatch.setattr("identify.verification.robot_check.check_robot", lambda *_: [Finding()])
+    far = Finding("reach", False, None, None, "1", None, "too far")
+    monkeypatch.setattr("identify.verification.robot_check.check_robot", lambda *_: [far])
     assert command("check", "rss6", "--quiet") == BEYOND_LIMIT
     assert "1 of 1 findings about rss6 fail: reach: too far" in one_line(capfd.readouterr().err)
     assert command("check", "none.toml") == NOT_DONE
     one_line(capfd.readouterr().err)
-
-
-class Finding:
-    """What `check_robot` finds of a robot that fails."""
-
-    ok, check, limit, text = False, "reach", None, "too far"
-
-    def entry(self):
-        return {"check": self.check, "ok": self.ok, "text": self.text}
 
 
 @pytest.mark.parametrize("quiet", [False, True])
