@@ -79,6 +79,7 @@ TESTS = ("test_pose[planes]: pose", "test_pose[registration]: pose", "test_senso
 ALL_SKIPPED = [f"{test} (the test was skipped)" for test in TESTS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "options", "missing", "guarded"),
     [

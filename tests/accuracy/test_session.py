@@ -219,6 +219,7 @@ def test_good(accuracy): accuracy.record("s", 1, limit=2)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "why"),
     [

@@ -39,6 +39,7 @@ def test_the_true_parameters_leave_nothing_but_the_models_steps():
     assert 0 < np.abs(errors).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_wrong_parameters_err_as_two_runs_of_the_loop_differ():
     """Against runs made here with both parameter sets on the same trajectory."""
     wrong = truth().copy()

@@ -172,6 +172,7 @@ def test_statistics_of_known_values_and_of_none():
             summarise(values, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
     """Half-normal errors: mean sqrt(2/pi), rms 1, 95th percentile the 97.5 % point of the normal
     distribution.

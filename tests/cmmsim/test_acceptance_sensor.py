@@ -214,6 +214,7 @@ def test_latency_and_jitter_of_the_sensor_file_are_found_from_images(volume):
     assert jittering.resolution < 1e-4
 
 
+@pytest.mark.slow
 def test_artefact_that_cannot_be_measured_is_named(volume):
     """Cameras that see nothing but darkness."""
     with pytest.raises(AcceptanceError, match="is not found in the images"):

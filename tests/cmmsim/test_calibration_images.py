@@ -196,6 +196,7 @@ def test_both_shapes_of_opencvs_answer_are_one(monkeypatch):
         assert np.abs(pixel_errors(PERFECT, ASYMMETRIC, *drawn)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_no_board_is_a_reason_and_not_an_error():
     rng = np.random.default_rng(0)
     for board in (DOTS, ASYMMETRIC, CHESSBOARD):

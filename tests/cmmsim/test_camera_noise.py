@@ -90,6 +90,7 @@ def test_rounding_excess_is_the_largest_variance_of_rounded_numbers(deviation):
     )
 
 
+@pytest.mark.slow
 def test_pattern_is_recovered_from_averaged_images():
     """PRNU from a bright and DSNU from a dark level: spatial variance of the mean less what the
     averaging leaves.

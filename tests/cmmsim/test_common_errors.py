@@ -149,6 +149,7 @@ def test_the_common_part_is_that_of_many_calibrations_and_is_added_to_the_noise_
     assert np.mean(np.einsum("ni,ij,nj->n", noisy, weights, noisy)) == pytest.approx(6.0, abs=1.4)
 
 
+@pytest.mark.slow
 def test_a_measurement_states_what_is_known_of_its_common_part(geometry):
     sensor = exact()
     assert not sensor.measure(sensor.home).common_covariance.any()

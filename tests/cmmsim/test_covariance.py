@@ -182,6 +182,7 @@ def test_place_misfits_are_those_of_plain_numpy(stickers):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_compiled_solver_finds_what_plain_numpy_finds():
     """Frames of four to eighteen stickers, some of them displaced or misshapen, with a lens."""
     rng, lost, left_out = np.random.default_rng(0), 0, 0

@@ -236,6 +236,7 @@ def rising(seed, count, rise, fine=12):
     return NOISE.expose(radiance.astype(np.float32), rng), centres
 
 
+@pytest.mark.slow
 def test_light_that_rises_across_a_sticker_is_fitted_with_it():
     """By 6 % a px, half of it across a radius. The error is that which the covariance states; even
     light would put the centres six deviations off.

@@ -132,6 +132,7 @@ def test_no_wrong_pose_in_thousands_of_faults(method, renderer, kinds, frames, s
     require_honest(run_faults(before_boxes(method, renderer), kinds, frames, seed, untracked))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOSING)
 def test_whole_frame_faults_are_lost_with_the_reason(sensor, kind):
     for m, _ in run_faults(sensor, [kind], 4, 2, untracked=0.05)[kind]:

@@ -114,6 +114,7 @@ def test_bent_images_show_what_opencv_says():
             assert np.sqrt((gap**2).mean()) < 0.001
 
 
+@pytest.mark.slow
 def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_distance():
     """From the image's centre, the farthest corner most."""
     dark, bright = (

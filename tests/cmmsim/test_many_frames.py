@@ -110,6 +110,7 @@ def test_nothing_depends_on_the_number_of_threads(monkeypatch):
             np.testing.assert_array_equal(value, getattr(other, name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["perfect", pytest.param("all", marks=pytest.mark.slow), "centroids"]
 )

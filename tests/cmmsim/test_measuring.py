@@ -55,6 +55,7 @@ def test_planes_and_registration_agree(taught):
     assert np.all(stated["planes"] > 1.5 * stated["registration"])
 
 
+@pytest.mark.slow
 def test_same_seed_same_numbers(taught, moving_path):
     sensor, runs = cmmsim.load_sensor("ctrack780", seed=5, taught=taught), []
     for seed in (None, 6, 5):
@@ -92,6 +93,7 @@ def test_images_decide_the_result(taught):
     assert np.all(np.abs(moved - predicted) < 0.1 * np.abs(predicted) + noise), (moved, predicted)
 
 
+@pytest.mark.slow
 def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     """A box hides plane B: `planes` says so; without the box the next frame is measured again."""
     sensor = cmmsim.load_sensor("ctrack780", seed=1, taught=taught, method="planes")

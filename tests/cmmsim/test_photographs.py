@@ -309,6 +309,7 @@ def test_pairs_that_do_not_belong_together_are_lost_with_a_hint():
     assert "36 bright spots in the left image and 36 in the right: do" in found[1].reason
 
 
+@pytest.mark.slow
 def test_the_radius_of_stickers_is_taken_from_the_images():
     """With that of the file, whose stickers are 6 % smaller, no sticker would be measured."""
     larger = {"stickers.radius": 0.0032}
@@ -341,6 +342,7 @@ def test_images_that_are_blurred_or_noisier_than_stated_are_said_to_be(changes, 
     assert re.search(f"^0: squared residuals of grey values are .*{said}", warnings[0]), warnings
 
 
+@pytest.mark.slow
 def test_stickers_that_something_hides_in_some_pairs_are_taught_from_the_others():
     """A rod that stands elsewhere before each pair hides a part of the stickers, or half of one."""
     sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", seed=300)

@@ -152,6 +152,7 @@ def test_the_whole_image_shows_the_windows(lens, renderer, granted):
             assert np.abs(image[y : y + 12, x : x + 12] - window).max() < granted
 
 
+@pytest.mark.slow
 def test_tracking_needs_no_opengl(taught, moving_path, monkeypatch):
     monkeypatch.setattr(pyrender_renderer, "_shared_atlas", None)  # any call would fail
     sensor, path = (

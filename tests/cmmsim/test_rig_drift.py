@@ -29,6 +29,7 @@ def windows(sensor, frame):
     return sensor.look(sensor.home).windows(corners, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("frame", "share"), [(0, 0.0), (2, 0.5), (4, 1.0), (6, 1.0)])
 def test_a_frame_of_drifting_cameras_is_that_of_cameras_moved_so_far(renderer, frame, share):

@@ -86,6 +86,7 @@ def test_streaks_tell_the_movement_but_for_its_sign(rate):
     assert found.longest_px == pytest.approx(np.linalg.norm(true, axis=-1).max(), abs=0.3)
 
 
+@pytest.mark.slow
 def test_partly_hidden_stickers_are_no_streaks():
     sensor = exposed()
     rate = RATES[3]

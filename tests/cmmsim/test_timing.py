@@ -37,6 +37,7 @@ def test_latencies_are_a_clipped_normal_distribution(jitter):
     np.testing.assert_array_equal(steady, np.full(50, 0.020))
 
 
+@pytest.mark.slow
 def test_frames_drop_out_as_often_as_stated_independently_for_a_reason_and_with_the_same_seed_alike():
     sensor = dropping(0.3)
     found = [sensor.measure(sensor.home) for _ in range(200)]

@@ -65,6 +65,7 @@ TWINS = {
 QUICK_TWINS = ("one frame", "lost frames", "from a state", "elastic, Stribeck, from a state")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [name if name in QUICK_TWINS else pytest.param(name, marks=pytest.mark.slow) for name in TWINS],

@@ -201,6 +201,7 @@ def test_sensitivities_of_the_start_are_finite_differences(loop):
         np.testing.assert_allclose(ours[:, :, entry], numeric, atol=1e-5 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["pd", pytest.param("cascade", marks=pytest.mark.slow), LAWS[-1]])
 def test_compiled_and_plain_runs_agree(loop, law):
     settings = loop.settings(latency_s=0.01, drives=replace(drives_of(law), torque_limit=4.0))

@@ -334,6 +334,7 @@ def test_a_leg_whose_link_lies_along_an_axis_at_home_is_refused(name, moved):
         replace(geometry, legs=legs)
 
 
+@pytest.mark.slow
 def test_casadi_functions_are_the_compiled_ones_and_name_what_they_take(robot, values):
     """At random states, to 1e-12 of the largest entry; derivatives of a function exist."""
     rng = np.random.default_rng(5)

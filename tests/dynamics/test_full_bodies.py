@@ -156,6 +156,7 @@ def _angle_rates(pose, omega):
     return (turned.as_euler("XYZ") - pose[3:]) / step
 
 
+@pytest.mark.slow
 def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(full):
     """With the angular velocities of the chain that Pinocchio gets: viscous c |w|^2, which as a
     quadratic form in the twist is the whole wrench; dry c |w|^2 / sqrt(|w|^2 + SLOW^2).
@@ -316,6 +317,7 @@ def test_full_bodies_of_a_robot_file(load_changed):
         robot.layout.check(np.where(np.arange(70) == 3, np.nan, robot.nominal_parameters))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.thorough)])
 def test_full_bodies_cost_few_more_operations_than_centred_ones(name):
     """At most 1.6 times as many, in the equation of motion and in its derivatives."""

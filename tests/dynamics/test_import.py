@@ -74,6 +74,7 @@ def test_a_robot_written_as_toml_is_the_same_to_the_last_digit(name, tmp_path):
         np.testing.assert_array_equal(again.parameter_sets[key].vector, values.vector)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_path):
     pytest.importorskip("mujoco")
@@ -121,6 +122,7 @@ def test_full_bodies_of_legs_exported_and_imported_have_the_same_dynamics(name, 
         assert [text for text in spin if not any(text in note for note in notes)] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "platform_on_a_leg"),
     [
@@ -313,6 +315,7 @@ def test_a_model_of_no_known_kind_is_refused_in_one_line(robot, old, new, words,
     assert re.search(words, refusal(RobotFileError, robot_of_mjcf, tmp_path / "robot.xml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("which", "old", "new", "words"),
     [

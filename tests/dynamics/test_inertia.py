@@ -73,6 +73,7 @@ def test_effect_is_measured_all_over_the_travel(robot):
     assert pose.shape == twist.shape == torque.shape == (300, 6)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.lists(moments, min_size=52, max_size=52))
 def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):

@@ -81,6 +81,7 @@ def followed_from_home(geometry, theta, steps=40):
     return np.hstack([places, turns.as_euler("XYZ")]), least
 
 
+@pytest.mark.slow
 def test_every_joint_vector_within_travel_has_one_pose_that_newton_finds_from_home(robot):
     """All 729 combinations of -limit, 0, +limit and 1500 random ones: the pose is the one reached
     by turning the cranks evenly from home (1e-12), no singularity is met on the way, and the angles

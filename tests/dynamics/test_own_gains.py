@@ -104,6 +104,7 @@ def test_sensitivities_are_finite_differences_of_the_run(own, case):
             _assert_derivative(run, own.parameters, index, ours, 1e-5 if law != case else 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["pd", "cascade"])
 def test_compiled_and_plain_runs_agree(own, law):
     settings = own.settings(latency_s=0.01, drives=Drives(law=law, torque_limit=4.0))

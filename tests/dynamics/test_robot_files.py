@@ -211,6 +211,7 @@ ERROR = 1e-4
 THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
 
 
+@pytest.mark.slow
 def test_joint_centres_are_off_by_normal_errors_of_the_given_size_and_seed(robot):
     """The squares of 15 robots' 36 errors over the variance are chi-square, their mean is zero."""
     plants = [robot.geometry.with_errors(ERROR, np.random.default_rng(k)) for k in range(15)]

@@ -87,11 +87,12 @@ def test_a_robot_on_a_chip_and_a_crane_close_as_well(factor):
             "link is 0.2 m and does not reach: it must be longer than the 0.22",
         ),
         ("ups6", {"leg": 0.5}, "leg is 0.5 m, must be between 0.2 m, the longer of cylinder and"),
-        (
+        pytest.param(
             "rss6",
             {"base_radius": 0.25, "platform_radius": 0.15, "crank": 0.08, "link": 0.15},
             "within a travel of only 0.104 rad about home: 1391 of 2000 positions of the joints "
             "have no pose; condition of the platform side 189, must be <= 20, 11.7 at home",
+            marks=pytest.mark.slow,
         ),
         ("rrr3", {"crank": 0.5, "link": 0.5}, "reach 0.7071 m at home, must be between 0.1861 m"),
     ],

@@ -40,6 +40,7 @@ CHANCE = 4.0
 """Standard deviations that a figure may be off by chance."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("form", "says"),
     [

@@ -53,6 +53,7 @@ def identified(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_squares_sum_up_to_every_variance_that_is_stated(identified):
     budget = error_budget(identified.path)
     found = dict(zip(budget.quantities, budget.std, strict=True))

@@ -150,6 +150,7 @@ def test_kept_answers_say_that_a_model_that_is_off_is_no_worse_than_none(timing)
                 assert figures[f"{what}_share_percent"]["mean"] < 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW)
 def test_few_rows_of_a_study_contradict_no_law(name):
     study, table = rows_of(name, REPEATS[name])

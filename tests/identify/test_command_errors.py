@@ -176,6 +176,7 @@ def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
     assert not diagnosis_from(problem_of([record], mended), values).findings
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_commands_is_diagnosed_with_its_setting():
     record, _ = run_plant(quick(**{"plant.command_scale": 1.0017}), seed=3)
     values = rss6().parameter_sets["truth"].vector

@@ -285,6 +285,7 @@ def test_settings_are_toml_or_text_behind_a_key():
         parse_settings(["=30"])
 
 
+@pytest.mark.slow
 def test_the_command_starts_in_a_process_of_its_own_and_waits_for_nothing_heavy():
     heavy = "casadi", "cv2", "matplotlib", "numba", "pandas", "scipy.optimize"
     loaded = f"import identify.commands.app, sys; print(sorted(set({heavy}) & sys.modules.keys()))"

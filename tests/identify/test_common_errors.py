@@ -128,6 +128,7 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
         assert ignorant.noise_ratio > 1.5 * result.noise_ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)]
 )

@@ -29,6 +29,7 @@ def damaged(content, rng, truncate):
     return bytes(changed)
 
 
+@pytest.mark.slow
 def test_a_file_is_refused_for_any_bit_in_it_and_read_without_its_digest(run_folder):
     path = run_folder.experiment
     whole = path.read_bytes()

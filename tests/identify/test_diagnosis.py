@@ -113,6 +113,7 @@ CASES = {
 """Records whose residual an injected cause doubles, and the true size of the cause."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_cause_that_was_injected_is_named_first_with_its_size(name, monkeypatch):
     make, true = CASES[name]
@@ -157,6 +158,7 @@ def test_another_law_of_the_drives_is_named_as_a_line_to_type():
     assert not found.left.significant
 
 
+@pytest.mark.slow
 def test_several_zeros_are_named_as_a_group_with_the_size_of_each(monkeypatch):
     true = 2e-4 * np.random.default_rng(3).standard_normal(6)
     found = diagnosed(record_of(6, monkeypatch, with_zeros(*true)))
@@ -240,6 +242,7 @@ def test_noise_that_is_stated_wrongly_is_named_with_its_ratio(times):
     assert f"state {only.sizes[0].value:.3g} times" in only.remedies[0]
 
 
+@pytest.mark.slow
 def test_gross_errors_are_named_by_their_frames():
     frames = {50: 0, 231: 1, 400: 4}
     size = 30 * SIGMA
@@ -349,6 +352,7 @@ def allowed(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, __name__, __import__("sys").modules[__name__])
 
 
+@pytest.mark.slow
 def test_an_own_cause_is_asked_beside_those_of_the_catalogue(allowed):
     record = record_of(9)
     half = np.arange(record.sizes["time"]) > record.sizes["time"] / 2
@@ -403,6 +407,7 @@ def run_folder(tmp_path, monkeypatch):
     return folder
 
 
+@pytest.mark.slow
 def test_identify_stores_the_diagnosis_and_warns_and_the_command_repeats_it(run_folder, capsys):
     result = load_result(run_folder.result)
     entry = result["diagnosis"]

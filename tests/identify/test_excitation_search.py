@@ -241,6 +241,7 @@ def climbed(problem):
     return climb(problem, np.random.SeedSequence(0), SilentProgress())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.slow)]
 )
@@ -328,6 +329,7 @@ def test_threads_of_linear_algebra_do_not_change_what_is_found():
     np.testing.assert_array_equal(*found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.3, 1.0])
 def test_interrupt_stops_the_search(seconds, monkeypatch):
     """Ctrl-C while IPOPT runs, which swallows it, or while limits are checked, where CasADi may

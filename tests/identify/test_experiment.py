@@ -90,6 +90,7 @@ def test_rods_join_the_robots_joints():
         assert np.allclose(end, joint, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_legs_that_are_placed_together_are_those_placed_one_by_one(sensor):
     """Also in another order, and where one of them is missing; what is no place is refused by its
     name.
@@ -113,6 +114,7 @@ def test_legs_that_are_placed_together_are_those_placed_one_by_one(sensor):
         sensor.measure(pose, PlacedBodies(("crank9",), together.together[:1]))
 
 
+@pytest.mark.slow
 def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sensor):
     """Nothing is seen for five frames, then the platform is found again; the sensor is told how
     fast it moves.

@@ -50,6 +50,7 @@ def test_it_is_the_double_sum_over_the_frames_with_gaps_left_out():
     )
 
 
+@pytest.mark.slow
 def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_white_ones():
     """The spread of drawn scores is the oracle. Fading correlations lack a part that grows with
     their length.

@@ -322,6 +322,7 @@ def anchored(record, anchor):
     return bare
 
 
+@pytest.mark.slow
 def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_shows_only_the_prior_is_known(
     record,
 ):

@@ -56,6 +56,7 @@ def test_a_new_robot_is_the_built_in_one_under_the_name_of_its_file(name, capsys
     assert schema_named_in("mine.toml") == robot_schema()
 
 
+@pytest.mark.slow
 def test_a_new_robot_of_other_lengths_is_written_and_a_length_it_does_not_have_is_refused(capfd):
     lengths = ("--base-radius", 0.4, "--platform-radius", 0.1, "--crank", 0.2, "--link", 0.3)
     write("robot", "mine.toml", "--like", "rrr3", *lengths)

@@ -31,6 +31,7 @@ def teach(pictures, out, *more):
     return command("teach", *sides, "--sensor", "ctrack780", "--out", out, *more)
 
 
+@pytest.mark.slow
 def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(pictures, tmp_path, capfd):
     assert teach(pictures, tmp_path / "taught") == 0
     said = capfd.readouterr()

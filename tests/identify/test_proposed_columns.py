@@ -103,6 +103,7 @@ def test_a_proposal_for_vicon_asks_which_body_and_which_convention(record, tmp_p
         telemetry_of(trial)
 
 
+@pytest.mark.slow
 def test_a_proposal_keeps_the_order_of_angles_and_a_wrong_order_is_found_with_what_fits(
     record,  # noqa: F811
     tmp_path,

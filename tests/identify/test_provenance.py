@@ -119,6 +119,7 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
         write_report(run_folder.path)
 
 
+@pytest.mark.slow
 def test_identification_states_what_it_read_and_wrote(recorded_folder):
     pipeline.identify(recorded_folder.path, SilentProgress())
     made_of = load_result(recorded_folder.result)[ENTRY]

@@ -503,6 +503,7 @@ def test_a_rate_that_contradicts_the_export_is_refused(record, tmp_path):
         telemetry_of(path)
 
 
+@pytest.mark.slow
 def test_a_bag_without_the_topic_lists_those_that_it_has(record, tmp_path):
     path = as_mcap(tmp_path, record)
     change(path.with_suffix(".toml"), "/plate/pose", "/plate")

@@ -35,6 +35,7 @@ def findings(telemetry, stated=SIGMA):
     return {one.check: one for one in check_telemetry(logged)}
 
 
+@pytest.mark.slow
 def test_a_sound_record_passes_and_its_page_and_json_hold_the_findings(
     record, tmp_path, monkeypatch
 ):
@@ -101,6 +102,7 @@ def test_rows_that_are_missing_are_told_from_commands_that_changed(record):
     assert found["lost poses"].text == "42 of 600 poses are empty or missing, in 2 gaps"
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_the_commands_is_found_with_its_size(record):
     sound = recorded_telemetry(record, "mine.nc")
     commands = sound.commands

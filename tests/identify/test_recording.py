@@ -178,6 +178,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, recor
     )
 
 
+@pytest.mark.slow
 def test_runs_share_a_file_and_keep_their_order(tmp_path, record, truth):
     path = tmp_path / "validation.nc"
     numbered = [truth.assign(parameter_value=n + 0 * truth["parameter_value"]) for n in (0, 1)]

@@ -126,6 +126,7 @@ def edges_with_ink(image):
     return [name for name, pixels in edges.items() if pixels[..., :3].min() < 0.8]
 
 
+@pytest.mark.slow
 def test_words_of_the_figures_of_a_run_stand_within_their_files(result):
     estimated = dict(list(result["identification"]["parameters"].items())[:14])
     figures = {
@@ -170,6 +171,7 @@ return worst;
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_images")
 def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finished_run, result):
     data = read_run(finished_run)
@@ -206,6 +208,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
     assert "&lt;b&gt;cost &amp; step&lt;/b&gt;" in text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_images")
 def test_the_papers_figures_stand_only_beside_its_own_robot_and_settings(finished_run):
     data = read_run(finished_run)
@@ -395,6 +398,7 @@ def test_parameter_figure_shows_what_is_identifiable_with_its_interval(result):
     )
 
 
+@pytest.mark.slow
 def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refused(run_folder):
     """With the command that does what is missing."""
     short = build_model_run(np.arange(5) / 60, np.zeros((5, 6)), np.zeros((5, 6)))

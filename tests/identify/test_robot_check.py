@@ -61,6 +61,7 @@ def test_a_built_in_robot_passes_but_for_known_faults(name, tmp_path):
     assert failed == known.get(name, set())
 
 
+@pytest.mark.slow
 def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp_path, capfd):
     asked = [
         "--set",

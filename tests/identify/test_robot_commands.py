@@ -121,6 +121,7 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
         exciting_trajectory(robot)
 
 
+@pytest.mark.slow
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
     off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
     monkeypatch.setattr("identify.verification.against_mujoco.verify", lambda *_: off)

@@ -388,6 +388,7 @@ def test_resolved_scenario_with_changes_reads_back_equal_and_its_timing_follows_
 DRIVEN = {"identification.method": "command_driven"}
 
 
+@pytest.mark.slow
 def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_folder):
     pipeline.identify(recorded_folder.path, SilentProgress(), DRIVEN)
     kept, result = load_scenario(recorded_folder.scenario), load_result(recorded_folder.result)
@@ -408,6 +409,7 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_
     assert load_result(recorded_folder.result)["identification"]["searches"] == ["command_driven"]
 
 
+@pytest.mark.slow
 def test_without_settings_the_scenario_is_left_as_it_is_and_by_an_identification_that_fails_the_result_too(
     recorded_folder,
 ):

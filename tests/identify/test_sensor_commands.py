@@ -50,6 +50,7 @@ def rendering(folder, pairs=1):
     return "--render", pairs, "--sensor", folder / "small.toml", "--board", folder / "board.toml"
 
 
+@pytest.mark.slow
 def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where_it_is_written(
     pictures, tmp_path, capfd
 ):

@@ -36,6 +36,7 @@ def result(record):
     return identify.identify(record)
 
 
+@pytest.mark.slow
 def test_a_setup_runs_the_experiment_that_one_call_does_and_runs_it_again(setup, record, tmp_path):
     setup.sensor.measure(setup.robot.home_pose)  # moves no stream of the run's noise
     for other in (setup.run(path=tmp_path / "a.nc"), identify.run_experiment(
@@ -68,6 +69,7 @@ def test_identify_reads_a_record_from_the_path_of_its_file(record):
         identify.identify("nowhere.nc")
 
 
+@pytest.mark.slow
 def test_identify_takes_robot_and_scenario_from_the_record(setup, record, result):
     given = identify.identify(record, setup.robot, setup.scenario)
     np.testing.assert_array_equal(given.estimate, result.estimate)

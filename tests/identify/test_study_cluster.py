@@ -269,6 +269,7 @@ def test_a_scheduler_with_certificates_takes_a_study_with_the_same_one_and_no_ot
             run(address.replace("tls", "tcp"), "c")
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_anybody_can_speak_to_is_refused_unless_that_is_wanted(monkeypatch):
     monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 0.2)
     for address in ("tcp://192.0.2.1:8786", "192.0.2.1:8786", "tcp://[2001:db8::1]:8786"):

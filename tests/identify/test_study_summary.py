@@ -264,6 +264,7 @@ def test_what_a_study_lacks_is_said(tmp_path, monkeypatch):
     assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 4
 
 
+@pytest.mark.slow
 def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(
     tmp_path, monkeypatch
 ):

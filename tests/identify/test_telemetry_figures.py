@@ -21,6 +21,7 @@ def moving(rate_hz, rng):
     return time, np.stack(waves, axis=1) + SIGMA * rng.standard_normal((len(time), 6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [29, 60, 250])
 def test_noise_is_found_to_a_tenth_and_jumps_by_their_times_though_times_jitter(rate_hz):
     time, measured = moving(rate_hz, np.random.default_rng(rate_hz))

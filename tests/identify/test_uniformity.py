@@ -98,6 +98,7 @@ def probabilities(**figures):
     return pd.DataFrame({PROBABILITY + name: values for name, values in figures.items()})
 
 
+@pytest.mark.slow
 def test_right_distributions_pass_and_wrong_ones_are_named():
     rng = np.random.default_rng(3)
     right = {f"right{k}": rng.random(300) for k in range(40)}
