@@ -150,10 +150,8 @@ def _validation(result: dict[str, Any]) -> list[Goal]:
         (UNSEEN_POSITION, slice(3), VALIDATION_UM, "µm"),
         (UNSEEN_ORIENTATION, slice(3, 6), VALIDATION_URAD, "µrad"),
     ):
-        widest = _widest(limit, declared[:, part])
-        said = "; the limit is three standard deviations of the prediction"
-        detail = text + (said if widest > limit else "")
-        goals.append(Goal(name, float(found.rows[:, part].max()), "<=", widest, unit, detail))
+        largest = float(found.rows[:, part].max())
+        goals.append(_within(name, largest, limit, declared[:, part], unit, text, "the prediction"))
     return goals
 
 
@@ -172,16 +170,23 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
         (SENSOR_POSITION, slice(3), SENSOR_UM, "µm"),
         (SENSOR_ORIENTATION, slice(3, 6), SENSOR_URAD, "µrad"),
     ):
-        widest = _widest(limit, DECLARED_STDS * common[part])
-        said = "; the limit is three standard deviations of the declared camera errors"
-        detail = text + (said if widest > limit else "")
-        goals.append(Goal(name, float(row[part].max()), "<=", widest, unit, detail))
+        declared = DECLARED_STDS * common[part]
+        largest = float(row[part].max())
+        what = "the declared camera errors"
+        goals.append(_within(name, largest, limit, declared, unit, text, what))
     return [*goals, Goal(LOST, float(sensor["lost_frames"]), "<=", 0.0, "", lost)]
 
 
-def _widest(limit: float, declared: Array) -> float:
-    """Return a limit, or the largest declared error if that is larger."""
-    return max(limit, float(np.nanmax(declared, initial=0.0)))
+def _within(
+    name: str, value: float, limit: float, declared: Array, unit: str, text: str, what: str
+) -> Goal:
+    """Return a goal whose limit is the largest declared error if that is beyond its own limit.
+
+    declared: three standard deviations of declared errors. what: words for these errors.
+    """
+    widest = max(limit, float(np.nanmax(declared, initial=0.0)))
+    said = f"; the limit is three standard deviations of {what}"
+    return Goal(name, value, "<=", widest, unit, text + (said if widest > limit else ""))
 
 
 def _parameters(result: dict[str, Any]) -> list[Goal]:
