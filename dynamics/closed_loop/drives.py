@@ -5,7 +5,7 @@ is, up to the limit,
 
     torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
-`motion_kernels.drive` computes the torque. At the limit, li z - lx theta is kept constant while it
+`drive_kernels.drive` computes the torque. At the limit, li z - lx theta is kept constant while it
 would otherwise grow further (conditional integration). The laws differ in the
 gains that they use, in c, and in lx:
 

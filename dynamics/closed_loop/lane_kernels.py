@@ -6,9 +6,10 @@ the time, and is computed for all lanes together.
 
 import numpy as np
 
+from dynamics.closed_loop.drive_kernels import drive
 from dynamics.closed_loop.frame_kernels import begin, next_span
 from dynamics.closed_loop.linear_algebra_kernels import copy
-from dynamics.closed_loop.motion_kernels import OK, count_stuck, drive, hold_stuck, push
+from dynamics.closed_loop.motion_kernels import OK, count_stuck, hold_stuck, push
 from dynamics.closed_loop.sensitivity_kernels import END
 from dynamics.closed_loop.stick_slip_kernels import (
     BRACKET,

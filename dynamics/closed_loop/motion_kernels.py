@@ -1,13 +1,13 @@
 """Kernels for the equation of motion at a state.
 
-Each joint slips in one direction (mode +1 or -1) or sticks (mode 0). The drives give the torque of
-each joint for its command; see `drives` for the formula. A stuck joint has the friction torque that
-makes its acceleration zero. A joint at rest sticks if this torque is below its breakaway torque.
-For friction and elastic joints see `joints`.
+Each joint slips in one direction (mode +1 or -1) or sticks (mode 0). A stuck joint has the friction
+torque that makes its acceleration zero. A joint at rest sticks if this torque is below its
+breakaway torque. For friction and elastic joints see `joints`.
 """
 
 import numpy as np
 
+from dynamics.closed_loop.drive_kernels import drive, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import copy, dot, factorise, fill, solve
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
@@ -15,61 +15,6 @@ from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 SMOOTHED = 1
 STRIBECK = 2
 OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
-
-
-@kernel
-def drive(task: Record, now: Record, at: Record) -> None:
-    """Compute the torques of the drives from the angles and velocities of an evaluation."""
-    state = at.state
-    count = len(at.angle)
-    first = 2 * len(at.bias)
-    time = at.time
-    for i in range(count):
-        ld = task.ld[i]
-        if task.stiffness > 0:
-            # joint PID and friction act on the motors: their angles replace those of the cranks
-            motor = state[len(state) - 2 * count + i]
-            motor_rate = state[len(state) - count + i]
-            wound = motor - at.angle[i]
-            winding = motor_rate - at.velocity[i]
-            at.spring[i] = task.stiffness * wound + task.damping * winding
-            at.angle[i] = motor
-            at.velocity[i] = motor_rate
-        error = now.command[i] + now.command_slope[i] * time - at.angle[i]
-        damped = ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
-        if task.filter_time > 0:
-            damped = ld * state[first + count + i]
-        at.error[i] = error
-        at.torque[i] = task.lp[i] * error + damped + task.li[i] * state[first + i]
-        if task.lx[i] > 0:
-            at.torque[i] -= task.lx[i] * at.angle[i]
-        # A law that commands torques replaces the joint PID, whose error is then not integrated.
-        if task.torques:
-            at.torque[i] = now.command[i] + now.command_slope[i] * time
-            at.error[i] = 0.0
-        # The limit comes last, because it applies to the torque of any law.
-        if task.torque_limit > 0:
-            at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
-
-
-@kernel
-def follows_law(task: Record, at: Record, joint: int) -> float:
-    """Return 1 if the torque of a joint follows its PID, 0 if it is commanded or at its limit."""
-    if task.torques or (task.torque_limit > 0 and abs(at.torque[joint]) >= task.torque_limit):
-        return 0.0
-    return 1.0
-
-
-@kernel
-def winds_up(task: Record, at: Record, joint: int) -> bool:
-    """Return True if the integral of a drive would grow further while the drive is at its limit.
-
-    The integral is then held (conditional integration).
-    """
-    if task.torques or follows_law(task, at, joint) > 0:
-        return False
-    growth = task.li[joint] * at.error[joint] - task.lx[joint] * at.velocity[joint]
-    return bool(growth * at.torque[joint] > 0)
 
 
 @kernel

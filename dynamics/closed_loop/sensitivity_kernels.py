@@ -11,6 +11,7 @@ of its length follows from the derivative of the margin. The next step becomes s
 this step becomes longer. The impulse that stops joints is differentiated implicitly, too.
 """
 
+from dynamics.closed_loop.drive_kernels import follows_law, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import (
     add_product,
     clear,
@@ -24,10 +25,8 @@ from dynamics.closed_loop.motion_kernels import (
     count_stuck,
     dry_level,
     dry_slope,
-    follows_law,
     hold_compliance,
     mode_margin,
-    winds_up,
 )
 from dynamics.compiled.kernel import (
     Array,

@@ -131,7 +131,7 @@ def _of_run(
     shown = sensitivity.shape[2]
     white = run.without_common(np.asarray(run.whitener @ rows))
     slopes = run.of_all(white[:, :, :shown])
-    missed = run.without_common(run.missed(found))
+    missed = run.without_common(run.run_residuals(found))
     return missed, slopes.reshape(missed.size, -1), white[:, :, shown:].reshape(missed.size, -1)
 
 
@@ -218,7 +218,7 @@ def residuals(problem: OutputErrorProblem, parameters: Array) -> Array:
     Raises LoopFailure if the model is unstable.
     """
     known, _ = problem.known(parameters)
-    return np.concatenate([known, *(run.misses(parameters).ravel() for run in problem.runs)])
+    return np.concatenate([known, *(run.residuals(parameters).ravel() for run in problem.runs)])
 
 
 def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) -> list[Array | None]:

@@ -79,7 +79,7 @@ def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause,
     places = [
         (number, int(frame))
         for number, run in enumerate(problem.runs)
-        for frame in suspicious_frames(run.misses(parameters), run.ok)
+        for frame in suspicious_frames(run.residuals(parameters), run.ok)
     ][:MOST_FRAMES]
     return tuple(
         _gross(number, frame, component) for number, frame in places for component in range(6)

@@ -43,7 +43,8 @@ def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tupl
     except EstimationError:
         return ()
     parameters = found["command_driven"].solution.parameters
-    remaining = float(np.mean(np.concatenate([run.misses(parameters) for run in judged.runs]) ** 2))
+    residuals = np.concatenate([run.residuals(parameters) for run in judged.runs])
+    remaining = float(np.mean(residuals**2))
     if remaining > (1 - EXPLAINS) * misfit:
         return ()
     hints = []

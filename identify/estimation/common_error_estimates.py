@@ -51,7 +51,7 @@ def errors_of_run(run: LoopModel, parameters: Array) -> Array:
     The run is one returned by `with_common_errors`. The errors are in prior standard deviations.
     """
     assert run.marginal is not None
-    missed = run.missed_in_noise(parameters).ravel()
+    missed = run.noise_residuals(parameters).ravel()
     return errors_from_residuals(run.marginal.modes, missed)
 
 

@@ -222,7 +222,7 @@ def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:
     counts = [one.shape[2] for one in modes]
     found = []
     for number, (run, own) in enumerate(zip(runs, modes, strict=True)):
-        missed, slopes = run.residuals_in_noise(parameters)
+        missed, slopes = run.noise_linearised(parameters)
         before = np.zeros((*missed.shape, sum(counts[:number])))
         after = np.zeros((*missed.shape, sum(counts[number + 1 :])))
         rows = np.concatenate([slopes, before, own, after], axis=2)

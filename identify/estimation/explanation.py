@@ -261,8 +261,8 @@ def explanation(
 ) -> Explanation:
     """Judge a model from the command-driven problem at its own optimum (p,).
 
-    misfit: misfit of the estimate. rng: generator for `white_misses`. Raises EstimationError with
-    too few good frames.
+    misfit: misfit of the estimate. rng: generator for `white_residuals`. Raises EstimationError
+    with too few good frames.
     """
     residuals, ok = _residuals(driven, parameters, rng)
     return Explanation(misfit, misfit_of_white(residuals[ok]), whiteness(residuals, ok))
@@ -273,7 +273,8 @@ def _residuals(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the whitened residuals (N, 6) of all records, and which frames (N,) are good."""
     runs = driven.runs
-    return by_frames([run.white_misses(parameters, rng) for run in runs], [run.ok for run in runs])
+    residuals = [run.white_residuals(parameters, rng) for run in runs]
+    return by_frames(residuals, [run.ok for run in runs])
 
 
 def by_frames(

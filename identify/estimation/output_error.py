@@ -6,8 +6,8 @@ loses the same frames as the real sensor. Driven by commands, the joints of the 
 commands, which contain the effect of the sensor's noise on the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance
-(`LoopModel.misses` computes them), and a row for each piece of prior knowledge: the initial guess
-of each parameter and the scale anchor.
+(`model/residuals.py` computes them), and a row for each piece of prior knowledge: the initial
+guess of each parameter and the scale anchor.
 """
 
 from collections.abc import Sequence
@@ -100,7 +100,7 @@ class OutputErrorProblem:
         total = float(known @ known)
         try:
             for run in self.runs:
-                total += float(np.sum(run.misses(parameters, ahead) ** 2))
+                total += float(np.sum(run.residuals(parameters, ahead) ** 2))
         except DynamicsError:
             # A search then reduces its step.
             return np.inf
@@ -117,7 +117,7 @@ class OutputErrorProblem:
         # Each record is reduced to its triangular factor, which saves memory.
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
-            residual, shown = run.shown_residuals(parameters)
+            residual, shown = run.linearised(parameters)
             cost += float(np.sum(residual**2))
             # Factoring costs less with the few columns of the groups than with all parameters.
             rows = triangular_factor(shown.reshape(residual.size, -1), residual.ravel())

@@ -123,7 +123,7 @@ class JointProblem:
         total = float(known @ known)
         try:
             for one, run in zip(self.parts, runs, strict=True):
-                missed = one.whiten(run.misses(parameters).ravel())
+                missed = one.whiten(run.residuals(parameters).ravel())
                 errors = run.errors_had[run.contained]
                 total += float(missed @ missed + errors @ errors)
         except DynamicsError:
@@ -146,7 +146,7 @@ class JointProblem:
             errors = run.errors_had[run.contained]
             # Modes come first, because their run is cached and also gives the residuals.
             modes = one.modes_at(run, parameters)
-            missed, shown = run.shown_residuals(parameters)
+            missed, shown = run.linearised(parameters)
             left = one.whiten(missed.ravel())
             cost += float(left @ left + errors @ errors)
             columns = np.column_stack([shown.reshape(missed.size, -1), modes])

@@ -1,11 +1,6 @@
-"""Model of one recorded run, and its residuals against the measured poses.
-
-The model is driven by its own servo or by the logged commands. Its residuals are whitened with the
-covariance of the sensor's noise and of the errors that all measured poses have in common.
-"""
+"""Model of one recorded run, driven by its own servo or by the logged commands."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,12 +27,13 @@ from identify.model.body_errors import body_errors, body_modes, fed_forward
 from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
+from identify.model.residuals import Residuals
 from identify.record.checks import long_gap_warnings
 from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Marginal
 
 
 @dataclass(frozen=True)
-class LoopModel:
+class LoopModel(Residuals):
     """Model of one run of a robot, for the output error of its parameters (p,).
 
     Attributes
@@ -305,87 +301,6 @@ class LoopModel:
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]
         return error if noise is None else error + noise
 
-    def misses(self, parameters: Array, ahead: bool = False) -> Array:
-        """Return the whitened residuals model - measurement (n, 6) of the good frames.
-
-        With `ahead`, the run also computes the sensitivities that `shown_residuals` will need.
-        Raises LoopFailure if the model is unstable.
-        """
-        return self.without_common(self.missed_in_noise(parameters, ahead))
-
-    def missed_in_noise(self, parameters: Array, ahead: bool = False) -> Array:
-        """Return the residuals (n, 6) as `misses`, but whitened by the noise alone."""
-        return self.missed(self._latest_run(parameters, sensitivities=ahead))
-
-    def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
-        """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
-        given = parameters.tobytes()  # a copy, because the caller can change the array
-        if self.known_runs.get(sensitivities, (b"", None))[0] != given:
-            self.known_runs[sensitivities] = given, self.simulate(parameters, sensitivities)
-        return self.known_runs[sensitivities][1]
-
-    @cached_property
-    def known_runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
-        """Latest run without and latest run with sensitivities, and their parameters."""
-        return {}
-
-    def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `misses` (n, 6) of a model driven by commands. If it is right, they are white.
-
-        rng: generator for a subclass that fits states to the poses. Raises LoopFailure.
-        """
-        return self.misses(parameters)
-
-    def shown_residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """Return `misses` (n, 6), and their derivatives (n, 6, k) before `of_all`."""
-        missed, shown = self._shown_in_noise(parameters)
-        return self.without_common(missed), self.without_common(shown)
-
-    def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters, from those by pivots and the ungrouped."""
-        if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
-            return shown
-        return self.groups.of_all(shown)
-
-    def residuals_in_noise(self, parameters: Array) -> tuple[Array, Array]:
-        """Return residuals (n, 6) and their Jacobian (n, 6, p), whitened by the noise alone."""
-        missed, shown = self._shown_in_noise(parameters)
-        return missed, self.of_all(shown)
-
-    def _shown_in_noise(self, parameters: Array) -> tuple[Array, Array]:
-        run = self._latest_run(parameters, sensitivities=True)
-        assert run.pose_sensitivity is not None
-        shown = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self.missed(run), shown
-
-    def missed(self, run: ClosedLoopRun) -> Array:
-        """Return the residuals (n, 6) of a run of the model, whitened by the noise alone.
-
-        The part due to the common errors in the model is subtracted.
-        """
-        seen = run.pose if self.driven or self.drawn is None else run.measured
-        missed = self.whiten(seen - self.measured)
-        return missed if self.marginal is None else missed - self.marginal.had.reshape(missed.shape)
-
-    def whiten(self, differences: Array) -> Array:
-        """Return pose differences (N, 6) at the good frames whitened by the noise, (n, 6)."""
-        return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
-
-    @property
-    def whitened_modes(self) -> Array:
-        """Modes (n, 6, k) of a run `with_common_errors`, at the good frames and whitened."""
-        count = np.count_nonzero(self.ok)
-        if self.marginal is None:
-            return np.zeros((count, 6, 0))
-        return self.marginal.modes.reshape(count, 6, -1)
-
-    def without_common(self, rows: Array) -> Array:
-        """Whiten rows (n, 6, ...) for the common errors. They are whitened by the noise already."""
-        if self.marginal is None:
-            return rows
-        stacked = rows.reshape(len(self.marginal.modes), -1)
-        return self.marginal.whiten(stacked).reshape(rows.shape)
-
     def without_gaps(self) -> Array:
         """Return measured poses (N, 6) with lost frames interpolated, for linear fits only."""
         return without_gaps(self.measured, self.ok)
@@ -393,8 +308,3 @@ class LoopModel:
     def warnings(self) -> tuple[str, ...]:
         """Return a warning if many consecutive frames were lost, which weakens the estimate."""
         return long_gap_warnings(self.ok, self.settings.timing.frame_rate_hz)
-
-    @cached_property
-    def whitener(self) -> Array:
-        """Matrix (6, 6) that scales pose differences to standard deviations of the sensor."""
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)), dtype=float)

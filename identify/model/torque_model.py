@@ -109,8 +109,8 @@ class TorqueModel(LoopModel):
         """Return the model's run. Its fits are cached, because the next fits start from them."""
         return self.simulate(parameters, sensitivities)
 
-    def white_misses(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `misses`, with random noise added along the directions that the starts fit.
+    def white_residuals(self, parameters: Array, rng: np.random.Generator) -> Array:
+        """Return `residuals`, with random noise added along the directions that the starts fit.
 
         They are white if the model is right.
         """
@@ -118,7 +118,7 @@ class TorqueModel(LoopModel):
         for fit in self._fits(parameters, None):
             directions = np.linalg.qr(fit.jacobian)[0]
             drawn.append(directions @ rng.standard_normal(directions.shape[1]))
-        return self.misses(parameters) + np.concatenate(drawn).reshape(-1, 6)
+        return self.residuals(parameters) + np.concatenate(drawn).reshape(-1, 6)
 
     @property
     def _spans(self) -> list[tuple[int, int]]:

@@ -147,7 +147,7 @@ def _with_fitted_start(run: LoopModel, parameters: Array) -> LoopModel:
     """
     cost = math.inf
     for _ in range(MOST_FITS):
-        missed = run.missed_in_noise(parameters)
+        missed = run.noise_residuals(parameters)
         before, cost = cost, float(np.sum(missed**2))
         if cost > SETTLED * before:
             break

@@ -214,7 +214,7 @@ def test_friction_and_gains_are_identified_with_intervals_and_unseen_motion_is_p
     scenario, truth = quick(), truth_of(robot)
     record, _ = run_plant(scenario, seed=1, robot=robot)
     run = problem_of([record], scenario, robot).runs[0]
-    residuals, slopes = run.residuals_in_noise(truth)
+    residuals, slopes = run.noise_linearised(truth)
     forbidden = list(FORBIDDEN.get(robot.name, ()))
     unmoved = run.whiten(run.simulate(truth).pose * 0 + robot.home_pose - run.measured)[
         :, forbidden

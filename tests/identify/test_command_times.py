@@ -123,7 +123,7 @@ def test_spans_of_torques_miss_a_record_by_its_noise():
     ).record
     assert logged_latencies(record, scenario.timing).std() > 0.2 / 60
     logged, blind = (
-        np.mean(identified_model(one, side_of(scenario)).misses(plant.parameters) ** 2)
+        np.mean(identified_model(one, side_of(scenario)).residuals(plant.parameters) ** 2)
         for one in (record, record.drop_vars("command_time"))
     )
     assert 0.85 < logged < 1.05

@@ -333,7 +333,7 @@ def test_records_that_share_a_draw_do_not_average_it():
     def run(number, common, turn):
         marginal = Marginal.of((modes[number] @ turn).reshape(-1, 2))
         return SimpleNamespace(
-            residuals_in_noise=lambda parameters: (0.1 * np.ones((frames, 6)), jacobians[number]),
+            noise_linearised=lambda parameters: (0.1 * np.ones((frames, 6)), jacobians[number]),
             without_common=lambda rows: marginal.whiten(rows.reshape(6 * frames, -1)).reshape(rows.shape),
             whitened_modes=modes[number] @ turn,
             common=SimpleNamespace(**{"known_as": common.known_as, "whole_factor": common.factor @ turn},

@@ -99,7 +99,7 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
 
     def found(scale):
         run = SimpleNamespace(
-            residuals_in_noise=lambda parameters: (scale * noise, jacobian),
+            noise_linearised=lambda parameters: (scale * noise, jacobian),
             without_common=lambda rows: rows,
             whitened_modes=np.zeros((frames, 6, 0)),
             common=NONE,

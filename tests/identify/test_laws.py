@@ -92,7 +92,7 @@ def test_spans_of_torques_find_their_starts_from_filtered_rates_that_are_far_off
         * np.random.default_rng(0).choice([-1, 1], (len(run.starts), 6))
     )
     far = replace(run, starts=run.starts + np.hstack([0 * off, 5 * off]))
-    assert np.sqrt(np.mean(far.misses(plant.parameters) ** 2)) < 1.2
+    assert np.sqrt(np.mean(far.residuals(plant.parameters) ** 2)) < 1.2
 
 
 @pytest.mark.thorough
