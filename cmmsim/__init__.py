@@ -34,8 +34,8 @@ Every exception that a user can cause is a CmmError, except OpenGLMissingError. 
 and renderers: `allow_plugin(module)` allows a module of the user to run. Everything else is
 private.
 
-Names are imported on first use: the command `cmmsim` begins in this package and must not wait for
-OpenCV and OpenGL.
+Names are imported on first use, because the command `cmmsim` begins in this package and must not
+wait for OpenCV and OpenGL.
 """
 
 from importlib import import_module

@@ -1,12 +1,13 @@
 """Detectors and renderers by name: built-in ones, and a user's own as ``module:name``.
 
-A built-in part has its own file and one line in a table of this module. Its file is imported when
-its name is first used.
+Each built-in detector or renderer has its own file, and one line in a table of this module. Its
+file is imported when its name is first used.
 
 ``module:name`` can be used wherever a built-in name can be used. The module's folder must be on
-PYTHONPATH, so that other processes find it. People exchange scenarios, sensor files and studies.
-A name in such a file therefore runs code only if its module is allowed: by ``--plugin my_module``
-on the command line, by the environment variable ``CMMSIM_PLUGINS``, or by `allow_plugin`.
+PYTHONPATH, so that other processes find it. A file of another person must not run code unasked.
+A module named in a scenario, sensor file or study is therefore imported only if it is allowed: by
+``--plugin my_module`` on the command line, by the environment variable ``CMMSIM_PLUGINS``, or by
+`allow_plugin`.
 """
 
 import importlib
@@ -75,15 +76,15 @@ def allowed_plugins() -> tuple[str, ...]:
 
 
 def is_plugin_name(name: str) -> bool:
-    """Tell whether a name has the form ``module:name`` of a user's own part."""
+    """Tell whether a name has the form ``module:name``, which names a user's own code."""
     return ":" in name
 
 
 def import_plugin(option: str, name: str) -> Any:
-    """Import a user's own part by its name ``module:name``.
+    """Import an object of the user by its name ``module:name``.
 
-    ``option`` states the kind of part in messages, such as "detector". Raises CmmError if the
-    module is not allowed to run, cannot be imported, or has no such part.
+    ``option`` states in messages what it is, such as "detector". Raises CmmError if the module is
+    not allowed to run, cannot be imported, or has no such object.
     """
     module, _, attribute = name.partition(":")
     if not (_is_module(module) and attribute.isidentifier()):
@@ -121,8 +122,8 @@ class PluginFunction:
     """Function of a plugin. Its exceptions are reported in one line with file and line number.
 
     ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged,
-    and any other exception becomes an ``error_class``. ``check`` is called with the part's name,
-    the result and the arguments. It raises an exception of a known class if the result is wrong.
+    and any other exception becomes an ``error_class``. ``check`` is called with ``part``, the
+    result and the arguments. It raises an exception of a known class if the result is wrong.
     """
 
     part: str
@@ -173,14 +174,14 @@ def find(
 ) -> K:
     """Return the Detector or Renderer with a built-in name or a name ``module:name``.
 
-    ``kind`` is the class Detector or Renderer. A user's own part can be an instance of ``kind``, a
-    function, or a class whose instances are called like a function. Such a class is created without
-    arguments. A function becomes an instance of ``kind``. Attributes of the function with the names
-    of numeric fields of ``kind`` become the values of these fields. ``check`` checks each result,
-    see `PluginFunction`.
+    ``kind`` is the class Detector or Renderer. ``module:name`` can be an instance of ``kind``, a
+    function, or a class whose instances are called like a function. Such a class is instantiated
+    without arguments. A function is wrapped in an instance of ``kind``. If the function has an
+    attribute with the name of a numeric field, such as ``bias_px``, the field gets its value.
+    ``check`` checks each result, see `PluginFunction`.
 
     Raises UnknownOptionError, which lists the valid names, for an unknown name. Raises CmmError for
-    a part that cannot be called, and for a module that is not allowed to run.
+    an object that cannot be called, and for a module that is not allowed to run.
     """
     name = _required(option, name, built_in)
     if name in built_in:

@@ -1,9 +1,9 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
 The discs are drawn exactly, at known random positions within a pixel, and the camera's noise is
-added. An error is the distance between the detected centre and the centre of the ellipse. The image
-of the disc's centre lies beside the ellipse's centre (eccentricity). Errors do not include this
-distance. Two methods of OpenCV are compared as well.
+added. An error is the distance between the detected centre and the centre of the ellipse. The
+eccentricity, the distance from there to the image of the disc's centre, is not part of the error.
+Two methods of OpenCV are compared as well.
 """
 
 from collections.abc import Callable, Sequence

@@ -47,7 +47,7 @@ class SensorFileError(CmmError):
 class UnknownOptionError(CmmError):
     """An option has a value that is not one of its valid values.
 
-    ``own`` is True if ``module:name`` of a user's own part is valid as well.
+    ``own`` is True if a name ``module:name`` of the user's own code is valid as well.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LostError(CmmError):
 
 
 class DividedError(LostError):
-    """Error that two groups of stickers in one frame agree on different poses."""
+    """Two groups of stickers in one frame determine different poses."""
 
 
 class TeachingWarning(UserWarning):
@@ -85,7 +85,7 @@ class TeachingWarning(UserWarning):
 
 
 class TeachingError(CmmError):
-    """The stickers could not be taught; the message names the step."""
+    """Teaching failed, or its result cannot be used; the message states the cause."""
 
 
 class OpenGLMissingError(RuntimeError):
@@ -108,4 +108,4 @@ class PhotographError(CmmError):
 
 
 class AcceptanceError(CmmError):
-    """A volume cannot be seen, measuring lines break a rule, or an artefact cannot be measured."""
+    """A volume is not visible, measuring lines break a rule, or an artefact is not measured."""

@@ -1,6 +1,6 @@
 """Random faults of stereo images.
 
-A measurement of images with a fault must be right, or must count as lost.
+They serve to test that a measurement of faulty images is either right or counts as lost.
 
     faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
@@ -33,8 +33,8 @@ from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
 # With probability one half, a fault changes at most this number of stickers.
 FEW = 4
-# Kinds of faults. The method FaultGenerator._<kind> draws a fault of a kind, and returns marks or a
-# whole fault.
+# Kinds of faults. The method FaultGenerator._<kind> draws a fault of the kind, and returns its
+# marks or a whole Fault.
 KINDS = (
     *(
         "hidden",

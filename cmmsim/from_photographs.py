@@ -19,14 +19,16 @@ from cmmsim.photographs.taught_file import read_taught
 from cmmsim.sensor import Sensor
 from cmmsim.uncertainty.known_rig import KnownRig
 
-# Photographs are not drawn. This renderer needs no OpenGL, and its images have exact centres.
+# Every sensor has a renderer, although photographs are not rendered. This one needs no OpenGL, and
+# adds no error to the stated errors of centres.
 RENDERER = "analytic"
 
 
 def sensor_for(name: str | Path) -> Sensor:
-    """Return the sensor of a file. It knows its cameras with the covariance that the file states.
+    """Return the sensor of a file.
 
-    Raises SensorFileError for a covariance that is not valid.
+    If the file states a covariance of the cameras, the sensor takes it into account. Raises
+    SensorFileError for a covariance that is not valid.
     """
     file = read_sensor_file(name)
     if file.rig.covariance is None:
@@ -42,7 +44,7 @@ def sensor_for(name: str | Path) -> Sensor:
 def photographs_for(
     sensor: Sensor, left: Source, right: Source, colour: str | None = None
 ) -> Photographs:
-    """Return pairs of photographs, to be checked against a sensor. Raises PhotographError."""
+    """Return pairs of photographs in the format of a sensor's images. Raises PhotographError."""
     rate = sensor.timing.frame_rate
     return Photographs(left, right, Format(sensor.rig, sensor.noise, rate, colour))
 
@@ -57,8 +59,8 @@ def teach(
     """Teach a sensor from photographs of its platform in several poses.
 
     The cameras and the base stand still, and the platform moves from pair to pair. Stickers need no
-    labels: those with the same pixels in most pairs belong to the base, and those that move
-    together to the platform. Each sticker is identified by its rough place in the sensor file. If
+    labels: those at the same pixels in most pairs belong to the base, and those that move together
+    belong to the platform. Each sticker is identified by its rough place in the sensor file. If
     the file states the covariance of the cameras, as a file of `cmmsim calibrate` does, the cameras
     are adjusted within this covariance.
 
@@ -77,7 +79,7 @@ def teach(
     Returns
     -------
     PhotographedTeaching
-        Its ``taught`` is for `load_sensor`, and its ``save`` writes a file.
+        Its ``taught`` can be passed to `load_sensor`, and its ``save`` writes a file.
 
     Raises
     ------

@@ -86,7 +86,7 @@ class Instrument:
             **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
         )
         lens = lens_from_file(file)
-        # For an estimator that does not know the lens, all depths are in focus.
+        # An estimator that does not know the lens assumes that all depths are in focus.
         blur = Optics(lens.psf_px, lens.vignetting)
         self.optics = lens if file.lens.known else blur
         self.platform = marked_body("platform", file.platform)
@@ -97,7 +97,7 @@ class Instrument:
         bodies = self.platform, self.base
         self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
-        # Each teaching from photographs begins with these values, a repeated one as well.
+        # Teaching from photographs always begins with these values, even if it is repeated.
         self._stated = self.platform, self.rig, self._known
         self._taught: Taught | None = None
         if taught is not None:

@@ -33,7 +33,7 @@ DROPOUT_STREAM = 2
 class Sensor(Instrument):
     """Stereo optical CMM that measures the pose of a platform.
 
-    It teaches itself on first use. `load_sensor` makes a sensor by name.
+    Teaching takes place on first use. `load_sensor` makes a sensor by name.
 
     Parameters
     ----------
@@ -370,9 +370,8 @@ class Sensor(Instrument):
         return Frames(self.estimator, at, rates, around, rngs, placed, period)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
-        """Return a tracker, which measures frame after frame."""
-        # The faster tracker needs every sticker of the scene, and teaching can leave some out. It
-        # does not model print.
+        # StatisticalTracker is faster, but it requires that no sticker was left out at teaching,
+        # and that the print is perfect.
         whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
         perfect = self._file.print.is_perfect
         if (

@@ -1,9 +1,9 @@
 """Poses from square tags (ArUco, AprilTag), compared with poses from the stickers of a sensor.
 
-A tag is drawn on each plane of the platform, as large as fits between the plane's stickers, with
-the same cameras, levels, lens and noise as the stickers. OpenCV finds its corners. Tags and
-stickers are found anew in the whole images of each frame. The places of all corners and stickers
-on the platform are known exactly, and so is the rig, so the errors are those of the images alone.
+A tag is drawn on each plane of the platform, as large as fits between the plane's stickers. It has
+the same cameras, grey levels, lens and noise as the stickers. OpenCV finds its corners. Tags and
+stickers are searched in the whole images of each frame, without tracking. The rig and the places of
+all corners and stickers are known exactly. The errors are therefore those of the images alone.
 
 Corners are triangulated and fitted rigidly like stickers, with equal weights. OpenCV states no
 covariance of its corners. The covariance of a pose from tags is therefore that of least squares,
@@ -288,7 +288,7 @@ def _score(marks: str, method: str, poses: Array, found: Sequence[Sequence[Found
         for k in np.flatnonzero(good).tolist()
     ]
     bias = np.concatenate([(pair[0].pixels - pair[0].expected).ravel() for pair in found])
-    # The scatter comes from the pairs in which the same marks are found, and in the same order.
+    # Scatter is computed only where both frames of a pair have the same marks in the same order.
     alike = [pair for pair in found if np.array_equal(pair[0].expected, pair[1].expected)]
     scatter = np.concatenate(
         [np.zeros(0), *((pair[1].pixels - pair[0].pixels).ravel() for pair in alike)]

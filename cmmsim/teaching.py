@@ -1,17 +1,17 @@
-"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes.
+"""Teaching (paper section 4.2), which finds the frames of base and platform from sticker planes.
 
-The base stands still, and its stickers are averaged over many exposures. The platform follows a
-smooth path. Its stickers are observed at each pose, and registration moves all observations onto
-each other. The planes are fitted to the mean constellation. Because the stickers lie on different
-sub-pixel positions at different poses, errors of the image formation are averaged out as well.
+The base stands still, and its stickers are observed in the mean of many exposures. The platform
+follows a smooth path. Its stickers are observed at each pose, and registration moves all
+observations onto each other. The planes are fitted to the mean constellation. The stickers have
+different sub-pixel positions at different poses, so errors of the image formation average out too.
 
 The centres always come from the maximum-likelihood fit, whichever detector the sensor uses later.
 The base is seen at one pose only. If another detector were used here, every measured pose would
 therefore contain the bias of that detector.
 
 The search windows are made for the largest image of a sticker. This is the larger of two images:
-the image at the nearest working distance, assumed a fifth nearer than the rig's target, and the
-largest image in view of both cameras at teaching.
+the image at the nearest working distance, assumed to be a fifth shorter than that of the rig's
+target, and the largest image that both cameras see at teaching.
 """
 
 import warnings
@@ -49,13 +49,13 @@ Progress = Callable[[int, int], None]
 SHIFT = 0.008
 TURN = 0.03
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-# Largest distance of a sticker from its place in averaged exposures, m. Unless the sticker is
-# hidden, the distance is a few micrometres.
+# Largest distance of a sticker from its place in averaged exposures, m. The distance is a few
+# micrometres unless the sticker is partly hidden.
 LARGEST_GAP = 1e-4
-# Largest rms distance between the two rays of a sticker of the base, in standard deviations. It is
-# 1.2 to 1.4 if cameras and stickers are as stated.
+# Largest rms distance between the two rays of a sticker of the base, in standard deviations. The
+# distance is 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
-# Distance of a sticker from its place that errors by print may cause, in standard deviations.
+# Additional distance that is allowed for errors of the print, in standard deviations.
 PRINT_REACH = 20.0
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
@@ -88,7 +88,7 @@ class TeachingPlan:
 
 
 class Camera(Protocol):
-    """Two cameras in front of the true scene."""
+    """Interface of two cameras in front of the true scene."""
 
     def look(
         self, pose: Array, rng: np.random.Generator, *, quality: Quality | None = None
@@ -129,7 +129,8 @@ class Teacher:
                 for body in (self.base, self.platform)
             ]
             report(1, steps)
-            # Every measured pose contains the error of this single view, so it is averaged longest.
+            # Every measured pose contains the error of this single view, so its mean is taken over
+            # the most exposures.
             base = self._look_at(
                 self.base,
                 start[0],

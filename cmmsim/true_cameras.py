@@ -42,7 +42,7 @@ from cmmsim.without_images.drawn_stickers import (
 from cmmsim.without_images.sticker_scene import StickerScene
 from cmmsim.without_images.verified import require_proved
 
-# Renderers that take each body as the convex hull of its mesh.
+# Renderers that replace each body by the convex hull of its mesh.
 SEE_HULLS = ("analytic", "statistical")
 
 
@@ -109,8 +109,7 @@ class TrueCameras:
 
         Raises the same exceptions as `Sensor.look`.
         """
-        # The legs of a robot are passed in every frame, so they are checked together, which is
-        # fast.
+        # The legs of a robot are passed in every frame. Checking them together saves time.
         if isinstance(obstacles, PlacedBodies) and self._are_placed(obstacles):
             return obstacles
         obstacles = {} if obstacles is None else obstacles
@@ -207,7 +206,7 @@ class TrueCameras:
         )
 
     def _centre_errors(self) -> CentreErrors | None:
-        """Return the errors that uneven print and outlines cause in drawn centres, or None."""
+        """Return the errors of centres due to uneven print and irregular outlines, or None."""
         file = self._file
         if file.print.unevenness == 0.0 and file.print.outline == 0.0:
             return None

@@ -141,7 +141,6 @@ def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
 
 
 def _behind(body: Body, rig: Rig) -> Body:
-    """Return the body moved far behind both cameras."""
     view = np.array(rig.target) - np.array(rig.position)
     shift = -OUT_OF_SIGHT * view / np.linalg.norm(view)
     planes = Planes(

@@ -2,9 +2,10 @@
 
 The bar moves along two rasters, each in three orientations. At the start of each raster, it first
 stands still. One raster goes to and fro along the volume's x axis while it advances along y. The
-other raster exchanges these axes. If the bar pointed at the cameras, its flat stickers would not be
-visible. In the third orientation, the bar is therefore inclined by only ``TOWARDS_DEPTH`` to the
-image plane. In addition, the bar rotates smoothly about all its axes.
+other raster exchanges these axes. The bar lies along x in the first orientation, along y in the
+second, and is inclined to the image plane by ``TOWARDS_DEPTH`` in the third. It does not point at
+the cameras, because its flat stickers would not be visible. In addition, it rotates smoothly about
+all its axes.
 
 The sensor measures the poses of the sticker clusters at both ends in the same exposure. The
 measured pose of one end relative to the other is compared with the certified relative pose, for the

@@ -21,7 +21,7 @@ from cmmsim.geometry.stereo_rig import StereoRig
 
 # Smallest distance of the corners from the image edges. It leaves space for the artefacts' width.
 MARGIN_PX = 40.0
-# Largest ratio of half the volume's depth to the distance of the target from the baseline.
+# Largest ratio of half the volume's depth to the distance from the baseline to the target.
 LARGEST_DEPTH_RATIO = 0.8
 # m: smallest side of a volume. The stickers of an artefact do not fit into a smaller volume.
 SMALLEST_SIZE = 0.1

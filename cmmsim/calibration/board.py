@@ -105,8 +105,8 @@ class Board(Section):
     def charuco(self, legacy: bool = False) -> cv2.aruco.CharucoBoard:
         """Return OpenCV's description of a ChArUco board.
 
-        OpenCV before version 4.6 placed markers in the other squares if the rows of squares are
-        even in number. ``legacy`` describes such a board.
+        If the number of rows of squares is even, OpenCV before version 4.6 placed the markers in
+        the other squares. ``legacy`` describes such a board.
         """
         squares = (self.columns + 1, self.rows + 1)
         found = cv2.aruco.CharucoBoard(squares, self.spacing, self.marker or 0.0, self.markers)

@@ -54,13 +54,13 @@ LARGEST_MOVE = 0.3
 # The radius comes from the fits if more than this fraction of them succeed, otherwise from the
 # covered area.
 FEWEST_FITTED = 0.5
-# Samples along each side of the square that encloses a dot's cell, the disc in which its area is
-# measured.
+# The area of a dot is measured in its cell, a disc around it. Number of samples along each side of
+# the square that encloses the cell.
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates ground from dot.
 EXTREME_PERCENTILES = (2.0, 98.0)
 # The noise of a photograph is unknown. It is set to 5 grey values in all pixels, which then have
-# equal weight. Residuals of 25 grey values rms, the limit, are those of shapes other than ellipses.
+# equal weight. A shape with residuals above 25 grey values rms is not an ellipse and is rejected.
 PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )

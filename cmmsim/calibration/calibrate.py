@@ -289,7 +289,6 @@ def _units(board: Board, state: RigState) -> list[str]:
 
 
 def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
-    """Return a line if many pairs are not used."""
     unused = [pair for pair in pairs if not pair.both]
     if len(unused) <= LARGEST_UNUSED * len(pairs):
         return []

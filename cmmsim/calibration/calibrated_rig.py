@@ -25,11 +25,11 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left", "rig.covariance")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-# Largest ratio without a warning between two baselines, that of the calibration and that of the
-# sensor file. The longer one is divided by the shorter one.
+# Largest ratio without a warning between the baselines of the calibration and of the sensor file.
+# The longer one is divided by the shorter one.
 LARGEST_BASELINE_RATIO = 1.5
-# Ratio of these baselines from which on the board file certainly has another unit: mm give about
-# 1000, and cm about 100.
+# Above this ratio, the lengths of the board file are certainly not in m: mm give about 1000, and cm
+# about 100.
 OTHER_UNIT_RATIO = 30.0
 
 
@@ -50,9 +50,9 @@ class UsedView:
 class Calibration:
     """Both cameras with their covariance, and the data from which they were calibrated.
 
-    ``sightings`` are the adjusted pixels, corrected for the eccentricity of dots. ``rejected`` maps
-    the name of each pair with an unused image to the reason; the other image can be in use. Each of
-    the ``warnings`` is one line.
+    The pixels of ``sightings`` are those of the adjustment, corrected for the eccentricity of dots.
+    ``rejected`` maps the name of each pair with an unused image to the reason; the other image can
+    be in use. Each of the ``warnings`` is one line.
     """
 
     rig: StereoRig
@@ -99,9 +99,9 @@ class Calibration:
 
 
 def _inverse_left_jacobian(vector: Array) -> Array:
-    """Return the derivative (3, 3) of a rotation vector (3,) with respect to a small left rotation.
+    """Return the derivative (3, 3) of a rotation vector (3,) by a small rotation on the left.
 
-    See Sola et al. 2018, eq. 146.
+    Source: J. Sola et al., A micro Lie theory for state estimation in robotics (2018), eq. 146.
     """
     angle = float(np.linalg.norm(vector))
     k = skew(vector)

@@ -26,7 +26,7 @@ from cmmsim.radiometry.stereo_images import StereoFrame
 # this margin, and a bright rim of width RIM, in spacings as well, surrounds the squares.
 MARGIN = 1.0
 RIM = 0.35
-# Picture elements along the side of a square. OpenCV rounds the sides of markers to them.
+# Picture elements along the side of a square. OpenCV rounds the sides of markers to whole elements.
 SQUARE = 80
 THICKNESS = 0.008  # m
 # Reflectances.
@@ -96,9 +96,9 @@ def _squares(board: Board) -> Print:
 
 
 def default_board(rig: StereoRig) -> Board:
-    """Return a board of 13 x 9 dots that fills a third of the width of the left image.
+    """Return a board of 13 x 9 dots.
 
-    The board is then at the depth at which the optical axes meet.
+    At the depth at which the optical axes meet, it fills a third of the left image's width.
     """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
     return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))
@@ -111,7 +111,7 @@ def meeting_depth(rig: StereoRig) -> float:
     """
     right_axis = invert(rig.right_from_left)[:3, 2]
     eye = _right_eye(rig)
-    # The closest approach of two lines, which parallel axes do not have.
+    # The closest approach of two lines. It is not defined for parallel axes.
     across = 1.0 - right_axis[2] ** 2
     depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
     return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
@@ -129,8 +129,8 @@ def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generat
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
     """Draw one pose that shows the whole board to both cameras.
 
-    The board lies in the next cell of the image. If the first half of the tries fails, any cell is
-    allowed.
+    ``number`` selects the cell of the image in which the board's middle lies. If the first half of
+    the tries fails, any cell is allowed.
     """
     corners = plate_corners(board)
     depth = meeting_depth(rig)
@@ -237,7 +237,7 @@ def render_pairs(
 ) -> Iterator[StereoFrame]:
     """Yield noisy images of both cameras for each pose left_from_board (4, 4).
 
-    The renderer draws dots. Squares are drawn as a print, without it.
+    The renderer draws boards of dots. Boards of squares are drawn as prints instead.
     """
     renderer = print_renderer([_squares(board)]) if board.has_squares else renderer
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))

@@ -1,4 +1,4 @@
-"""Pairs of image files, and the points of the board that the cameras saw in them."""
+"""Views of the board in pairs of image files, and all points that each camera saw."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -117,8 +117,8 @@ def view_pairs(
 class Sightings:
     """All m sightings of board points by one camera.
 
-    ``view`` (m,) is the ascending index of the view, ``point`` (m,) the index of the point of the
-    board, and ``pixels`` (m, 2) its place in the image.
+    ``view`` (m,) is the index of the view, in ascending order. ``point`` (m,) is the index of the
+    point of the board, and ``pixels`` (m, 2) its place in the image.
     """
 
     view: NDArray[np.int_]

@@ -1,8 +1,9 @@
 """Start values of the adjustment: OpenCV's calibration of each camera and of the pair.
 
 The points of a symmetric board can be numbered in several orders (half a turn, quarter turns), and
-the order is found for each picture separately. Both pictures of a pair have the same order if, and
-only if, all pairs agree on the place of the right camera.
+the order is found for each picture separately. Two pictures of a pair with different orders give a
+wrong place of the right camera. The order in each right picture is therefore chosen such that most
+pairs agree on this place.
 """
 
 from collections.abc import Sequence
@@ -42,8 +43,8 @@ def start_values(
 ) -> tuple[RigState, list[PairView]]:
     """Return the first state, and the pairs with the same order of points in both images.
 
-    Pairs that do not fit the others lose both views. ``radial_terms`` frees two radial terms of
-    distortion, and ``size`` is (width, height) px. Raises CalibrationError.
+    Pairs that do not fit the others lose both views. If ``radial_terms`` is True, two radial terms
+    of distortion are estimated. ``size`` is (width, height) px. Raises CalibrationError.
     """
     left, from_left = _one_camera(board, pairs, 0, size, radial_terms, fix_aspect)
     right, from_right = _one_camera(board, pairs, 1, size, radial_terms, fix_aspect)

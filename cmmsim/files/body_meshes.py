@@ -1,6 +1,6 @@
 """Bodies of a sensor file that are triangle meshes, and the stickers on their surfaces.
 
-A mesh takes the place of the convex solid that planes and cuts enclose. It is drawn, and it hides
+A mesh replaces the convex solid that planes and cuts enclose. It is drawn, and it can hide
 stickers. The stickers still belong to three planes, which define the frame of the body.
 """
 
@@ -31,7 +31,7 @@ SMALLEST_SIZE_RATIO = 0.3
 # sticker's dark ring.
 LARGEST_DEPTH = 0.0002
 REMEDY = "; {}.drop = true moves the planes of stickers onto the surface"
-# Fraction of a triangle by which a line may miss it, so that no line passes between two triangles.
+# A line may miss a triangle by this fraction of its size, so that no line passes between triangles.
 EDGE_TOLERANCE = 1e-6
 
 
@@ -178,7 +178,7 @@ def _require_on_surface(
 
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)
     for sticker, place, height in zip(body.sticker_ids, body.nominal, heights, strict=True):
-        # a sticker that juts out over an edge lies near the surface, although not along its normal
+        # below a sticker that juts out over an edge there is no surface, but the edge is near
         away = float(closest_point_naive(mesh, place[None])[1][0])
         deep = height > LARGEST_DEPTH
         if deep or away > radius:

@@ -1,4 +1,4 @@
-"""Errors of the print of a sensor file's stickers: their sizes, and random errors of each."""
+"""Sizes of the print errors that a sensor file states, and random errors of each sticker."""
 
 from __future__ import annotations
 

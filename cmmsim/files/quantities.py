@@ -36,7 +36,7 @@ class Bounds:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         inner = handler(source)
-        # In strict mode, pydantic does not accept texts and truth values as numbers.
+        # In strict mode, pydantic does not accept strings and booleans as numbers.
         if inner["type"] == "float":
             inner = {**inner, "strict": True, "allow_inf_nan": False}
         return core_schema.no_info_after_validator_function(self.check, inner)

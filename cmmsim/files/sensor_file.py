@@ -85,8 +85,8 @@ def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array
     """Return places (count, 2) [u, v], m, on the one-standard-deviation ellipse of listed places.
 
     ``listed`` (n, 2) are the listed places. Three or more points at equal angles on an ellipse have
-    the same mean and the same second moments, whatever their number. The accuracy of a plane or a
-    pose thus improves with the square root of the number of stickers.
+    the same mean and the same mean second moments, whatever their number. Only their number then
+    changes the accuracy of a plane or a pose, which improves with its square root.
     """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
@@ -205,7 +205,7 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
 
 
 def _content(name: str | Path) -> dict[str, Any]:
-    """Return the content of a file, completed from the sensor that it is based on.
+    """Return the content of a file, completed from the sensor that ``based_on`` names.
 
     Missing tables, and missing entries of a table, are added; tables within tables are not merged.
     """

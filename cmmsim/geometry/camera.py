@@ -1,8 +1,8 @@
 """A pinhole camera with its lens: distortion, point spread and vignetting.
 
 Pixel coordinates (0, 0) are the centre of the top-left pixel. Camera axes are x right, y down, z
-forward. Ideal pixels are the pixels of the same camera with a perfect lens. In these, lines are
-straight, and the linear formulas of epipolar geometry and triangulation hold.
+forward. Ideal pixels are the pixels of the same camera with a perfect lens. In ideal pixels,
+straight lines stay straight, and the linear formulas of epipolar geometry and triangulation hold.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cmmsim.geometry.lens_distortion import Distortion, NDArrayBool
 from cmmsim.geometry.pose import Array, frozen
 
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-# Standard deviations at which the point spread is cut off.
+# Distance at which the point spread is cut off, in standard deviations.
 PSF_REACH = 5.0
 
 
@@ -153,7 +153,7 @@ class PinholeCamera:
         return normalised * self.focal_lengths + self.centre, found
 
     def distortion_jacobian(self, ideal: Array) -> Array:
-        """Return the derivatives (..., 2, 2) of the image's pixels at ideal pixels (..., 2)."""
+        """Return the derivatives (..., 2, 2) of distorted pixels at ideal pixels (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
 

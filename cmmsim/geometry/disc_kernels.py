@@ -168,7 +168,8 @@ def inverse_shape(shape: Array) -> Array:
     return m
 
 
-# Standard deviations from the rim at which the point spread is cut off; 4e-8 of the light is lost.
+# Distance from the rim at which the point spread is cut off, in standard deviations. A share of
+# 4e-8 of the light is lost.
 REACH = 5.5
 # Rim points per standard deviation of the point spread.
 POINTS_PER_SIGMA = 1.1

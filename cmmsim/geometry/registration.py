@@ -1,4 +1,4 @@
-"""Weighted rigid registration (paper eq. 27): the transform from known to measured points."""
+"""Weighted rigid registration (paper eq. 27): fit of a transform to known and measured points."""
 
 from dataclasses import dataclass
 
@@ -17,8 +17,8 @@ SMALLEST_SPREAD = 0.005
 class Registration:
     """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
-    ``misfit`` (n,) is the squared residual of each point in units of its noise. The expected value
-    is 3 minus the point's part of the fit's six degrees of freedom.
+    ``misfit`` (n,) is the squared residual of each point in units of its noise. Its expected value
+    is 3 minus the point's share of the six fitted parameters.
     """
 
     transform: Array

@@ -1,4 +1,4 @@
-"""Print of stickers, and the shift of a sticker's centre that it causes.
+"""Imperfect print of stickers, and the shifts of their centres that it causes.
 
 Places on a sticker are (u, v), in radii of the sticker and along the axes of its plane. Brightness
 varies over a sticker by the modes 2 u, 2 v, √24 u v, √6 (u² - v²) and √12 (u² + v² - ½). They are
@@ -13,9 +13,9 @@ opposite sides. The shift of the centre is therefore
     (integral of n n' ds)^-1  integral of n rho ds.
 
 The rim is the image c + M q of the unit circle q, so that n is M^-T q, scaled to length one.
-The outline of a thick sticker grows by the side of its rim that the camera sees. A brightness that
-rises across a sticker moves its centre as well, but is fitted together with it. See
-``light_kernels``.
+An inclined thick sticker also shows the side of its rim, which enlarges its outline. A brightness
+that rises across a sticker would move its centre as well, but this rise is estimated together with
+the centre, see ``light_kernels``.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class SeenStickers:
     """Views of k stickers by a camera.
 
     to_image  (k, 2, 2), derivative d(pixels) / d(u, v) at the centre
-    slopes    (k, 2), movement of a point in (u, v) per radius of its depth below the sticker
+    slopes    (k, 2), apparent shift in (u, v) of a point one radius below the sticker's face
     """
 
     to_image: Array
@@ -103,9 +103,9 @@ class SeenStickers:
         return -factor[:, None] * self.slopes
 
     def centre_shifts(self, rims: Array) -> Array:
-        """Return the shifts (k, 2, ...) px of the centres if the apparent rims move.
+        """Return the shifts (k, 2, ...) px of the centres that movements of the rims cause.
 
-        ``rims`` (k, RIM_POINTS, ...) px are movements along the normal in the image.
+        ``rims`` (k, RIM_POINTS, ...) px are the movements along the rim's normal in the image.
         """
         normals, lengths = self._rim
         weights = lengths[:, None] * normals

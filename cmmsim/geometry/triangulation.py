@@ -23,9 +23,9 @@ STEP_TOLERANCE = 1e-8
 class StereoPoints:
     """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
 
-    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, with one
-    degree of freedom. ``rays`` (n,) are its roots, with a sign that tells on which side of each
-    other the rays pass.
+    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, a
+    chi-square with one degree of freedom. ``rays`` (n,) are its square roots. Their sign tells on
+    which side of the left ray the right ray passes.
     """
 
     points: Array

@@ -1,12 +1,13 @@
 """Image formation from posed bodies to the light on each pixel, before noise.
 
 Windows are drawn through perfect lenses on a grid finer than the pixels. A margin around each
-window supplies the light that the point spread brings in from outside. Distortion resamples each
-fine pixel from its ideal place. Then the point spread, the mean over each pixel, and the relative
-illumination are applied. All steps are linear in light. For a perfect lens without point spread,
-the pixels are drawn directly.
+window supplies the light that the point spread brings in from outside. Distortion is applied by
+resampling: each fine pixel takes its light from its ideal place, which is its place in the image
+of a perfect lens. Then the point spread, the mean over each pixel, a ghost (a faint shifted copy)
+and the relative illumination are applied. All steps are linear in light. For a perfect lens without
+point spread, the pixels are drawn directly.
 
-The ideal place of each pixel is exact at three by three nodes of a window, and interpolated by
+The ideal places of pixels are exact at three by three nodes of a window, and interpolated by
 quadratics in between. In windows of some tens of pixels, the interpolation error is below 1e-4 px.
 Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so it
 neither moves nor widens edges. Source: R. G. Keys, Cubic convolution interpolation for digital
@@ -34,7 +35,7 @@ SUB_PIXELS = 6
 SHARP_SUB_PIXELS = 12
 # px: sides of drawn windows are multiples of this, so that few sizes of frame buffers are needed.
 SIDE_STEP = 4
-# Number of drawn pixels that the cubic needs on either side.
+# Number of drawn pixels that the cubic convolution needs on either side.
 REACH = 2
 # Smallest and largest depth for which defocus is computed, in shares of the usual distance.
 DEPTHS = (0.7, 1.5)
@@ -59,7 +60,7 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Side:
-    """Camera with camera_from_body transforms (b, 4, 4) and the first pixels (k, 2) of windows."""
+    """Camera with camera_from_body (b, 4, 4) as ``bodies``, and first pixels (k, 2) of windows."""
 
     camera: PinholeCamera
     bodies: Array
@@ -67,7 +68,7 @@ class Side:
 
 
 class Painter(Protocol):
-    """Painter that adds light and print to what a renderer draws."""
+    """Interface of a painter, which adds light and print to the images of a renderer."""
 
     def draw(
         self, renderer: Renderer, views: Views, supersampling: int, background: float
@@ -81,10 +82,9 @@ class Painter(Protocol):
 
 @dataclass(frozen=True)
 class ImageFormation:
-    """Image formation by a renderer, with the drawn bodies, the radiance of the background, and the
-    optics of the lenses.
+    """Image formation: a renderer, the drawn bodies, the radiance of the background, and optics.
 
-    ``painter``, if not None, replaces the evenly lit and printed stickers of the renderer.
+    A ``painter`` replaces the evenly lit and printed stickers of the renderer.
     """
 
     renderer: Renderer
@@ -155,8 +155,7 @@ class ImageFormation:
         size: int,
         sub_pixels: int | None = None,
     ) -> NDArray[np.bool_]:
-        """Return a mask (m, k, patches) of the patches that could be visible in k windows at m
-        moments.
+        """Return a mask (m, k, patches) of patches that may be visible in k windows at m moments.
 
         Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2).
         See ``windows`` for ``size`` and ``sub_pixels``.
@@ -253,7 +252,7 @@ class ImageFormation:
         return self.optics.spreads_px(side.camera.focal_px, depths)
 
     def _margin_px(self, camera: PinholeCamera) -> int:
-        """Return the largest distance, px (an integer), from which light reaches a window."""
+        """Return the largest distance, in whole px, from which light outside reaches a window."""
         depths = self.drawable.distance * np.array(DEPTHS)
         return self.optics.reach_px(float(self.optics.spreads_px(camera.focal_px, depths).max()))
 

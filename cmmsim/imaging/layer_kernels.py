@@ -15,8 +15,8 @@ class Solids(NamedTuple):
     """Outlines of solids in an image, from far to near.
 
     ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. Rows starts[k] to starts[k + 1]
-    belong to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y of the s solids. ``slots``
-    (s,) are the indices under which the covered shares of pixels are stored; -1 stores none.
+    belong to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y of the s solids. The shares
+    of pixels that solid k covers are stored in ``covers[slots[k]]``, or not if ``slots[k]`` is -1.
     """
 
     half_planes: Array
@@ -30,7 +30,7 @@ class Discs(NamedTuple):
     """Discs in the order in which they are drawn.
 
     Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``behind`` (m,
-    slots) states whether the disc lies behind the solid with that slot.
+    slots) states whether a disc lies behind the solid with each slot.
     """
 
     centres: Array

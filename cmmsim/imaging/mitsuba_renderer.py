@@ -1,9 +1,9 @@
 """Renderer ``mitsuba``: windows by physically based path tracing with Mitsuba 3.
 
-It shares neither meshes nor rasterisation nor light with the other renderers, so it is their
-reference. Without lamps, all surfaces send out their levels. With lamps, they are diffuse, and
-light falls on them from lamps and from all sides, with shadows. Discs are exact circles.
-Only this module imports Mitsuba, an optional dependency.
+It shares neither the meshes of discs nor rasterisation nor light with the other renderers, so it is
+their reference. Without lamps, each surface emits its level as radiance. With lamps, surfaces are
+diffuse, and light falls on them from the lamps and from all sides, with shadows. Discs are exact
+circles. Only this module imports Mitsuba, an optional dependency.
 """
 
 from collections.abc import Sequence
@@ -25,9 +25,9 @@ OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class PointLamp:
-    """Lamp at a ``place`` (3,) in the axes of the first camera, m.
+    """Lamp at a ``place`` (3,) in the axes of the camera that is drawn, m.
 
-    ``strength`` is the radiance of a white face that looks at the lamp from a distance of 1 m.
+    ``strength`` is the radiance of a white face that faces the lamp from a distance of 1 m.
     """
 
     place: Array
@@ -44,9 +44,10 @@ def draw_frames(
 ) -> NDArray[np.float32]:
     """Draw the radiance (n, h, w) float32 of n windows of one size.
 
-    Each pixel is the mean of ``supersampling``² stratified rays. ``lamps`` and ``ambient``, the
-    radiance of a white face by light from all sides, replace even light. Raises CmmError if Mitsuba
-    is missing, or if the pixels of a camera are not square.
+    Each pixel is the mean of ``supersampling``² stratified rays. If there are ``lamps`` or
+    ``ambient`` light, surfaces are lit by them instead of emitting their levels. ``ambient`` is the
+    radiance of a white face in the light from all sides. Raises CmmError if Mitsuba is missing, or
+    if the pixels of a camera are not square.
     """
     mi = _mitsuba()
     views = Views.of(views)
@@ -121,7 +122,7 @@ def _sensor(
 
 
 def _surface(level: float, lit: bool) -> dict[str, Any]:
-    """Return a surface that is diffuse, or that sends out its level alone."""
+    """Return a diffuse surface if ``lit`` is True, else one that emits its level."""
     value = {"type": "rgb", "value": float(level)}
     own = {"light": {"type": "area", "radiance": value}}
     return {"bsdf": {"type": "diffuse", "reflectance": value}} if lit else own

@@ -1,9 +1,9 @@
-"""Stickers with light and print, painted into what any renderer has drawn.
+"""Stickers with uneven light and imperfect print, painted into the images of any renderer.
 
 A renderer draws the scene with empty rings. It also draws a second image, which states the share of
-each pixel in which a ring and its sticker are visible. There, the sticker is painted pixel by
-pixel, from the place on the sticker that the pixel shows. Light and print are thus the same for all
-renderers, and bodies still hide stickers. Pixels must be much finer than the rims of stickers.
+each pixel in which a ring and its sticker are visible. In these pixels, the sticker is painted: the
+place on the sticker that a pixel shows determines its level. Light and print are thus the same for
+all renderers, and bodies still hide stickers. Pixels must be much finer than the rims of stickers.
 """
 
 from __future__ import annotations
@@ -101,9 +101,10 @@ class Paint:
     def _lights(
         self, camera_from_base: Array, centres: Array, normals: Array, steps: Array
     ) -> Array:
-        """Return the light at centres (n, 3), and its changes along steps (n, 3, 2), as (n, 3).
+        """Return the light at n stickers, and its changes along both axes of each, as (n, 3).
 
-        All are in camera axes.
+        The stickers have ``centres`` and ``normals`` (n, 3). ``steps`` (n, 3, 2) are their axes,
+        one radius long. All are in camera axes.
         """
 
         def at(points: Array) -> Array:
@@ -130,9 +131,9 @@ class Paint:
 
 @dataclass(frozen=True)
 class StickerPainter:
-    """Painter of the stickers of a scene, see the beginning of this file.
+    """Painter of the stickers of a scene.
 
-    ``rings`` is the scene with empty rings, ``visible`` has rings of level 1 in a dark scene, and
+    ``rings`` is the scene with empty rings. ``visible`` has rings of level 1 and all else dark, and
     ``dark`` is wholly dark. ``objects`` (o, 5) are the objects of the background.
     """
 

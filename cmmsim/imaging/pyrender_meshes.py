@@ -60,8 +60,7 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
 
 
 def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
-    """Return the triangles of a stack of discs for a window that is cleared to the lowest disc's
-    level.
+    """Return the triangles of a stack for a window that is cleared to the lowest disc's level.
 
     The triangles are as in ``disc_mesh``, but a band of ``level`` around the lowest disc replaces
     this disc.
@@ -79,7 +78,6 @@ def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
 
 
 def _joined(pieces: Sequence[Mesh]) -> Mesh:
-    """Join several meshes."""
     first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
     return Mesh(
         np.concatenate([p.vertices for p in pieces]),
@@ -109,16 +107,12 @@ def _sharp_disc(disc: Disc, sides: int) -> Mesh:
 
 
 def _sides(radius: float, sample: float) -> int:
-    """Return the number of sides of a polygon that deviates from a circle by LARGEST_SAG
-    samples.
-    """
+    """Return the number of sides of a polygon within LARGEST_SAG samples of a circle."""
     return max(FEWEST_SIDES, int(np.ceil(np.pi * np.sqrt(radius / (2.0 * LARGEST_SAG * sample)))))
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Return corners (sides, 3) of a regular polygon in a disc's plane, as large as a circle of
-    ``radius``.
-    """
+    """Return corners (sides, 3) of a polygon with the area of a circle in a disc's plane."""
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
     # Polygon and circle have the same area and therefore the same total light.
@@ -158,9 +152,10 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
 class PaintedWindows:
     """Windows that can be drawn in painter's order, without a depth test.
 
-    ``solid`` (n,) is the patch of a window's only solid, or -1 if a depth test is needed.
-    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the patch of a
+    ``solid`` (n,) is the index of the only solid in a window, or -1 if a depth test is needed.
+    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the index of a
     stack of discs if the window can be cleared to the level of the lowest disc, and otherwise -1.
+    The indices are those of the drawable's patches.
     """
 
     solid: NDArray[np.int_]
@@ -171,8 +166,8 @@ class PaintedWindows:
 class PaintedSolids:
     """Convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
 
-    ``levels`` (patches,) has the level of each patch that is a solid or a stack (that of the lowest
-    disc), and NaN for other patches.
+    ``levels`` (patches,) has the level of each such solid, the level of the lowest disc of each
+    stack, and NaN for other patches.
     """
 
     def __init__(self, drawable: Drawable) -> None:

@@ -4,7 +4,7 @@ pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The 
 one channel only, which draws faster than pyrender's four. One large frame buffer, the atlas, has a
 cell for each window. Each window is drawn into its cell with its own projection, enlarged by the
 supersampling factor. The drawn pixels are then averaged in linear light. Every drawn pixel has one
-sample: multisampling would take more time than its accuracy on the stickers' soft rims is worth.
+sample. Multisampling would be slower and hardly more accurate, because stickers have soft rims.
 
 In a cell, only patches whose bounding box reaches into it are drawn. Projection and
 camera_from_body are multiplied in double precision, so that the shader gets one well-scaled matrix.
@@ -99,9 +99,9 @@ def _shared_atlas() -> "_Atlas":
 class _Patch:
     """Patch in OpenGL's memory.
 
-    The indices of its triangles are stored twice: from front to back, and in reverse order.
-    ``indices`` is their number, and ``backwards`` is the first byte of the reverse order. ``solid``
-    is False for a stack of discs.
+    The vertex indices of its triangles are stored twice: from front to back, and in reverse order.
+    ``indices`` is the number of indices of one order, and ``backwards`` the byte at which the
+    reverse order begins. ``solid`` is False for a stack of discs.
     """
 
     vertex_array: int
@@ -114,8 +114,9 @@ class _Patch:
 class _Uploaded:
     """Parts of a drawable in OpenGL's memory.
 
-    ``patches`` contains all patches, for each number of drawn pixels per radian. ``ringed`` differs
-    in the stacks of discs, which are made for cells that are cleared to their lowest disc's level.
+    ``patches`` maps a resolution, drawn pixels per radian, to all patches. ``ringed`` does the
+    same, but its stacks of discs come from ``ringed_mesh``, for cells that are cleared to the level
+    of the lowest disc.
     """
 
     patches: dict[float, list[_Patch]]
@@ -235,7 +236,7 @@ class _Atlas:
     def _clear(
         self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
-        """Clear each cell to its level in ``grounds``, and the depths if ``with_depth``."""
+        """Clear each cell to its level in ``grounds``, and the depth buffer if ``with_depth``."""
         gl = self._gl
         level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)

@@ -180,9 +180,7 @@ class Drawable:
         self.distance = distance
 
     def reaching(self, views: Views) -> NDArray[np.bool_]:
-        """Return a mask (n views, n patches) of the patches whose bounding box reaches into each
-        window.
-        """
+        """Return a mask (views, patches): whether a patch's bounding box reaches into a window."""
         windows = views.bounds
         result = np.zeros((len(views), len(self.patches)), dtype=bool)
         for shown in views.exposures:
@@ -194,8 +192,7 @@ class Drawable:
     def reaching_windows(
         self, camera: PinholeCamera, camera_from_bodies: Array, bounds: Array
     ) -> NDArray[np.bool_]:
-        """Return a mask (n windows, n patches) of the patches whose bounding box reaches into each
-        window.
+        """Return a mask (windows, patches), as in ``reaching``.
 
         All windows belong to one camera with a perfect lens. Bodies stand at ``camera_from_bodies``
         (b, 4, 4). ``bounds`` (n, 4) are lowest x, y and highest x, y of the windows, px.

@@ -1,8 +1,8 @@
 """Exposure of an image row after row, as by a rolling shutter.
 
-A pose belongs to the middle row of an image. Each window is drawn with the platform where it is
-when the middle row of the window is exposed. The platform hardly moves while the few rows of a
-window are exposed.
+The pose of an exposure is the pose when the middle row of the image is exposed. Each window is
+drawn with the platform at the pose at which the middle row of the window is exposed. The platform
+hardly moves while the few rows of a window are exposed.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, transforms_of
 from cmmsim.imaging.formation import ImageFormation, Side
 
-# Number of rows over which the movement of the platform is averaged, for its change per row.
+# Number of rows between the two poses from whose difference the change per row is computed.
 SWEPT_ROWS = 100.0
 
 

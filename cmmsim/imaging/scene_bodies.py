@@ -315,7 +315,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 def _sunk(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a mesh whose faces lie SUNK below those of the given mesh.
 
-    Stickers can then lie on the surface as on that of a convex solid.
+    Stickers on the surface of the given mesh then lie above the drawn one, as on convex solids.
     """
     moved = np.array(mesh.vertices)
     normals = np.asarray(mesh.face_normals)

@@ -1,16 +1,16 @@
 """Renderer ``scene``: whole frames by pyrender's own scene, camera, lamp and materials.
 
 It shares no matrices, frame buffers or order of drawing with the renderer ``pyrender``. It is
-slower, shows a robot as people know it, and checks the other renderers.
+slower, but it shades bodies realistically, and it serves to check the other renderers.
 
-Stickers send light back to the camera, so they have their level under any light. Bodies are lit by
-a lamp at the camera and from all sides, in equal parts: a face that looks at the camera has about
-the level that the sensor file states, and other faces are darker. There are no shadows, because a
-lamp at the camera casts none that the camera sees.
+Stickers are retro-reflective, so their level is the same in any light. Bodies are lit by a lamp at
+the camera and by ambient light, in equal parts. A face that faces the camera has about the level
+that the sensor file states, and other faces are darker. There are no shadows, because a lamp at the
+camera casts none that the camera sees.
 
 Every window is drawn by a camera of its own, whose principal point is shifted. A whole image is
 drawn in pieces, and pieces without a body are left out. The scene has a perfect lens: distortion,
-point spread and vignetting are applied to what is drawn, as with every renderer.
+point spread and vignetting are applied to the drawn images later, as with every renderer.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,15 +32,15 @@ from cmmsim.imaging.scene_bodies import DiscStack, Mesh
 # Drawn pixels along each side of the largest piece, and of the frame buffer for pieces.
 LARGEST_PIECE = 512
 ATLAS = 1024
-# Ratio of drawn pixels to the pixels that are asked for, along each side. Materials and lamps make
-# a pixel five times as expensive as those of the renderer `pyrender`.
+# Ratio of the drawn samples to the requested ones, along each side. Materials and lamps make a
+# sample five times as expensive as in the renderer `pyrender`.
 SAMPLES = 5.0 / 9.0
-# Share of a body's level that comes from all sides.
+# Share of a body's level that ambient light contributes.
 AMBIENT = 0.5
-# Radiance of the lamp that adds the rest to a face that looks at the camera. pyrender reflects
-# 0.96² / pi of it diffusely and 0.04 / (4 pi) in its rough gloss.
+# Radiance of the lamp, which contributes the rest on a face that faces the camera. pyrender
+# reflects 0.96² / pi of it diffusely and 0.04 / (4 pi) as rough gloss.
 LAMP = (1.0 - AMBIENT) / (AMBIENT * 0.96**2 / np.pi + 0.04 / (4.0 * np.pi))
-# pyrender's shader writes powers of the radiance.
+# pyrender's shader writes the radiance to the power 1 / GAMMA.
 GAMMA = 2.2
 LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 # Camera axes of OpenGL in those of OpenCV.
@@ -92,10 +92,10 @@ SCENE = Renderer("scene", draw_frames, 0.0016)
 
 
 class _Scene:
-    """pyrender's scene of the patches of a drawable, one node a body."""
+    """pyrender's scene of a drawable: for each body, a node of its discs and one of its solids."""
 
     def __init__(self, drawable: Drawable, samples: float) -> None:
-        # Only the context's owner imports pyrender before this.
+        # The context selects OpenGL's platform, which must be done before pyrender is imported.
         context = opengl_context()
         import pyrender
 
@@ -103,13 +103,13 @@ class _Scene:
         self._scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0])
         sample = drawable.distance / samples
         self._nodes = {}
-        # Primitives with the patches that each contains.
+        # Nodes with their primitives, and the indices of the patches in each.
         self.primitives = []
         for body in np.unique(drawable.body_index).tolist():
             own = np.flatnonzero(drawable.body_index == body)
             discs = [k for k in own if isinstance(drawable.patches[k], DiscStack)]
             solids = [k for k in own if isinstance(drawable.patches[k], Mesh)]
-            # Stickers come first: where they hide their body, it need not be lit.
+            # Stickers are drawn first, so that pixels of the body behind them are not shaded.
             for part, share in ((discs, 1.0), (solids, AMBIENT)):
                 if part:
                     facets = [_facets_of(drawable.patches[k], sample) for k in part]
@@ -162,9 +162,9 @@ class _Scene:
                 yield atlas[top : top + size[1], left : left + size[0]][::-1]
 
     def _primitive(self, facets: Array, share: float) -> Any:
-        """Return triangles in pyrender's form. ``facets`` is as `_facets` returns it.
+        """Return triangles in pyrender's form. ``facets`` is a result of `_facets`.
 
-        ``share`` is the share of the level that comes from all sides.
+        ``share`` is the share of the level that ambient light contributes.
         """
         positions, normals, levels = facets[:, :3], facets[:, 3:6], facets[:, 6:]
         return self._pyrender.Primitive(
@@ -175,7 +175,7 @@ class _Scene:
                 baseColorFactor=(share, share, share, 1.0),
                 metallicFactor=0.0,
                 roughnessFactor=1.0,
-                # The lower side of a body is hidden, and lies behind its upper side.
+                # Solids are closed, so their inner sides are never seen.
                 doubleSided=share == 1.0,
             ),
             mode=4,
@@ -186,7 +186,7 @@ def _facets_of(patch: DiscStack | Mesh, sample: float) -> Array:
     """Return the facets of a solid, or of discs for drawing with samples ``sample`` m apart."""
     if isinstance(patch, Mesh):
         return _facets(patch, None)
-    # Discs are seen from one side. Normals to the other side keep the lamp from them.
+    # The lamp does not light faces whose normals point away from it, so discs keep their level.
     return _facets(disc_mesh(patch, sample), -patch.discs[0].normal)
 
 
@@ -213,7 +213,7 @@ def _facets(mesh: Mesh, normal: Array | None) -> Array:
 
 @lru_cache(maxsize=1)
 def _drawing() -> Any:
-    """Return what draws pyrender's scenes in this process."""
+    """Return the only object in this process that draws pyrender's scenes."""
     context = opengl_context()
     from OpenGL import GL
     from pyrender.constants import ProgramFlags, RenderFlags
@@ -233,10 +233,11 @@ def _drawing() -> Any:
             projections: NDArray[np.float32],
             size: NDArray[np.int_],
         ) -> NDArray[np.uint8]:
-            """Return the values (ATLAS, ATLAS) that the shader wrote, the lowest row first.
+            """Return the values (rows, ATLAS) that the shader wrote, the lowest row first.
 
-            ``parts`` contains nodes of meshes with their primitives, and the pieces in which each
-            is drawn. ``projections`` (n, 4, 4) belong to the pieces, whose size is (w, h).
+            ``parts`` contains nodes of meshes with their primitives, and masks (n,) of the pieces
+            in which each is drawn. ``projections`` (n, 4, 4) belong to the pieces of ``size``
+            (w, h).
             """
             context.make_current()
             while _UNUSED:
@@ -278,7 +279,7 @@ def _drawing() -> Any:
 
         def _configure_forward_pass_viewport(self, flags: int) -> None:
             super()._configure_forward_pass_viewport(flags)
-            # Discs have soft rims. Several samples a drawn pixel would only take time.
+            # The plain frame buffer has one sample per pixel, which is enough for soft rims.
             GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._main_fb)
 
     context.make_current()

@@ -18,11 +18,11 @@ NEAREST = 1e-3
 
 
 class Scene(NamedTuple):
-    """Discs and convex solids, in the axes of their bodies.
+    """Discs and convex solids, in the axes of their bodies. Levels are radiances 0 to 1.
 
     places, normals             (m, 3), of the discs
     radii, disc_levels          (m,), of the discs
-    owners                      (m,), bodies of the discs
+    owners                      (m,), bodies to which the discs belong
     bodies, levels              (s,), bodies and levels of the solids
     middles                     (s, 3), of the solids
     vertices                    (v, 3), of all solids
@@ -141,10 +141,11 @@ def half_planes_of(corners: Array, half_planes: Array) -> int:
 def visible_discs(
     scene: Scene, camera_from_bodies: Array, focal: Array, principal: Array, near: float
 ) -> tuple:
-    """Return the discs that face the camera, from far to near, and larger before smaller.
+    """Return the discs that face the camera, from far to near; at equal depth, larger ones first.
 
-    The results are the numbers (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and extents
-    (m, 2) of the ellipses in px, and points (m, k, 3) on the discs in camera axes, m.
+    The results are the indices (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and half
+    extents (m, 2) of their ellipses in px, and the ``probes`` (m, k, 3), points on the discs that
+    are tested for occlusion, in camera axes, m. Discs nearer than ``near`` m are left out.
     """
     total = len(scene.radii)
     places = np.empty((total, 3))
@@ -199,11 +200,11 @@ def occlusion_mask(
     touching: float,
     slots: Array,
 ) -> Array:
-    """Return a mask (m, h) of the discs that lie behind each of h solids.
+    """Return a mask (m, h) that states which discs lie behind which solids.
 
-    The h solids are those that hide a probe of at least one disc. ``slots`` (s,) is filled with the
-    column of each solid in the mask, or -1. The discs belong to bodies ``owners`` (m,) and have
-    ``probes`` (m, k, 3).
+    Only the h solids that hide a probe of at least one disc have a column. ``slots`` (s,) is filled
+    with the column of each solid, or -1. The discs belong to bodies ``owners`` (m,) and have
+    ``probes`` (m, k, 3) from ``visible_discs``. ``touching`` is that of ``occludes``.
     """
     behind = np.zeros((len(owners), len(slots)), np.bool_)
     hiding = 0
@@ -242,8 +243,7 @@ def solid_outlines(
 ) -> Solids:
     """Return the outlines of solids that lie wholly in front of the camera, from far to near.
 
-    ``slots`` (s,) are the indices under which the covered shares of pixels are stored; -1 stores
-    none.
+    ``slots`` (s,) come from ``occlusion_mask`` and are passed on in the result.
     """
     total = len(slots)
     depths = np.empty(total)
@@ -305,7 +305,7 @@ def draw_view(
 
     The windows have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal``
     (2,) and the principal point ``principal`` (2,), px. Bodies stand at ``camera_from_bodies``
-    (b, 4, 4).
+    (b, 4, 4). ``lines`` is the number of scan lines per pixel that sample edges of solids.
     """
     kept, pixels, shapes, extents, probes = visible_discs(
         scene, camera_from_bodies, focal, principal, near

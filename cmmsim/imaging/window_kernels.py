@@ -18,9 +18,10 @@ def boxes_reaching(
 ) -> None:
     """Fill ``reaching`` (n, patches) with whether each patch's box reaches into each window.
 
-    The windows (n, 4) of one exposure are lowest x, y and highest x, y, px. ``boxes`` (patches, 4,
-    8) are the corners of each box as columns (x, y, z in m, 1). A box that is partly nearer than
-    ``near`` counts as reaching into all windows, and a box behind the camera into none.
+    ``pixels_from_bodies`` (b, 3, 4) are the projection matrices of the bodies. ``windows`` (n, 4)
+    are lowest x, y and highest x, y, px. ``boxes`` (patches, 4, 8) are the corners of each box as
+    columns (x, y, z in m, 1). A box that is partly nearer than ``near`` counts as reaching into all
+    windows, and a box behind the camera into none.
     """
     box = np.empty(4)
     point = np.empty(3)

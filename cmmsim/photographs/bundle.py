@@ -2,9 +2,9 @@
 
 The observations are the centres of stickers in both images of all pairs, with their covariances.
 The unknowns are the places of the base's stickers in the camera frame, the places of the platform's
-stickers in the frame of a reference pair, the pose of the platform in each pair, and, if the rig is
-known with a covariance, the 24 parameters of the rig. The known parameters are then observations,
-too.
+stickers in the frame of a reference pair, and the pose of the platform in each pair. If the rig is
+known with a covariance, its 24 parameters are unknowns, too, and their known values are additional
+observations.
 
 A pose affects only the observations of its own pair. Gauss-Newton steps therefore eliminate the
 poses pair by pair (Schur complement). A common movement of platform places and poses changes no
@@ -150,8 +150,8 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
     """Adjust a state to the observations.
 
     ``known`` is the rig as calibrated, and ``prior`` (24, 24) the covariance of its parameters.
-    Parameters with zero variance do not change. The covariance of the result belongs to noise as
-    stated; ``factor`` tells how much larger the squared residuals are.
+    Parameters with zero variance do not change. The covariance of the result assumes the stated
+    noise; ``factor`` tells how much larger the squared residuals are.
     """
     state = start
     free = np.flatnonzero(np.diag(prior) > 0.0)
@@ -258,7 +258,7 @@ def _rows(
 
 
 def _gauge(seen: Observations, state: BundleState, size: int) -> Array:
-    """Return the common movements (size, 6) of the platform's places, of length one each."""
+    """Return six orthonormal columns (size, 6) that span common movements of platform places."""
     places = state.places[seen.base :]
     arms = places - places.mean(axis=0)
     moves = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)

@@ -1,7 +1,7 @@
-"""Causes for which photographs teach nothing or little.
+"""Causes of a failed or poor teaching from photographs.
 
-The folders may be exchanged, shifted or of one camera, and the images may be blurred or noisier
-than stated.
+The two folders may be exchanged, may be shifted by some images, or may both come from one camera.
+The images may be blurred, or noisier than stated.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cmmsim.photographs.pairs import Photograph
 # Both images of a pair count as images of one camera if this share of the spots agrees to SAME_PX.
 SAME_SHARE = 0.7
 SAME_PX = 1.5
-# Numbers of pairs by which the images of one folder may be late.
+# Shifts between the two folders that are tried, in images.
 SHIFTS = (1, -1, 2, -2)
 # Point spreads that are tried for images that do not fit, px.
 SPREADS = (0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
@@ -35,7 +35,10 @@ def cause_of(
     base: MarkedBody,
     platform: MarkedBody,
 ) -> str:
-    """Return the cause of an error in teaching from the spots of K pairs, or the error's text."""
+    """Return the cause of an error of teaching, found from the spots of K pairs.
+
+    If no cause is found, the result is the error's text.
+    """
     counts = [min(len(one.centres[one.good]) for one in pair) for pair in spots]
     if max(counts) == 0:
         return (
@@ -90,7 +93,7 @@ def _same(pair: Spots) -> bool:
 def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str:
     """Return a text about a wrong noise or point spread in the sensor file, or an empty text.
 
-    Measuring refuses stickers whose grey values differ too much from a blurred disc. The text names
+    Measuring rejects stickers whose grey values differ too much from a blurred disc. The text names
     the point spread that fits best.
     """
     usual = _misfit(spots)

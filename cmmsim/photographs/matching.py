@@ -2,9 +2,9 @@
 
 A spot of the left image and a spot of the right image that lie on each other's epipolar lines are a
 candidate: a point in space. The stickers of the base stand still, so their candidates have the same
-pixels in most pairs. All other candidates are taken as points of one rigid body. Those of the pair
-with the most candidates are the first model, which is searched in every other pair. The rough
-places of the sensor file only serve to name the stickers that were found.
+pixels in most pairs. All other candidates are assumed to be points of one rigid body. Those of the
+pair with the most candidates are the first model, which is searched in every other pair. The rough
+places in the sensor file only serve to identify the stickers that were found.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ STANDING_SHARE = 0.6
 STANDING_PX = 0.7
 # Fewest candidates of a pair that are recognised as a rigid body.
 FEWEST_MOVING = 6
-# Tolerances of most rough places, m. The second is tried if the first finds no body. It is also the
-# tolerance of single places.
+# Tolerances of rough places, m. The second is tried if no body is found with the first. In any
+# case, single stickers may be off by the second.
 ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
 # Number of pairs that are tried as the first model of the platform.
@@ -321,7 +321,7 @@ def match(
     pairs: Sequence[Candidates], platform: MarkedBody, base: MarkedBody, names: Sequence[str]
 ) -> list[FoundBody]:
     """Return the stickers of base and platform in K pairs with ``names``. Raises LostError."""
-    # Points that stand for a while tell when a sticker has moved.
+    # Points that stand still in only a few pairs are kept, to show when a sticker has moved.
     briefly = standing(pairs)
     share = np.mean(briefly != NONE, axis=1)
     places = places_of(pairs, briefly)
@@ -332,7 +332,7 @@ def match(
     stays = np.tile(np.eye(4), (len(pairs), 1, 1)), np.ones(len(pairs), dtype=bool)
     found = [FoundBody(stickers, shown[own], stood[own], *stays, {}).with_missing(lost)]
     try:
-        # Stickers that stand and belong to no body are left out as well.
+        # Standing stickers that do not belong to the base are left out as well.
         moved = moving(pairs, _free(pairs, np.concatenate([still, shown[own]])), platform.name)
     except LostError:
         # A platform that seldom moves stands in most pairs, too.

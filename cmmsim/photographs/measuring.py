@@ -1,7 +1,6 @@
-"""Measuring in photographs: one pose for each pair of images, and its row of a table.
+"""Measuring in photographs: one pose for each pair of images, as a row of a table.
 
-The columns have the names of a record's measured part, so that the table can become a part of a
-record.
+The columns are named as in a record of an experiment, so that the table can become a part of it.
 """
 
 from __future__ import annotations

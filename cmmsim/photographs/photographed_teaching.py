@@ -38,7 +38,7 @@ from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
 FEWEST_PAIRS = 3
-# Of more pairs, such as those of a video, only this many are used.
+# Largest number of pairs that are used. A video has more, of which some are selected evenly.
 MOST_PAIRS = 500
 # A warning is given if the squared residuals exceed the stated noise by this factor.
 LARGEST_FACTOR = 1.5

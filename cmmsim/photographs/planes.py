@@ -37,8 +37,7 @@ class TaughtFrames:
                       places, and the parameters of the rig
     base_ids          (k,), names of the base's stickers
     platform_ids      (n,), names of the platform's stickers
-    effect            (6, 3 n), small error of the platform frame that errors of places cause in a
-                      pose by registration
+    effect            (6, 3 n), derivative of a registered platform frame by errors of the places
     """
 
     base_from_camera: Array
@@ -55,7 +54,8 @@ class TaughtFrames:
         own = self.covariance[:split, :split]
         by_rig = None
         if known is not None:
-            # What the errors of the rig explain is stated as their effect, and the rest as noise.
+            # The part of the covariance that errors of the rig explain is stated by their effect
+            # ``by_rig``; only the rest is stated as noise.
             with_rig = self.covariance[:split, split:]
             slope = with_rig @ np.linalg.pinv(self.covariance[split:, split:], hermitian=True)
             own = own - slope @ with_rig.T
@@ -126,13 +126,16 @@ def taught_frames(
 
 
 def _moved(points: Array) -> tuple[Array, Array]:
-    """Return the points (3 n, n, 3) after a step of each coordinate, forwards and backwards."""
+    """Return the points (3 n, n, 3) after a step of each coordinate, first forwards, then back."""
     steps = STEP * np.eye(points.size).reshape(-1, *points.shape)
     return points + steps, points - steps
 
 
 def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array]:
-    """Return a function that computes the body's frames from adjusted and from changed points."""
+    """Return a function of adjusted points and of changed points that computes the body's frames.
+
+    The adjusted points only fix the signs of the normals. ``spread`` is the points' covariance.
+    """
     size = len(body.nominal)
     blocks = np.array(np.einsum("iaib->iab", spread.reshape(size, 3, size, 3)))
 

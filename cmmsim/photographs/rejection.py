@@ -1,8 +1,8 @@
-"""Adjustment that leaves out what contradicts the rest: single centres, pairs, and stickers.
+"""Adjustment that leaves out single centres, pairs and stickers that contradict the rest.
 
 The worst centres are left out if their squared residuals are larger than chance allows, and the
-adjustment is repeated. If most centres of a pair or of a sticker are left out, or if those of a
-sticker show that it moved, the whole pair or sticker is left out, and the result says so.
+adjustment is repeated. A pair or a sticker is left out as a whole if most of its centres are left
+out. A sticker is also left out if its centres show that it moved. The result names the reasons.
 
 All residuals can be larger than the noise that the fits of ellipses state. The noise is then
 enlarged to the size of the residuals.
@@ -27,7 +27,7 @@ from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
 CHANCE = 1e-5
 LARGEST_SQUARE = float(chdtri(4, CHANCE))
 MEDIAN_SQUARE = float(chdtri(4, 0.5))
-# Share of a sticker's largest squared residual above which a centre is nearly its worst.
+# Share of a sticker's largest squared residual above which a centre counts as nearly its worst.
 NEARLY = 0.5
 # Probability that residuals count as larger than noise although they are not.
 EXCESS_CHANCE = 1e-4

@@ -15,7 +15,7 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)
-# Number of terms of the series in rounding_excess. Without noise, the series is 0.25, and the terms
+# Number of terms of the series in rounding_excess. Without noise, the series is 1/6, and the terms
 # that are left out add up to 0.002.
 ROUNDING_TERMS = 50
 # Variance, grey values squared, above which rounding_excess differs from 1 by less than 1e-11.

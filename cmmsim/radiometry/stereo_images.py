@@ -1,4 +1,4 @@
-"""Images for the estimator: stereo frames, and windows that are read from them."""
+"""Images for the estimator: stereo frames, and interfaces through which windows are read."""
 
 from __future__ import annotations
 
@@ -108,7 +108,6 @@ class StereoFrame:
 
 
 def _in_notebook() -> bool:
-    """Return True if the code runs in a notebook."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return shell is not None and hasattr(shell, "kernel")

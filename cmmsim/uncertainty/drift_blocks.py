@@ -1,11 +1,11 @@
 """Residuals of the stickers' pixels in blocks of frames, and the effects of errors of the rig.
 
-The residuals of a body are differences between observed and expected pixels. Expected pixels follow
-from taught places and the measured pose. The pose of the platform is estimated from the same
-pixels, so the part of the residuals that a pose explains is removed. With n stickers, the 4 n
-residuals then have unit variance in 4 n - 6 directions and are zero in the other six. The base
-stands still, and its pose was taught, so nothing is removed from its residuals. The base's
-residuals also show movements of the whole rig relative to the base.
+The residuals of a body are differences between observed and expected pixels, in units of their
+noise. Expected pixels follow from taught places and the measured pose. The pose of the platform is
+estimated from the same pixels, so the part of the residuals that a pose explains is removed. With n
+stickers, the 4 n residuals then have unit variance in 4 n - 6 directions and are zero in the other
+six. The base stands still, and its pose was taught, so nothing is removed from its residuals. They
+also show movements of the whole rig relative to the base.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sequential likelihood ratio test of residuals for a rig that moves, and the finding.
+"""Sequential likelihood ratio test for movements of the rig, and the finding of a run.
 
 All models of the residuals are Gaussian. In the first model, the rig has not changed since
 calibration and teaching: its errors have the calibration's covariance and are the same in every
@@ -145,8 +145,8 @@ class Evidence:
     The errors of the calibration, in units of SIZES, are ``calibration`` (24, r) times r
     independent numbers of unit variance. ``delay_std`` is the standard deviation of the right
     camera's delay, s. ``offset_std`` (o,) are the standard deviations of constant errors of single
-    centres, px. ``place_shows`` is True if the base is observed, because the residuals then depend
-    on the rig's place.
+    centres, px. ``place_shows`` is True if the base is observed: only then do the residuals depend
+    on the place of the whole rig.
     """
 
     def __init__(
@@ -234,9 +234,9 @@ def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[
 
 @dataclass(frozen=True)
 class Movement:
-    """Movement of one parameter of the rig and its standard deviation.
+    """Movement of one parameter of the rig, with its standard deviation.
 
-    The name of the parameter ends with the unit.
+    The ``name`` of the parameter ends with the unit.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Errors of sticker centres by the thickness and the retro-reflection of all stickers.
+"""Errors of sticker centres due to the thickness and the retro-reflection of all stickers.
 
 The estimator knows the sizes of these errors, but not their values. They depend on the angle of
-view alone, so they are the same in all frames from the same view.
+view alone, so a sticker has the same errors whenever it is seen at the same angle.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors of sticker centres by print, without images."""
+"""Errors of sticker centres due to imperfect print, drawn without images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PRINT_STREAM = 2
 
 @dataclass(frozen=True)
 class CentreErrors:
-    """Errors of sticker centres by uneven print and by outlines that are not round.
+    """Errors of sticker centres due to uneven print and outlines that are not round.
 
     ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
     ``changing_px`` is the rms of the errors that change from exposure to exposure.

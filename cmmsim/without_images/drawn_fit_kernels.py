@@ -104,7 +104,7 @@ def lit_covariances(
     settings: FitSettings,
     covariances: Array,
 ) -> None:
-    """Fill the covariances of fits that also estimate how the light rises across a sticker.
+    """Fill the covariances of fits that also estimate the gradient of the light on a sticker.
 
     The arguments are those of ``fit_covariances``.
     """
@@ -261,7 +261,7 @@ class Fits(NamedTuple):
 
 
 class DetectionLimits(NamedTuple):
-    """Limits for an ellipse that can be fitted.
+    """Limits that an ellipse must keep to be fitted.
 
     radius       smallest half width, px
     thin_px      half width at which half of the fits fail, because the ellipse is too thin
@@ -319,7 +319,8 @@ def fit_stickers(
 ) -> None:
     """Draw random results of the fits in windows, and write them to ``fits``.
 
-    Results that are not good have unit covariances and meaningless values.
+    ``smallest`` contains the limits for a successful fit. Results that are not good have unit
+    covariances and meaningless values.
     """
     count = len(windows.stickers)
     size = windows.size

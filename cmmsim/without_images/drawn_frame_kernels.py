@@ -1,6 +1,6 @@
 """Compiled kernels that simulate measured poses frame by frame, without images.
 
-Sticker positions found by two cameras are compared with the positions expected at the true pose.
+The places of stickers that two cameras find are compared with the places expected at the true pose.
 The differences are due to noise, and to the errors of teaching and of the rig.
 """
 
@@ -226,7 +226,8 @@ def observe(
     all solids except the platform. ``noise`` (2, n, 3) are unit normal numbers. ``kept`` (n,) is
     False for stickers that are omitted at random.
     """
-    # Begun as comparisons and not as False, for which `image_stickers` would be compiled once more.
+    # Both flags begin as results of comparisons, because `image_stickers` would be compiled once
+    # more for the constant False.
     moving = poses[1, 0] != poses[2, 0]
     apart = poses[3, 0] != poses[0, 0]
     for i in range(1, 6):
@@ -307,7 +308,7 @@ def measure_frame(
 ) -> None:  # fmt: skip
     """Fill the measured pose (6,) and its covariance (6, 6), or NaN if the frame is lost.
 
-    The first parameters are those of ``observe``. ``verdict`` receives the state of the frame.
+    The first parameters are those of ``observe``. ``verdict`` gets the state of the frame.
     """
     observe(scene, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))

@@ -1,13 +1,13 @@
 """Measurement of poses without images, frame by frame or many frames at once.
 
-The results have the same distribution as those of ``DrawnStickers``, but the covariance of a centre
-comes from a table. There is no search: each sticker is found at its true position.
+The results have the same distribution as those from ``DrawnStickers``, but the covariance of a
+centre comes from a table. There is no search: each sticker is found at its true position.
 
 The table describes the noise of a sticker's centre as a function of its ellipse. The covariance
 from ``fit_covariances`` belongs to one position of the centre. It is averaged over all positions
-within a pixel and inverted. The inverse grows with the length of the rim. Divided by the mean half
-axis m, it depends only weakly on m. It depends smoothly on the ovalness p = (A_xx - A_yy) / 2 m and
-q = A_xy / m of the ellipse's shape A.
+within a pixel and inverted. The inverse grows with the length of the rim. The table contains the
+inverse divided by the mean half axis m, which depends only weakly on m. It depends smoothly on the
+ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
 """
 
 import os
@@ -58,7 +58,7 @@ SHARP_PHASES = 5
 BLURRED_PHASES = 2
 # Smallest distance of a tabulated ellipse from the edge of the fitted part, px.
 EDGE_PX = 0.2
-# Shares of light at which the covariance is computed.
+# Shares of full light at which the growth of the covariance is computed.
 LIGHTS = np.array([0.4, 0.7, 1.0])
 # Probability that a good sticker is rejected because of its outline in either image.
 OUTLINE_CHANCE = 2 * CHANCE
@@ -253,8 +253,8 @@ class StatisticalTracker:
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
         """Draw unit normal noise (N, 2, n, 3), and the mask (N, n) of stickers that stay in use.
 
-        The noise is for the centres and for the limit of thin ellipses. Stickers are omitted at
-        random, because the test of outlines also rejects a few good stickers.
+        Of each three numbers, two are for the centre, and one is for the limit of thin ellipses.
+        Stickers are omitted at random, because the test of outlines rejects a few good ones.
         """
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE

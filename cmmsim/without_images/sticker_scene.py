@@ -14,8 +14,8 @@ from cmmsim.imaging.scene_bodies import ConvexSolid, Mesh, SceneBody
 if TYPE_CHECKING:
     from cmmsim.without_images.hiding_kernels import Solids
 
-# Radius around a sticker within which no point may be hidden, in sticker radii. It is about the
-# size of the fitted part.
+# Radius around a sticker within which no point may be hidden, in sticker radii. It is about that of
+# the part of the image that is fitted.
 CLEAR = 1.75
 
 
