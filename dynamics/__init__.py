@@ -19,7 +19,8 @@ and Numba take a second to load, and the help of the command line does not need 
 
 Conventions: SI units and rad. A pose is [x y z alpha beta gamma] with
 R = Rx(alpha) Ry(beta) Rz(gamma). A twist is [h_dot, omega] in the axes of the base. A wrench is
-[force, moment]. In the paper, the word wrench means the crank.
+[force, moment]. "Eq." and "the paper" refer to Electronics 8(8), 836 (2019), doi
+10.3390/electronics8080836. In that paper, the word wrench means the crank.
 """
 
 from importlib import import_module

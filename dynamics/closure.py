@@ -1,7 +1,7 @@
 """Poses that close the loops of a robot whose geometry deviates, and their derivatives.
 
 The gaps of the loops (`rigid_body.jacobians.loop_closure`) depend on the coordinates q of the
-platform and on the geometric numbers. They are zero at a closed pose. Hence
+platform and on the geometric numbers. They are zero at a pose that closes the loops. Hence
 
     dq/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 
@@ -48,7 +48,7 @@ class Closure:
         return poses
 
     def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """The same as `poses`, with NaN for rows whose loops do not close."""
+        """Poses like those of `poses`, with NaN for rows whose loops do not close."""
 
         def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
             return self._function(poses, theta, deviations[None])[:2]
@@ -60,10 +60,10 @@ class Closure:
     def derivatives(
         self, poses: np.ndarray, joints: np.ndarray, deviations: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of the platform's coordinates at closed loops.
+        """Derivatives of the platform's coordinates at poses (N, 6) that close the loops.
 
-        At poses (N, 6) with joint coordinates (N, n), they are the derivatives with respect to
-        deviations (N, m, g) and to joint coordinates (N, m, n).
+        Returns derivatives with respect to the deviations, (N, m, g), and with respect to the joint
+        coordinates, (N, m, n). `joints` (N, n) are the joint coordinates at the poses.
         """
         _, by_coordinates, by_joints, by_numbers = self._function(poses, joints, deviations[None])
         return -np.linalg.solve(by_coordinates, by_numbers), -np.linalg.solve(

@@ -1,18 +1,18 @@
 """Sampled closed loop: visual servo (eq. 30), joint PID (eq. 31) and robot (eq. 40).
 
-A sensor measures the pose at every frame. Then a joint command is issued by the servo, by a
-controller, or from a log. The command arrives after the latency, and acts until the next one
-arrives. A run begins at rest at the first reference pose, unless a start state is given.
+A sensor measures the pose at every frame. The servo, a controller or a log then issues a joint
+command. The command arrives after the latency, and acts until the next one arrives. A run begins at
+rest at the first reference pose, unless a start state is given.
 
 Functions
 
     simulate_servo, simulate_commands, simulate_controller   one run
     differentiate_servo, differentiate_commands              one run with derivatives
-    repeat_servo, repeat_commands                            one run per noise
+    repeat_servo, repeat_commands                            runs that differ only in their noise
     simulate_batch                                           many runs of the servo on all cores
 
 The loop is implemented once, in modules named `*_kernels`. Numba compiles them, and they also run
-as plain Python. Plant and model use the same code.
+as plain Python. The simulated plant and the identified model use the same code.
 """
 
 from dynamics.closed_loop.checked_arguments import most_directions

@@ -1,6 +1,6 @@
 """Checked arguments of a run: times of its frames, commands, and directions of the commands.
 
-A direction is a change of all commands, along which the poses of a run can be differentiated.
+A direction is a change of all commands of a run. Poses can be differentiated along it.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     robot : Robot
         Robot of the run.
     groups : RigidGroups, optional
-        Groups as for `differentiate_servo`. They need fewer columns than single parameters, which
-        leaves more columns for directions.
+        Groups as for `differentiate_servo`. With groups, derivatives with respect to the parameters
+        take fewer columns, so that there is room for more directions.
 
     Returns
     -------
@@ -42,17 +42,17 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     shown = len(layout.names)
     if groups is not None:
         shown -= len(layout.rigid_names) - len(groups.pivots)
-    # one column is for the length of a step that an event shortens
+    # one column is for the derivative of the length of a step that an event shortens
     return layout.derivatives(len(robot.geometry.chart.freedoms)) - shown - 1
 
 
 def checked_directions(
     directions: object, before: object, shape: tuple[int, int], most: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Checked directions (frames, n, k) of the commands of a run, and (n, k) of those before it.
+    """Checked directions: (frames, n, k) for the run, and (n, k) for the commands before it.
 
     `shape` is (frames, n). If `directions` is None, k is 0. If `before` is None, the commands
-    before the start do not change. Raises SimulationError, also for k above `most`.
+    before the run do not change. Raises SimulationError, also for k above `most`.
     """
     directions = np.zeros((*shape, 0)) if directions is None else directions
     given = np.asarray(directions)
@@ -83,7 +83,7 @@ def held_commands(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Commands (frames, n), with rows of NaN replaced by the command before, and a mask (frames,).
 
-    The mask is True for given rows. Raises SimulationError for a row of which only a part is NaN.
+    The mask is False for rows of NaN. Raises SimulationError for a row that is only partly NaN.
     """
     given = floats("commands", commands, shape, error=SimulationError, finite=False)
     missing = np.isnan(given)

@@ -1,7 +1,8 @@
 """Kernels for the frames of a run: measurement, command and record.
 
-The visual servo computes the command at a frame that is measured. At a lost frame, the command is
-that of the frame before. The feedforward is added at every frame.
+The visual servo computes the command at a frame that is measured. At a lost frame, its command of
+the frame before is used again. The feedforward is added at every frame. The arguments `task`,
+`now`, `at`, `d`, `plan` and `record` are explained in `run_memory`.
 """
 
 import numpy as np
@@ -26,7 +27,7 @@ from dynamics.compiled.kernel import Array, Record, entry, invoke, kernel
 
 @kernel
 def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> None:
-    """Set modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
+    """Set joint modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
     size = len(at[0].bias)
     count = len(now.mode)
     copy(now.state[:], at[0].state[:])
@@ -58,7 +59,7 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
 
 @kernel
 def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
-    """Record the state at a frame, before it is measured."""
+    """Record the state, and its derivatives, at a frame."""
     size = len(now.servo_integral)
     count = len(now.mode)
     row = now.first_row + k
@@ -89,7 +90,7 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
 
 @kernel
 def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -> None:
-    """Record the columns of the parameters, and those of the start state if there are any."""
+    """Record derivatives with respect to the parameters, and to the start state if requested."""
     copy_rows(rows, by_parameters, now.parameters)
     copy_rows(rows[:, now.parameters :], by_start, by_start.shape[1])
 
@@ -112,7 +113,7 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 def issue_command(
     task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
 ) -> int:
-    """Measure the pose, unless that has been done, and record the command that follows from it."""
+    """Measure the pose, unless a Python sensor has done so, and record the command issued."""
     if not task.measured:
         measure_ideally(now, plan, record, k)
     now.elapsed += task.period
@@ -143,7 +144,7 @@ def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
 
 @kernel
 def received(task: Record, command: float, joint: int) -> float:
-    """Command that a drive receives for the one that was sent. See `drives`."""
+    """Command that a drive receives if `command` is sent. See `drives`."""
     if task.command_step > 0:
         command = task.command_step * np.rint(command / task.command_step)
     command = min(max(command, task.command_low), task.command_high)
@@ -152,9 +153,9 @@ def received(task: Record, command: float, joint: int) -> float:
 
 @kernel
 def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
-    """Scale the derivatives of sent commands (n,) to those of received commands.
+    """Turn derivatives of sent commands (n,) into those of received commands, by their scale.
 
-    A command that the drives cut at a limit has no derivatives.
+    The derivatives of a command that is cut at a limit are zero.
     """
     for i in range(len(rows)):
         inside = task.command_low <= sent[i] <= task.command_high
@@ -168,7 +169,7 @@ def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
-    """Let a command act.
+    """Set the command that acts from now on.
 
     `ramp` is the fraction of the ramp from the previous command that is already done. At 1, the
     command is constant.

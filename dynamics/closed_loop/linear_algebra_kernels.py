@@ -1,6 +1,7 @@
 """Small dense linear algebra, for vectors and for rows of derivatives.
 
-Each row holds the derivatives of one unknown. Each column is for one variable.
+Each row holds the derivatives of one unknown. Each column is for one variable with respect to which
+they are taken. `width` is the number of columns in use.
 """
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part
@@ -8,7 +9,10 @@ from dynamics.compiled.kernel import Array, add_row, kernel, part
 
 @part
 def factorise(matrix: Array, size: int, factor: Array) -> None:
-    """Factorise a symmetric matrix (size, size). See `accelerations.factored`."""
+    """Factorise a symmetric matrix (size, size) into L D L^T.
+
+    `factor` has L below its diagonal, 1/D on it, and D L^T above it.
+    """
     for i in range(size):
         for j in range(i + 1):
             rest = matrix[i, j]
@@ -20,7 +24,7 @@ def factorise(matrix: Array, size: int, factor: Array) -> None:
 
 @part
 def solve(factor: Array, size: int, vector: Array) -> None:
-    """Solve L D L^T x = vector (size,) in place."""
+    """Solve L D L^T x = vector (size,) in place. `factor` is from `factorise`."""
     for i in range(size):
         for k in range(i):
             vector[i] -= factor[i, k] * vector[k]

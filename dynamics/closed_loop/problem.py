@@ -41,9 +41,9 @@ class Sizes:
 
     `joints` and `coordinates` are the numbers of joints and coordinates of the robot, and `rigid`
     is the number of parameters of the rigid bodies. `geometry` is the space for geometric numbers,
-    which are the last inputs of functions (see `Robot.moved`). This space is the same for most
-    robots. `filters` is the number of joints whose drives filter a rate. `gains` is the number of
-    gains of the joint PID.
+    the last inputs of the robot's functions (see `Robot.moved`). Most robots need the same space,
+    and so share kernels. `filters` is the number of joints whose drives filter a rate. `gains` is
+    the number of gains of the joint PID.
     """
 
     joints: int
@@ -69,7 +69,7 @@ class LoopProblem:
     """Checked arguments of one run, with its start state.
 
     Frames are one period apart, or at `times` (frames,), s. With `times`, only frames for which
-    `written` (frames,) is True issue a command, and other rows of `commands` repeat the one before.
+    `written` (frames,) is True issue a command. Other rows of `commands` repeat the row before.
     """
 
     robot: Robot
@@ -99,7 +99,7 @@ class LoopProblem:
 
     @property
     def further_columns(self) -> int:
-        """Number of columns of the start state, or of directions, after those of the parameters."""
+        """Number of entries of the start state, or of directions, with columns of derivatives."""
         return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property
@@ -224,8 +224,8 @@ def with_derivatives(
 ) -> LoopProblem:
     """Problem of a run that also computes derivatives.
 
-    `directions` (frames, n, k) are k directions of the commands, and `start_directions` (n, k) of
-    the commands from before the start. Raises SimulationError for elastic joints, and for
+    `directions` (frames, n, k) are k directions of the commands of the run. `start_directions` (n,
+    k) are those of the commands before the run. Raises SimulationError for elastic joints, and for
     directions of a wrong shape or number.
     """
     if groups is not None:
@@ -257,7 +257,7 @@ def _problem(
     servo_robot: Robot | None = None,
     feedforward: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Problem from the arguments that runs under servo, commands and controllers share."""
+    """Problem with the arguments that are common to servo, commands and controllers."""
     check_type("robot", robot, Robot, SimulationError)
     check_type("reference", reference, Reference, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
@@ -267,7 +267,7 @@ def _problem(
     _check_reach(robot, reference)
     frames = len(reference.poses)
     parameters = checked_loop_parameters(robot, parameters, settings.drives.law)
-    # raises an error if the number of zeros is not the number of joints
+    # raises an error if the drives have zero errors of another number of joints
     settings.drives.zeros(robot.layout.joints)
     feedforward = _rows("feedforward", feedforward, (frames, robot.layout.joints))
     if latencies is not None:
@@ -321,7 +321,7 @@ def _at_rest(
 ) -> StartState:
     """State of rest at a pose (6,).
 
-    The state is cached for further runs of a model. Hence its arrays are read-only.
+    The state is cached for further runs of the same model. Hence its arrays are read-only.
     """
     values = np.frombuffer(parameters)
     start = equilibrium(

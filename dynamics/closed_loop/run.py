@@ -15,8 +15,8 @@ class ClosedLoopRun:
     """Record of a run, one row per frame.
 
     The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). The start state has s =
-    3 m + n entries, in the order of `StartState`. Fields that the run does not have are None. Poses
-    are in m and rad, joints in rad or m.
+    3 m + n entries, in the order of `StartState`. Fields that were not requested, or that the robot
+    does not have, are None. Poses are in m and rad, joints in rad or m.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class ClosedLoopRun:
     torque : ndarray, shape (frames, n)
         Actuator torque or force, N m or N.
     command : ndarray, shape (frames, n)
-        Issued command: a coordinate, rad or m, or a torque (N m or N) if drives take torques.
+        Issued command, rad or m. If the drives take torques, it is a torque, N m or N.
     measured : ndarray, shape (frames, 6)
         Measured pose, NaN if the measurement was lost.
     measured_ok : ndarray of bool, shape (frames,)

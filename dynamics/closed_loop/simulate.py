@@ -1,8 +1,8 @@
-"""Closed-loop runs, with one function for each way to drive the joints.
+"""Closed-loop runs, with one function for each source of the joint commands.
 
-In `simulate_servo` the visual servo commands the joints, `simulate_commands` replays logged
-commands, and `simulate_controller` calls a control law at every frame. `differentiate_servo` and
-`differentiate_commands` do the same runs with the ideal sensor, and also return derivatives.
+In `simulate_servo` it is the visual servo, in `simulate_commands` a log of commands, and in
+`simulate_controller` a control law that is called at every frame. `differentiate_servo` and
+`differentiate_commands` also return derivatives. They use the ideal sensor.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def simulate_servo(
     start : StartState, optional
         State at the first frame. The default is rest at the first reference pose.
     feedforward : ndarray, shape (frames, n), optional
-        Joint commands, rad or m, to which the servo adds its own commands. At rest, the feedforward
-        is equal to the joint coordinates.
+        Joint commands, rad or m, to which the servo adds its own commands. The default start
+        assumes that the first row alone is the command that holds the robot at rest.
     latencies : ndarray, shape (frames,), optional
         Latency of each frame's command, s. The default is the latency of the timing.
     compiled : bool
@@ -80,8 +80,8 @@ def simulate_servo(
     Raises
     ------
     LoopFailure
-        If the run ends early, because the robot leaves its reach, for example, or because the
-        sensor raises a DynamicsError.
+        If the run ends early, for example because the robot leaves its reach or because the sensor
+        raises a DynamicsError.
     UnreachablePoseError, SingularPoseError
         If a pose of the reference or of the start is out of reach, or if the start is singular.
     ParameterError, SimulationError
@@ -128,8 +128,8 @@ def simulate_commands(
         Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
         of NaN issues no command.
     times : ndarray, shape (frames,), optional
-        Increasing times of the frames, s. The default is equal periods from zero on. In the drives,
-        the rate of a command is its change from the one before, divided by the period of `timing`.
+        Increasing times of the frames, s. The default is equal periods from zero on. The drives
+        divide the change between two commands by the period of `timing` to find their rate.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def differentiate_servo(
     directions: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the servo's loop with derivatives of the poses and of the last frame's state.
+    """Run the servo's loop, and differentiate the poses and the state at the last frame.
 
     Parameters
     ----------
@@ -231,9 +231,9 @@ def differentiate_servo(
         True returns derivatives with respect to the start state, too.
     groups : RigidGroups, optional
         Groups of inertial parameters on which the motion depends. Derivatives are then computed
-        only for the pivots of the groups and for all other parameters, which is faster.
-        `groups.of_all` extends the derivatives to all parameters. Groups are not valid with a start
-        whose own sensitivities depend on more than the groups.
+        only for the pivots (one parameter of each group) and for the parameters that are not
+        inertial, which is faster. `groups.of_all` extends the derivatives to all parameters. Groups
+        must not be given with a start whose own sensitivities depend on more than the groups.
     directions : ndarray, shape (frames, n, k), optional
         Directions of the feedforward along which the poses are also differentiated. Their number k
         is at most `most_directions`. They cannot be combined with `by_start`.

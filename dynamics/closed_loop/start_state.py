@@ -17,7 +17,7 @@ class StartState:
     """State of the loop at the first frame, before that frame is measured.
 
     The robot has n joints, m coordinates and p parameters. `ClosedLoopRun.start_sensitivity` has
-    derivatives with respect to the first four entries, in which coordinates replace poses.
+    derivatives with respect to the first four parameters below, with coordinates in place of poses.
 
     Parameters
     ----------
@@ -149,8 +149,8 @@ def equilibrium(
 ) -> StartState:
     """State of rest at a pose, without friction torques.
 
-    The state includes its derivatives with respect to the parameters. If friction has an offset,
-    the integrals hold the robot without this offset, because friction at rest can be zero.
+    The state includes its derivatives with respect to the parameters. The torque that holds the
+    robot does not include an offset of friction, because friction at rest can be zero.
 
     Parameters
     ----------
@@ -208,8 +208,8 @@ def equilibrium(
     if elasticity is not None:
         angles = angles + torque / elasticity.stiffness
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(angles))}
-    # A joint with the friction c + o in one direction and -(c - o) in the other moves as with c and
-    # -c under a torque that is less by o.
+    # Friction c + o in one direction and -(c - o) in the other has the same effect as c and -c, if
+    # o is subtracted from the torque.
     net = torque - drives.offsets(len(angles))
     received, integral = law.held(net, angles)
     command = drives.sent(received)

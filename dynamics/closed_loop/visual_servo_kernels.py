@@ -2,9 +2,9 @@
 
 The joint command is U = J_theta [kp e + kd e_dot + ki integral(e)]. J_theta is the Jacobian of the
 joints, and e is the error of the pose at the time of exposure. The pose rate is the difference of
-the last two measurements over the time between them. At the first measurement, the one before is in
-the start state. The integral is the sum of the errors times the frame period. At a lost frame, the
-servo does not run: its last measurement, integral and command stay as they are.
+the last two measurements divided by the time between them. The start state has the measurement
+before the first frame. The integral is the sum of the errors times the frame period. At a lost
+frame, the servo does not run: its last measurement, integral and command stay as they are.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, dot
@@ -16,8 +16,8 @@ from dynamics.compiled.kernel import Array, Record, call, kernel
 def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
     """Compute the command of the servo at a measured frame, and its derivatives.
 
-    The servo needs the Jacobian at the measured pose. If the measured pose is the true pose, the
-    Jacobian of the motion is used, which is already known.
+    The servo needs the Jacobian at the measured pose. If the measured pose is the true pose, and
+    the servo uses the true geometry, the Jacobian of the motion is used, which is already known.
     """
     size = len(measured)
     known = now.known

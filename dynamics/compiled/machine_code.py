@@ -1,10 +1,11 @@
 """CasADi functions as machine code, which LLVM compiles once and the user's cache stores.
 
-A function is translated to arithmetic without branches that assigns each value once. Its signature
-is `void name(const double *inputs, double *outputs)`. The inputs are dense matrices stored by rows
-in one array, one after the other, and so are the outputs. A second function, `void name.rows(long
-count, const double *inputs, double *outputs)`, evaluates many rows of inputs. Parts of a function
-that are alike are computed in vectors, one lane each (see `lanes`), with the same results.
+A function is translated to arithmetic without branches, in which each value is assigned once. Its
+signature is `void name(const double *inputs, double *outputs)`. The inputs are dense matrices
+stored by rows, one after the other in one array, and so are the outputs. A second function, `void
+name.rows(long count, const double *inputs, double *outputs)`, evaluates many rows of inputs. Parts
+of a function that are alike are computed in vectors, one lane each (see `lanes`), with the same
+results.
 """
 
 import ctypes

@@ -1,4 +1,4 @@
-"""Law `feedforward`: joint commands for which the joint PID produces the torque of the motion.
+"""Law `feedforward`: joint commands with which the joint PID gives the torque that a motion needs.
 
 The drives need not accept torques. While a command U acts, the torque of a drive (eq. 31) is
 
@@ -10,7 +10,7 @@ equal to the torque of the inverse dynamics. With the linear hold, the torque of
 end of the ramp is equal to it. The servo adds its correction.
 
 Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
-at rest. An error of the torque at rest has an effect only if it changes along the motion.
+at rest. A constant error of the modelled torque thus has no effect.
 """
 
 from dataclasses import replace

@@ -1,12 +1,12 @@
-"""Force and mass of a crank and a link that does not spin, if they are full bodies (CasADi).
+"""Force and mass matrix of a crank and a link with ten inertial parameters each (CasADi).
 
-Of the crank, only the rotation about its axis z does work. Let r be its length, theta its angle, x
-the axis along it, y = z x x, and g gravity. Its first moments m_x and m_y add to the torque
+The crank only rotates about its axis z. Let r be its length, theta its angle, x the axis along it,
+y = z x x, and g gravity. The first moments m_x and m_y of the crank add to the torque about z
 
     m_x (r theta_ddot - y . g) + m_y x . g
 
-The angular velocity of the link has no component along its length. In the axes of the link, it is
-(p, q, 0), and only the components x and y of the moment do work.
+The link does not spin about its length. In the axes of the link, its angular velocity is (p, q, 0),
+and only the components x and y of the moment do work.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def full_force(
     bodies: Sequence[ca.SX],
     gravity: ca.DM,
 ) -> ca.SX:
-    """Force at A (3,), N, for the motion of crank and link.
+    """Force at A (3,), N, that is needed for the motion of crank and link.
 
     `gradient` (3,) is that of the crank angle. `bodies` has the parameters of crank and link, 4 or
     10 each.
@@ -101,7 +101,7 @@ def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca
 
 
 def _ten(body: ca.SX) -> ca.SX:
-    """Parameters (10,) of a full body for those of a full or centred body."""
+    """Parameters (10,) of a body. Those that a centred body does not have are zero."""
     if not centred([body]):
         return body
     return ca.vertcat(body[0], ca.SX(3, 1), body[1:], ca.SX(3, 1))

@@ -28,7 +28,7 @@ from dynamics.legs.rss import Z
 class PssLeg(Leg):
     """Slider that is at B if its coordinate is zero, and a link from the slider to A.
 
-    The link does not spin about its length. The x of the link is perpendicular to the direction of
+    The link does not spin about its length. The x axis of the link is perpendicular to the axis of
     the slider and to the link's length.
     """
 
@@ -91,7 +91,7 @@ class PssLeg(Leg):
         return 1 - ca.dot(across, across) / self.link_length**2
 
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
-        """(|link|^2 - link_length^2) / 2."""
+        """Gap (|link|^2 - link_length^2) / 2."""
         link = position - self.base_joint - coordinate * self.slider_axis
         return (ca.dot(link, link) - self.link_length**2) / 2
 
@@ -164,7 +164,7 @@ class PssLeg(Leg):
 class PusLeg(PssLeg):
     """Slider and a link on a universal joint, which determines the spin of the link.
 
-    The x of the link is perpendicular to the first axis of the joint and to the link's length.
+    The x axis of the link is perpendicular to the first axis of the joint and to the link's length.
     """
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy", "Izz")))

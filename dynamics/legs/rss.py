@@ -3,9 +3,9 @@
 The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
 Rates of Jacobians (Appendix A of the paper) are computed by automatic differentiation, because eq.
 A5 and A6 are misprinted. The vector a from the platform origin to joint A is in the axes of the
-base: eq. 3 and 5 need R a, although the text defines a in platform axes. Centres of mass are at
-mid-length. Forces follow by virtual work, as for any `Leg`, but here in closed form, which is
-faster.
+base: eq. 3 and 5 need R a, although the paper defines a in platform axes. Centres of mass are at
+mid-length, unless a body has ten inertial parameters. Forces follow by virtual work, as for any
+`Leg`, but are here in closed form, which is faster.
 
 The link of a RUS leg has a universal joint (U) at the tip of the crank. The first axis of this
 joint is parallel to the crank axis, so that its direction is fixed in the axes of the base. The
@@ -168,7 +168,7 @@ class RssLeg(Leg):
         return 1 - chord**2 / (along**2 + across**2)
 
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
-        """(|A - T|^2 - link_length^2) / 2."""
+        """Gap (|A - T|^2 - link_length^2) / 2."""
         zero = ca.SX(self.crank_zero_direction)
         axis = ca.SX(self.crank_axis)
         crank = self.crank_length * (
@@ -181,7 +181,7 @@ class RssLeg(Leg):
         return self.vectors(position).link * (1 / self.link_length)
 
     def leverage(self, position: ca.SX) -> ca.SX:
-        """|J_a1| / (|w| |l|)."""
+        """Leverage |J_a1| / (|w| |l|)."""
         return ca.fabs(crank_leverage(self.vectors(position))) / (
             self.crank_length * self.link_length
         )
@@ -327,7 +327,7 @@ class ParallelogramLeg(RssLeg):
 
 
 class RrrLeg(RssLeg):
-    """Crank and link in one plane, with three hinges perpendicular to it (planar robots)."""
+    """Crank and link in one plane, with three hinge axes normal to it (planar robots)."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
     numbers: ClassVar[tuple[str, ...]] = (

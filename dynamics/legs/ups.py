@@ -76,13 +76,13 @@ class UpsLeg(Leg):
         return ca.norm_2(position - self.base_joint) - self.zero_length + beyond
 
     def reach(self, position: ca.SX) -> ca.SX:
-        """1 at mid-stroke, 0 at both ends of the stroke."""
+        """Reach margin: 1 at mid-stroke, 0 at both ends of the stroke."""
         shortest, longest = self.stroke
         length = ca.norm_2(position - self.base_joint)
         return (length - shortest) * (longest - length) * (2 / (longest - shortest)) ** 2
 
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
-        """(|A - B|^2 - length^2) / 2."""
+        """Gap (|A - B|^2 - length^2) / 2."""
         along = position - self.base_joint
         return (ca.dot(along, along) - (coordinate + self.zero_length) ** 2) / 2
 
@@ -91,7 +91,7 @@ class UpsLeg(Leg):
         return along * (1 / ca.norm_2(along))
 
     def leverage(self, position: ca.SX) -> ca.SX:
-        """1, because the actuator pushes along the leg."""
+        """Leverage, which is 1 because the actuator pushes along the leg."""
         return ca.SX(1)
 
     def gradient(self, position: ca.SX) -> ca.SX:

@@ -161,7 +161,7 @@ def stop_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """Function (q, change of rate (m,), impulse (n,), rigid (p,)) of derivatives at a stop.
 
     It returns the derivatives of M change - J_theta^T impulse with respect to q (m, m), rate (m, m)
-    and rigid (m, p). Those with respect to the rate are zero. They are derivatives of a motion that
+    and rigid (m, p). Those with respect to the rate are zero. All are computed as for a motion that
     starts from rest, without gravity, with the acceleration `change`.
     """
     q, change = _coordinates(geometry, "q", "change")
@@ -298,8 +298,8 @@ def _parted(
 ) -> PartedFunction:
     """Function that consists of expressions of each leg, and of expressions that depend on them.
 
-    `end` is called with the first expression of all legs, then the second, and so on. `branches`
-    are those of `_legs`. `substitution` has symbols and the expressions that replace them.
+    The arguments of `end` are the first expressions of all legs, then the second ones, and so on.
+    `branches` are those of `_legs`. `substitution` has symbols and what replaces them.
     """
     old, new = map(list, substitution)
     columns = [ca.vertcat(*(ca.densify(ca.vec(entry)) for entry in part)) for part in parts]
