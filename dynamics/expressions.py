@@ -6,7 +6,7 @@ import casadi as ca
 def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
     """CasADi function with dense outputs, in which common subexpressions are computed only once.
 
-    Legs share rotations and lever arms. This halves the size and the time of forward dynamics.
+    Legs share rotations and lever arms, so that forward dynamics takes half the size and time.
     """
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 

@@ -18,10 +18,10 @@ def fast_forward_dynamics(
     """Make a function that computes the same as `Robot.forward_dynamics`, for inner loops.
 
     The function is about 80 times faster than the method, because it does not check reach and
-    conditioning. It always returns the same array, which the next call overwrites, and is
-    therefore not thread safe. At a pose at which the platform can move although all cranks are
-    locked, eq. 40 still holds, and the function returns the acceleration. `Robot.forward_dynamics`
-    refuses such a pose, because no controller can hold it.
+    conditioning. Every call overwrites and returns the same array, so that the function is not
+    thread safe. At a pose at which the platform can move although all cranks are locked, eq. 40
+    still holds, and the function returns the acceleration. `Robot.forward_dynamics` refuses such a
+    pose, because no controller can hold the platform there.
 
     Parameters
     ----------

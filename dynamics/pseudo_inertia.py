@@ -18,7 +18,8 @@ import numpy as np
 
 from dynamics.spatial_inertia import MOMENTS
 
-# Row and column of the products Ixy, Ixz, Iyz, and of the Cholesky factor above its diagonal.
+# Row and column of the products Ixy, Ixz, Iyz. The entries of a Cholesky factor above its diagonal
+# are in the same order.
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -92,7 +93,7 @@ def log_cholesky(body: np.ndarray) -> np.ndarray:
 
 
 def about_centre(body: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass (3,), m, and inertia (3, 3) about it of a full body (10,) with a mass."""
+    """Centre of mass (3,), m, of a full body (10,) with a mass, and inertia (3, 3) about it."""
     xx, yy, zz, xy, xz, yz = body[4:]
     about_reference = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     centre = body[1:4] / body[0]
@@ -161,7 +162,7 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
 def nearest_body(body: np.ndarray, smallest: float) -> np.ndarray:
     """Full body (10,) that exists, with the same mass and centre of mass.
 
-    The second moments of the mass about its centre that are below `smallest` / 2 are raised.
+    Principal second moments of the mass, about its centre, are raised to at least `smallest` / 2.
     """
     mass = max(body[0], smallest)
     centre, inertia = about_centre(np.array([mass, *body[1:]]))

@@ -175,7 +175,7 @@ class RobotModel:
         Parameters
         ----------
         allow_unphysical_inertia : bool
-            Whether a body that breaks Ix + Iy >= Iz is written with the nearest possible inertia.
+            True writes a body that breaks Ix + Iy >= Iz with the nearest possible inertia.
 
         Returns
         -------

@@ -241,7 +241,7 @@ def prepare(robot: Robot) -> None:
     reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
     parameters = next(iter(robot.parameter_sets.values())).vector
-    # the first call compiles the functions for single runs, the second those for runs in lanes
+    # the first call compiles the functions for single runs, the second those for several at once
     simulate_servo(robot, parameters, reference, settings)
     repeat_servo(robot, parameters, reference, settings, np.zeros((1, 2, 6)))
 

@@ -99,7 +99,7 @@ class LoopProblem:
 
     @property
     def further_columns(self) -> int:
-        """Number of entries of the start state, or of directions, with columns of derivatives."""
+        """Number of columns of derivatives with respect to the start state, or to directions."""
         return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property

@@ -47,7 +47,7 @@ class ClosedLoopRun:
     motor_angle, motor_rate : ndarray, shape (frames, n)
         Coordinate of the motors of elastic joints, and its rate.
     filtered_rate : ndarray, shape (frames, n)
-        Rate of the error of each drive after its filter.
+        Filtered rate of the error of each drive, rad/s or m/s.
     events : int
         Number of stick-slip events.
     start : StartState
@@ -140,5 +140,5 @@ def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
 
     None means no limit.
     """
-    # the kernels limit torques up to rounding errors
+    # the kernels limit torques only to within rounding errors
     return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

@@ -46,14 +46,14 @@ def simulate_servo(
     latencies: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the loop that the visual servo closes.
+    """Run the closed loop of the visual servo.
 
     Parameters
     ----------
     robot : Robot
         Robot that moves.
     parameters : ndarray, shape (p,)
-        Dynamic parameters of the robot, then lp, li, ld of its drives.
+        Dynamic parameters of the robot, then the gains lp, li, ld of its drives.
     reference : Reference
         Desired motion, one row per frame.
     settings : LoopSettings
@@ -68,7 +68,7 @@ def simulate_servo(
         Joint commands, rad or m, to which the servo adds its own commands. The default start
         assumes that the first row alone is the command that holds the robot at rest.
     latencies : ndarray, shape (frames,), optional
-        Latency of each frame's command, s. The default is the latency of the timing.
+        Latency of each frame's command, s. The default is `settings.timing.latency_s`.
     compiled : bool
         False runs the same code in plain Python, thousands of times slower.
 
@@ -128,8 +128,8 @@ def simulate_commands(
         Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
         of NaN issues no command.
     times : ndarray, shape (frames,), optional
-        Increasing times of the frames, s. The default is equal periods from zero on. The drives
-        divide the change between two commands by the period of `timing` to find their rate.
+        Increasing times of the frames, s. The default is equal periods from zero on. In any case,
+        the rate of the command in the drives is the change of the command divided by that period.
 
     Returns
     -------
@@ -166,7 +166,7 @@ def simulate_controller(
     latencies: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the loop that a control law closes.
+    """Run the closed loop of a control law.
 
     Parameters
     ----------
@@ -232,8 +232,8 @@ def differentiate_servo(
     groups : RigidGroups, optional
         Groups of inertial parameters on which the motion depends. Derivatives are then computed
         only for the pivots (one parameter of each group) and for the parameters that are not
-        inertial, which is faster. `groups.of_all` extends the derivatives to all parameters. Groups
-        must not be given with a start whose own sensitivities depend on more than the groups.
+        inertial, which is faster. `groups.of_all` extends the derivatives to all parameters. If the
+        start has sensitivities of its own, they must depend only on the groups, too.
     directions : ndarray, shape (frames, n, k), optional
         Directions of the feedforward along which the poses are also differentiated. Their number k
         is at most `most_directions`. They cannot be combined with `by_start`.
@@ -294,7 +294,8 @@ def differentiate_commands(
         at most `most_directions`. They cannot be combined with `by_start`. With `times`, the
         direction of a row of NaN must be that of the command before.
     start_directions : ndarray, shape (n, k), optional
-        Directions of all commands from before the start. The default is zero.
+        Directions of the commands from before the start, which are the same for all of them. The
+        default is zero.
 
     Returns
     -------

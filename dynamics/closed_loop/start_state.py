@@ -38,9 +38,9 @@ class StartState:
     motor_angle, motor_rate : array_like, shape (n,), optional
         Coordinate of the motors of elastic joints, rad or m, and its rate.
     filtered_rate : array_like, shape (n,), optional
-        Rate of the error of each drive after its filter. The default is zero.
+        Filtered rate of the error of each drive, rad/s or m/s. The default is zero.
     latencies : array_like, shape (k,), optional
-        Latencies of `commands`, s. The default is the latency of the timing.
+        Latencies of `commands`, s. The default is that of `FrameTiming`.
 
     Raises
     ------
@@ -114,7 +114,8 @@ def checked_loop_parameters(
 ) -> np.ndarray:
     """Dynamic parameters of a robot, then its gains, checked for the law of its drives.
 
-    Raises ParameterError for a dynamic parameter, and SimulationError for everything else.
+    Raises ParameterError for an invalid dynamic parameter, and SimulationError for an invalid gain
+    or a wrong shape.
     """
     layout = robot.layout
     values = floats(

@@ -1,4 +1,7 @@
-"""LLVM code of one CasADi function, in static single-assignment form."""
+"""LLVM code of one CasADi function, in static single-assignment form.
+
+Parts, their columns, groups and lanes are those of `lanes`.
+"""
 
 from collections.abc import Callable
 
@@ -54,7 +57,7 @@ def _inputs(function: AnyFunction) -> int:
 
 
 class FunctionBody:
-    """LLVM lines of one function, and the functions that they call."""
+    """LLVM lines of one function, and the external functions that it calls."""
 
     def __init__(self, function: AnyFunction, quick: bool = False) -> None:
         last = _last(function)
@@ -104,7 +107,7 @@ class FunctionBody:
                 )
 
     def _parts(self, function: PartedFunction) -> list[list[str]]:
-        """Columns of all parts, group by group."""
+        """Column of each part. The columns of a group are computed together."""
         graph = self._quickened(graph_of(function.parts, function.constants))
         values = GraphValues(self, graph, [])
         columns = [[""] * len(outputs) for outputs in graph.outputs]
@@ -176,7 +179,7 @@ class FunctionBody:
         )
 
     def _vector(self, entries: list[str], width: int) -> str:
-        """Vector of numbers, or of several numbers side by side for each entry.
+        """Vector that joins entries: numbers, or vectors if sets of inputs are side by side.
 
         Unused lanes repeat the first entry.
         """
@@ -224,7 +227,7 @@ class FunctionBody:
         return vector
 
     def _entry(self, vector: str, part: int, width: int) -> str:
-        """Number of a part in a vector, or its numbers side by side."""
+        """Entry of a part in a vector: a number, or a vector if sets of inputs are side by side."""
         if width == 1 or self._beside == 1:
             return self._lane(vector, part, width)
         kind = type_name(width * self._beside)

@@ -107,7 +107,7 @@ class Assignment:
         return motion.pose(at)[0], motion.pose_rate(at)[0], motion.pose_acceleration(at)[0]
 
     def watched(self, drives: Drives) -> Observer:
-        """Observer of the run with drives that may differ from those of the settings."""
+        """Observer of the run. `drives` may differ from those of the settings."""
         holding = (
             self.holding if drives.torques else self.model.held(self.desired(0.0)[0], drives)[0]
         )

@@ -183,7 +183,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source: str) -> None:
-    """Add name and comments."""
+    """Add comments on the model."""
     lines = [
         f"Parallel robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N, N m.",
         "The model as written, and its keyframe home: all actuated joints at their home "

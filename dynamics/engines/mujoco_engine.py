@@ -128,7 +128,7 @@ class MujocoRobot:
         return max(spins)
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
-        """Set the state of all bodies to a pose (6,) and a twist (6,) of the platform.
+        """Set the state of all bodies from a pose (6,) and a twist (6,) of the platform.
 
         Links do not spin about their own axes (eq. 12).
         """
