@@ -107,7 +107,8 @@ def _ours_alone(folder: Path, source: Path) -> bool:
         if _is_open(file) and file.lstat().st_uid == os.geteuid():
             file.unlink(missing_ok=True)
     files = list(folder.glob("*.nb?"))
-    # With the sticky bit, as in /tmp, nobody can rename another user's folder.
+    # Users who can write into the parent folder can replace the folder, unless the parent has the
+    # sticky bit, as /tmp has.
     above = _is_open(folder.parent) and not folder.parent.stat().st_mode & stat.S_ISVTX
     owners = {one.lstat().st_uid for one in (folder.parent, folder, *files)}
     ours = not above and not any(map(_is_open, (folder, *files))) and owners <= trusted
@@ -128,6 +129,6 @@ def _is_open(path: Path) -> bool:
 
 @lru_cache(maxsize=1)
 def _stamp() -> str:
-    """Return a digest of all kernels, which changes when any of them changes."""
+    """Return a digest of the source files of all kernels."""
     files = sorted(Path(__file__).parent.rglob("*kernels.py"))
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()

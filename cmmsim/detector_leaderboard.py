@@ -315,7 +315,7 @@ def _round(
 
 
 def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: int) -> Array:
-    """Return the smallest mean squared error (n,) of each centre per axis, px²."""
+    """Return the Cramer-Rao bound (n,) of each centre's mean squared error per axis, px²."""
     parts = [
         cramer_rao_bound(*part, size, scene.contrast, scene.ground, scene.noise, psf_px)
         for part in _parts(centres, shapes)
@@ -326,7 +326,7 @@ def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: in
 def _ratio_interval(
     squared: Array, bounds: Array, rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    """Return the root of mean squared error / mean bound, and its 95 % bootstrap interval."""
+    """Return the rms error divided by the rms bound, and the ratio's 95 % bootstrap interval."""
     if len(squared) == 0:
         return np.inf, np.inf, np.inf
     drawn = rng.integers(len(squared), size=(RESAMPLES, len(squared)))
@@ -343,7 +343,7 @@ def _root_mean(squared: Array) -> float:
 def _by_window(
     find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
 ) -> DetectedCentres:
-    """Return the centres that a function finds, called with each window as an 8-bit image.
+    """Return the centres that ``find`` finds, which is called with each window as an 8-bit image.
 
     OpenCV states no covariance, so the covariances are zero.
     """

@@ -213,8 +213,8 @@ class Instrument:
         progress : callable, optional
             Function that is called with the number of steps done and their total.
         frames : iterable of StereoFrame or of results of `Sensor.look`, optional
-            Exposures of the platform in several poses, to teach from instead of exposures that the
-            sensor takes itself. An earlier teaching is replaced.
+            Exposures of the platform in several poses. Teaching uses them instead of exposures that
+            the sensor takes itself, and replaces an earlier teaching.
 
         Returns
         -------

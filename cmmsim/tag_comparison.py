@@ -117,7 +117,7 @@ class Tags:
 
 
 def tags_on(name: str, body: MarkedBody, stickers: Stickers) -> Tags:
-    """Return the largest tags of a dictionary between the stickers of each plane of a body.
+    """Return tags of a dictionary, as large as fits between the stickers of each plane of a body.
 
     Raises UnknownOptionError for an unknown dictionary.
     """
@@ -278,7 +278,10 @@ def _pose_of(sensor: Sensor, places: Array, pixels: Array) -> tuple[Array, Array
 
 
 def _score(marks: str, method: str, poses: Array, found: Sequence[Sequence[Found]]) -> MarkScore:
-    """Return the score of frames without and with noise at poses (N, 6)."""
+    """Return the score of ``found``, which has a frame without and one with noise at each pose.
+
+    The ``poses`` (N, 6) are the true ones.
+    """
     clean = np.array([pair[0].pose for pair in found]) - poses
     noisy = np.array([pair[1].pose for pair in found]) - poses
     good = np.isfinite(noisy).all(axis=1)

@@ -193,9 +193,10 @@ class Teacher:
         quality: Quality,
         window_size: int,
     ) -> StickerObservation:
-        """Observe all stickers of a body in averaged exposures.
+        """Observe all stickers of a body in averaged exposures of the platform at ``pose`` (6,).
 
-        Raises LostError if a sticker is missing.
+        The body is ``expected`` at camera_from_body (4, 4), with stickers at ``places`` (n, 3) in
+        its axes. Raises LostError if a sticker is missing.
         """
         usual = self.observer.settings
         # Averaged exposures have so little noise that errors of the model dominate the misfit, so
@@ -233,7 +234,10 @@ class Teacher:
     def _platform_views(
         self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
     ) -> list[StickerObservation]:
-        """Observe the platform along the teaching path, near poses predicted from earlier views."""
+        """Observe the platform along the teaching path. Earlier views predict the next pose.
+
+        ``rough`` (4, 4) is a rough camera_from_platform in the first view.
+        """
         places = self.platform.nominal
         last = rough
         step = np.eye(4)

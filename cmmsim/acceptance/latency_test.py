@@ -36,7 +36,7 @@ FRAMES = 180
 STEP = 1e-5
 ITERATIONS = 8
 Motion = Callable[[Array], Array]
-"""True positions (n,3) m at times (n,) s."""
+"""Function that returns true positions (n,3) m at times (n,) s."""
 
 
 @dataclass(frozen=True)

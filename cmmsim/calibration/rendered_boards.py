@@ -22,8 +22,8 @@ from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
 # The first constants describe the drawn board.
-# Width of the plate beyond its outermost points, in spacings. The outer squares of a board fill
-# this margin, and a bright rim of width RIM, in spacings as well, surrounds the squares.
+# Width of the plate beyond its outermost points, in spacings. On a board of squares, the outer
+# squares fill this margin. A bright rim of width RIM, in spacings, surrounds them.
 MARGIN = 1.0
 RIM = 0.35
 # Picture elements along the side of a square. OpenCV rounds the sides of markers to whole elements.
@@ -37,7 +37,7 @@ FRONT = frozen([0.0, 0.0, -1.0])
 # The next constants limit the poses of the board.
 # Largest angle between the board's normal and the direction to the middle of the baseline, rad.
 LARGEST_TILT = 0.75
-# Range of the board's depth, in units of the depth at which the optical axes are nearest.
+# Range of the board's depth, in units of ``meeting_depth``.
 DEPTH_RANGE = (0.8, 1.2)
 # Each image is divided into 3 x 3 cells that the board visits in turn.
 CELLS = 3

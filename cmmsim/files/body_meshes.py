@@ -149,7 +149,7 @@ def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Arr
 def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
     """Return the body with each plane moved along its normal onto the surface of the mesh.
 
-    The plane touches the surface below the highest of its stickers.
+    Each plane is moved to the highest place at which its stickers' normals meet the surface.
     """
     body = marked_body(name, section)
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)

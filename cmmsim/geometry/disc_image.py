@@ -9,10 +9,11 @@ maps the unit disc onto the ellipse.
 **Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
 perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
 (X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to a curve, to which an ellipse is fitted.
-With J the Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). Let t
-be the tangent of the unit circle, and J A a the shift of the centre of the fitted ellipse. A fit to
-grey values minimises the squared normal distance between curve and ellipse, integrated along the
-curve. Up to a factor, this is the integral of (u'w - u'a)² / |J A t| over the angle of u, and gives
+Let J be the Jacobian of the distortion d at c. The curve is then d(c) + J A (u + w), where the
+small w(u) is due to the curvature of d. Let t be the tangent of the unit circle, and J A a the
+shift of the centre of the fitted ellipse. A fit to grey values minimises the squared normal
+distance between curve and ellipse, integrated along the curve. Up to a factor, this is the integral
+of (u'w - u'a)² / |J A t| over the angle of u. Its minimum is at
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 

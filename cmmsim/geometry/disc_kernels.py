@@ -213,7 +213,10 @@ def rim_points(shape: Array, psf_px: float) -> int:
 def blur_window(
     centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of a blurred ellipse."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of a blurred ellipse.
+
+    The arguments are those of ``disc_image.coverage``, for a single ellipse.
+    """
     height, width = shares.shape
     shares[:] = 0.0
     derivatives[:] = 0.0

@@ -19,7 +19,7 @@ from cmmsim.geometry.pose import Array, apply, rigid
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import Disc, Mesh
 
-# Local axes of a camera of Mitsuba, left, up and forward, in those of OpenCV.
+# Transform from the axes of Mitsuba's camera (left, up, forward) to those of OpenCV's.
 OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 

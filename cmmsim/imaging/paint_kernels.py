@@ -133,8 +133,8 @@ def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Pai
 def paint_view(images: Array, shown: Array, group: Array, corners: Array, painted: Painted) -> None:
     """Paint all stickers into the windows ``images[group]`` (n, h, w) of one exposure.
 
-    ``shown`` (all, h, w) are the shares of pixels in which rings with their stickers are visible,
-    and ``corners`` (n, 2) the first pixels of the windows.
+    ``shown``, of the shape of ``images``, has the share of each pixel in which a ring with its
+    sticker is visible. ``corners`` (n, 2) are the first pixels of the windows.
     """
     height, width = images.shape[1:]
     for n in range(len(painted.boxes)):
@@ -157,9 +157,9 @@ def scatter_objects(
 ) -> None:  # fmt: skip
     """Paint far objects into the windows ``images[group]`` (n, h, w) where no body hides them.
 
-    ``behind`` (all, h, w) are the shares of pixels that show the background. ``objects`` (o, 5) are
-    a direction in the base frame, an angular radius, rad, and the level above the background.
-    ``turn`` (3, 3) is the rotation from base axes to camera axes.
+    ``behind``, of the shape of ``images``, has the share of each pixel that shows the background.
+    Each of the ``objects`` (o, 5) has a direction in the base frame, an angular radius, rad, and a
+    level above the background. ``turn`` (3, 3) is the rotation from base axes to camera axes.
     """
     height, width = images.shape[1:]
     ray = np.empty(3)

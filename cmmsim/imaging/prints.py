@@ -20,7 +20,7 @@ from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.whole_image import TILE
 
-# Drawn samples per pixel and axis. All of them are computed, and errors along an edge average out.
+# Drawn samples per pixel and axis. Sampling errors average out along an edge.
 PRINT_SUPERSAMPLING = 6
 # Points along each side of a plate, from which the extent of its distorted image is found.
 OUTLINE_POINTS = 15

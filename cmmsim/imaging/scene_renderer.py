@@ -43,7 +43,7 @@ LAMP = (1.0 - AMBIENT) / (AMBIENT * 0.96**2 / np.pi + 0.04 / (4.0 * np.pi))
 # pyrender's shader writes the radiance to the power 1 / GAMMA.
 GAMMA = 2.2
 LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
-# Camera axes of OpenGL in those of OpenCV.
+# Transform from the camera axes of OpenGL to those of OpenCV.
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 

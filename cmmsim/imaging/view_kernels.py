@@ -50,9 +50,9 @@ class Scene(NamedTuple):
 def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) -> None:
     """Fill ``transforms`` with base_from_body (k, 4, 4) of rods, and ``lengths`` (k,).
 
-    The rods lead from ``starts`` to ``ends`` (k, 3) along their z axes. Their x axes are
-    perpendicular to z and to the base axis with the smallest component along z. ``transforms`` must
-    contain zeros.
+    The rods lead from ``starts`` to ``ends`` (k, 3) along their z axes. Each x axis is
+    perpendicular to the rod, and to the base axis that forms the largest angle with the rod.
+    ``transforms`` must contain zeros.
     """
     for k in range(len(starts)):
         move = transforms[k]
@@ -305,7 +305,8 @@ def draw_view(
 
     The windows have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal``
     (2,) and the principal point ``principal`` (2,), px. Bodies stand at ``camera_from_bodies``
-    (b, 4, 4). ``lines`` is the number of scan lines per pixel that sample edges of solids.
+    (b, 4, 4). ``lines`` is the number of scan lines per pixel that sample edges of solids. See
+    ``visible_discs`` for ``near`` and ``occludes`` for ``touching``.
     """
     kept, pixels, shapes, extents, probes = visible_discs(
         scene, camera_from_bodies, focal, principal, near

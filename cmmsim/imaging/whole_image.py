@@ -1,8 +1,8 @@
 """Exposures of windows over several moments, and whole images.
 
 A whole image is drawn finely only around bright spots. Most of the scene stands still during an
-exposure. A window without any body is filled with the background, and a window without a moving
-body is drawn only once.
+exposure, so a window without a moving body is drawn only once. A window without any body is filled
+with the background.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ LARGEST_PASTED_SIZE = 96
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4
-# Radiance above which a spot is drawn finely, if stickers can be darker than their level.
+# The same limit if light and print can make stickers darker than their level.
 DIM = 0.25
 # px: side of the pieces in which a whole image is distorted and blurred.
 TILE = 64
@@ -137,7 +137,10 @@ def _coarse(
 
 
 def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
-    """Return the first pixels (k, 2) of the windows around bright spots, and their side in px."""
+    """Return the first pixels (k, 2) of the windows around bright spots, and their side in px.
+
+    The side suits the largest spot unless ``fixed_size`` is True.
+    """
     _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
     keep = np.isfinite(centres[1:]).all(axis=1)
     sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)

@@ -194,7 +194,7 @@ def _taught(
             raise LostError(f"{error}: {said}") from error
         seen, start = observations(pairs, bodies, marked, observer)
         judged = adjust_robustly(seen, start, observer.rig, prior, names)
-        # The images determine the radius better, and it moves the centres of ellipses a little.
+        # The images give a better radius than the file, and the centres of ellipses depend on it.
         seen = replace(seen, radius=judged.bundle.state.radius(judged.seen))
         judged = adjust_robustly(seen, judged.bundle.state, observer.rig, prior, names)
         if not judged.stickers:

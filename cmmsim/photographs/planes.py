@@ -1,7 +1,7 @@
 """Frames from the planes of adjusted stickers, with the covariance of the whole result.
 
-The frames are those of the simulated teaching. Their errors follow to first order from the errors
-of all places together. The derivatives are central differences.
+The frames are defined as in the simulated teaching. Their errors follow to first order from the
+errors of all places together. The derivatives are central differences.
 """
 
 from __future__ import annotations

@@ -87,7 +87,8 @@ class CameraNoise:
     dsnu                standard deviation of the pixels' offsets, e-
     frames              number of exposures averaged in each grey value; averaging reduces the
                         temporal noise, but not the fixed pattern
-    inverted            True if grey values are subtracted from the largest one, for dark stickers
+    inverted            True if stickers are dark; grey values are then subtracted from the largest
+                        one, so that stickers become bright
     """
 
     electrons_at_white: float

@@ -10,7 +10,7 @@ from cmmsim.compilation import Array, compiled
 
 # Normal noise is cut off beyond this number of standard deviations, with a probability of 2e-9.
 REACH = 6.0
-# Grey values: from this standard deviation on, rounding adds 1/12 to the variance, and at most 1e-9
+# Above this standard deviation, in grey values, rounding adds 1/12 to the variance and at most 1e-9
 # to the mean.
 SMOOTH_DEVIATION = 1.0
 SQRT_HALF = math.sqrt(0.5)

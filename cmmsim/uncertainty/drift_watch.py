@@ -46,7 +46,7 @@ class DriftWatch:
     chance : float
         Probability of a false alarm in a run, however long.
     offset_px : float
-        Standard deviation of a centre's systematic error.
+        Standard deviation of a centre's systematic error, px.
     base : bool
         True if the base's stickers are observed as well.
 

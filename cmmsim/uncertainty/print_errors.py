@@ -38,8 +38,9 @@ class PrintErrors:
     ) -> Array:
         """Return the shifts (2, N, n, 2, 2) px of the centres of stickers in both images.
 
-        The last axis has one entry per error of one standard deviation. The body stands at
-        camera_from_body (N, 4, 4), and its stickers lie at ``places`` (n, 3).
+        The last axis is for thickness and retro-shift, each with an error of one standard
+        deviation. The body stands at camera_from_body (N, 4, 4), with stickers at ``places``
+        (n, 3).
         """
         turns = camera_from_body[:, None, :3, :3]
         points = apply_each(camera_from_body, places)

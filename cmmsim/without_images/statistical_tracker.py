@@ -72,7 +72,7 @@ BLOCK = 512
 def centre_noise(
     noise: CameraNoise, psf_px: float, fit_size: int, sticker: float, ring: float
 ) -> CentreNoise:
-    """Return the table of the centre's covariance in fitted parts of ``fit_size`` px.
+    """Return the table of the centre's covariance for fits in windows of ``fit_size`` px.
 
     ``sticker`` and ``ring`` are the radiances of stickers and rings, 0 to 1.
     """
