@@ -5,7 +5,7 @@ Sensor
     Sensor.measure(pose)               -> Measurement: pose (6,) m, rad and its covariance (6, 6)
     Sensor.measure_many(poses)         -> MeasuredPoses of many frames at once
     Sensor.capture(pose)               -> StereoFrame: both whole images
-    Sensor.teach()                     -> Taught, for sensors with the same cameras and bodies
+    Sensor.teach()                     -> Taught, which `load_sensor` takes for the same bodies
     require_opengl()                   raises OpenGLMissingError if pyrender cannot draw
 
 Images from other sources

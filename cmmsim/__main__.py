@@ -1,9 +1,9 @@
 """The command `cmmsim`, and a warning if another package is imported as `identify`.
 
-A package on PyPI is called `identify`, too, and pre-commit depends on it. Both packages write the
-file `identify/__init__.py`, so the one that is installed last breaks the other. The command
-therefore begins here, in the only module of this package that imports `identify`, and refuses to
-run beside the other package.
+cmmsim is installed together with its package `identify`. PyPI has another package of this name,
+which pre-commit needs. Both packages write the file `identify/__init__.py`, so the one that is
+installed last breaks the other. The command therefore begins here, in the only module of this
+package that imports `identify`, and refuses to run beside the other package.
 """
 
 import sys

@@ -52,7 +52,8 @@ class Condition:
 
     radius_px  long half axis of the disc's image
     tilt       angle between the disc's normal and the line of sight, rad
-    noise      standard deviation of a grey value half-way up the edge, as a share of the contrast
+    noise      standard deviation of a grey value midway between disc and ground, as a share of
+               their contrast
     psf_px     sigma of the Gaussian point spread
     """
 
@@ -114,7 +115,7 @@ class Scene:
 
     @property
     def edge_noise(self) -> float:
-        """Standard deviation of a grey value half-way up the edge, as a share of the contrast."""
+        """Noise as in ``Condition``: standard deviation midway between disc and ground."""
         return (
             float(np.sqrt(self.noise.variance(np.array(self.ground + 0.5 * self.contrast))))
             / self.contrast
@@ -161,7 +162,7 @@ def scene_of(file: SensorFile) -> Scene:
 
 
 def working_point(file: SensorFile) -> Condition:
-    """Return the condition of the platform's stickers at home, in the left camera of a sensor file.
+    """Return the condition under which a sensor file's left camera sees the stickers at home.
 
     Radius and tilt are the medians of the stickers that face the camera; the noise is the camera's
     own.

@@ -72,7 +72,7 @@ class ShapeError(CmmError):
 class LostError(CmmError):
     """The stickers in the images do not determine a pose.
 
-    The message becomes the measurement's reason.
+    The message becomes the ``reason`` of the measurement.
     """
 
 
@@ -81,7 +81,7 @@ class DividedError(LostError):
 
 
 class TeachingWarning(UserWarning):
-    """Warning that the stated cameras and stickers do not explain what teaching observed."""
+    """Warning that observations at teaching contradict the stated cameras and stickers."""
 
 
 class TeachingError(CmmError):

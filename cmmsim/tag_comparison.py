@@ -52,7 +52,7 @@ REACH_M = 0.01
 REACH_RAD = 0.04
 # Width of the bright margin of a tag, in sides of its cells.
 QUIET_CELLS = 1
-# The four corners of a tag on each of two planes.
+# Fewest corners from which a pose is computed: those of one tag on each of two planes.
 FEWEST_CORNERS = 8
 
 

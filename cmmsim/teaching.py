@@ -10,8 +10,8 @@ The base is seen at one pose only. If another detector were used here, every mea
 therefore contain the bias of that detector.
 
 The search windows are made for the largest image of a sticker. This is the larger of two images:
-the image at the nearest working distance, assumed to be a fifth shorter than that of the rig's
-target, and the largest image that both cameras see at teaching.
+the image at the nearest working distance, assumed to be a fifth shorter than the distance of the
+rig's target, and the largest image that both cameras see at teaching.
 """
 
 import warnings
@@ -165,7 +165,7 @@ class Teacher:
     def _warn_of_parted_rays(self, base: StickerObservation) -> None:
         """Warn if the two rays of the base's stickers are farther apart than noise explains.
 
-        Known errors of the rig or of print also separate the rays, which are then not tested.
+        The rays are not tested if errors of the rig or of print are known to separate them, too.
         """
         settings = self.observer.settings
         exact = settings.line_error_px == 0.0 and not settings.allowed.known
@@ -265,7 +265,7 @@ class Teacher:
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError if a sticker has moved relative to the others, as if partly hidden."""
+        """Raise LostError if a sticker seems to have moved relative to the others."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px
@@ -327,9 +327,9 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
 def largest_radius(
     rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
 ) -> float:
-    """Return the longest half axis in px of a body's stickers that both cameras see.
+    """Return the longest half axis, px, in the images of the stickers that both cameras see.
 
-    The result is 0 if both cameras see no sticker.
+    The result is 0 if no sticker of the body is seen by both cameras.
     """
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)

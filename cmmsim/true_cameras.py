@@ -178,8 +178,8 @@ class TrueCameras:
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
         """Both cameras in front of the scene, without drift.
 
-        Raises CmmError if the statistical renderer is not validated for this sensor file, and
-        SensorFileError if a sticker lies in a hollow of a mesh that the renderer does not draw.
+        Raises CmmError if the statistical renderer is not verified for this sensor file, and
+        SensorFileError if a sticker lies in a hollow of a mesh but the renderer draws convex hulls.
         """
         if self.renderer.name in SEE_HULLS:
             sections = self._file.platform, self._file.base

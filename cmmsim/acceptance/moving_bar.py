@@ -3,8 +3,8 @@
 The bar moves along two rasters, each in three orientations. At the start of each raster, it first
 stands still. One raster goes to and fro along the volume's x axis while it advances along y. The
 other raster exchanges these axes. The bar lies along x in the first orientation, along y in the
-second, and is inclined to the image plane by ``TOWARDS_DEPTH`` in the third. It does not point at
-the cameras, because its flat stickers would not be visible. In addition, it rotates smoothly about
+second, and is inclined to the image plane by ``TOWARDS_DEPTH`` in the third. It never points at the
+cameras, because they would not see its flat stickers then. In addition, it rotates smoothly about
 all its axes.
 
 The sensor measures the poses of the sticker clusters at both ends in the same exposure. The
@@ -298,7 +298,7 @@ def relative_covariance(first: Measurement, second: Measurement) -> Array:
 def _small_covariance(measurement: Measurement) -> Array:
     """Return the covariance (6, 6) of a pose's small error [shift, rotation vector].
 
-    The measurement states the covariance for Euler angles.
+    It is computed from the measurement's covariance, which is for Euler angles.
     """
     turn = np.eye(6)
     turn[3:, 3:] = euler_rates_matrix(measurement.pose)

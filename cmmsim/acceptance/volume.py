@@ -1,8 +1,8 @@
 """Measuring volume, a cuboid that both cameras see, and the seven lines of VDI/VDE 2634-1 in it.
 
 The origin of the volume axes is the target of the rig. As seen from the rig, x points to the right
-and y downwards; z points away from the middle of the baseline. Four lines are the space diagonals.
-The other three lines are face diagonals, one on each of three faces that meet in a corner.
+and y downwards; z points away from the middle of the baseline. Four lines lie on the space
+diagonals. The other three lie on diagonals of three faces that meet in a corner.
 """
 
 from __future__ import annotations

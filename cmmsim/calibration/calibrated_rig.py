@@ -235,7 +235,7 @@ class SensorTemplate:
         )
 
     def _compared(self, calibration: Calibration) -> tuple[float, float]:
-        """Return the calibrated baseline, m, and the longer of both baselines over the shorter."""
+        """Return the calibrated baseline, m, and the ratio of the longer of both to the shorter."""
         baseline = float(np.linalg.norm(calibration.rig.right_from_left[:3, 3]))
         return baseline, max(baseline / self.baseline, self.baseline / baseline)
 

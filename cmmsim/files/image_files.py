@@ -1,4 +1,4 @@
-"""Files of images of both cameras: their pairs, and their pixels."""
+"""Image files of both cameras, their pairs, and their pixels."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def pair_images(
 
     The names in both folders are either all different (left_01.png, right_01.png) or all equal.
     Raises ``error`` if a folder is missing or empty, if both folders are the same, if the numbers
-    of images differ, or if only some names are equal. In the last two cases, the message has the
+    of images differ, or if only some names are equal. In the last two cases, the message lists the
     names that exist in one folder only.
     """
     if Path(left).resolve() == Path(right).resolve():

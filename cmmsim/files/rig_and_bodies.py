@@ -1,4 +1,4 @@
-"""Stereo rig, and bodies with stickers, that a sensor file describes.
+"""Stereo rig and bodies with stickers, made from the content of a sensor file.
 
 A rig is either nominal, with both cameras toed in to the target, or calibrated. A body has its
 stickers on three machined planes. The planes are exact, but the places of the stickers are nominal:

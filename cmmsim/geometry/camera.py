@@ -145,7 +145,7 @@ class PinholeCamera:
     def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
         """Return ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each exists.
 
-        Values that do not exist are finite but meaningless.
+        An ideal pixel that does not exist has a finite but meaningless value.
         """
         if self.distortion.is_zero:
             return pixels, np.ones(pixels.shape[:-1], dtype=bool)

@@ -61,9 +61,9 @@ def invert_factored(lower: Array, inverse: Array) -> None:
 
 @compiled
 def inverse_entries(n: Array, into: Array) -> None:
-    """Fill the inverse of a symmetric matrix (3, 3); both are given by their six entries.
+    """Fill ``into`` (6,) with the inverse of a symmetric matrix (3, 3) with entries ``n`` (6,).
 
-    The entries are 00, 01, 02, 11, 12 and 22.
+    Both are given by the entries 00, 01, 02, 11, 12 and 22.
     """
     c_00 = n[3] * n[5] - n[4] * n[4]
     c_01 = n[2] * n[4] - n[1] * n[5]

@@ -249,8 +249,8 @@ def pose_jacobian(poses: Array) -> Array:
 def pose_covariance(transforms: Array, covariances: Array) -> Array:
     """Return the covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
 
-    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi], which come
-    from ``rigid_kernels`` for a pose that is fitted to points.
+    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi]. For a pose
+    that is fitted to points, ``rigid_kernels`` computes them.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_covariances

@@ -1,8 +1,9 @@
 """Drawing without OpenGL. The share of each pixel that a disc covers is computed exactly.
 
 Layers are drawn over each other: first the background, then solids from far to near, then discs. A
-disc that faces away from the camera is not drawn. Some points of each disc are probed. If a solid
-hides one of these points, the disc is drawn only outside of the solid's outline.
+disc that faces away from the camera is not drawn. The centre and some points on the rim of each
+disc are tested. If a solid hides one of them, the disc is drawn only outside of the solid's
+outline.
 
 Three things are simpler than in `pyrender`. Solids are convex hulls, ordered by the depth of their
 middles. Their edges are sampled by scan lines. If a pixel contains edges of two layers, the shares

@@ -46,8 +46,8 @@ SPREAD_STEP = 0.01
 def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.float32]:
     """Return windows (n, size, size) that are resampled from drawn windows (n, h, w).
 
-    ``nodes`` (n, 3, 3, 2) are the places (x, y) in the drawn window of the pixels in the first,
-    middle and last row and column.
+    ``nodes`` (n, 3, 3, 2) belong to the pixels in the first, middle and last row and column of the
+    result. They are the places (x, y) of these pixels in the drawn window.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.imaging.window_kernels import resample_windows

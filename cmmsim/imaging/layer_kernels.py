@@ -179,9 +179,10 @@ def occludes(
 ) -> bool:
     """Tell whether a solid stands between ``eye`` (3,) and ``point`` (3,).
 
-    The solid is normal . x + offset <= ``wider``; all coordinates are in the solid's axes. A point
-    lies on the solid, and not behind it, if the line of sight enters the solid within the last
-    share ``touching`` of the line's length.
+    The solid, enlarged by ``wider`` m on all sides, consists of the points x with
+    normal . x + offset <= ``wider`` for all faces. All coordinates are in its axes. A point lies on
+    the solid, and not behind it, if the line of sight enters the solid within the last share
+    ``touching`` of the line's length.
     """
     enter = -np.inf
     leave = np.inf

@@ -1,4 +1,4 @@
-"""Flat prints, such as chessboards and tags, from pictures of their levels, and images of plates.
+"""Flat prints, such as chessboards and tags, and whole images of flat plates.
 
 A perfect lens images a plane by a homography. Each sample of a pixel therefore has its exact place
 on the print. The renderer of prints draws nothing else, so `ImageFormation` adds distortion, point

@@ -46,7 +46,7 @@ class View:
 class Exposure:
     """Camera with a perfect lens that sees bodies at camera_from_body (b, 4, 4).
 
-    ``windows`` (k,) are the numbers of the windows that belong to this camera and these places.
+    ``windows`` (k,) are the indices of the windows that belong to this camera and these places.
     """
 
     camera: PinholeCamera

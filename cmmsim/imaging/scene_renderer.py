@@ -37,8 +37,8 @@ ATLAS = 1024
 SAMPLES = 5.0 / 9.0
 # Share of a body's level that ambient light contributes.
 AMBIENT = 0.5
-# Radiance of the lamp, which contributes the rest on a face that faces the camera. pyrender
-# reflects 0.96² / pi of it diffusely and 0.04 / (4 pi) as rough gloss.
+# Radiance of the lamp, which contributes the rest of the level of a face that faces the camera.
+# pyrender reflects 0.96² / pi of it diffusely and 0.04 / (4 pi) as rough gloss.
 LAMP = (1.0 - AMBIENT) / (AMBIENT * 0.96**2 / np.pi + 0.04 / (4.0 * np.pi))
 # pyrender's shader writes the radiance to the power 1 / GAMMA.
 GAMMA = 2.2

@@ -27,7 +27,7 @@ class Scene(NamedTuple):
     middles                     (s, 3), of the solids
     vertices                    (v, 3), of all solids
     vertex_starts               vertices of solid k begin at vertex_starts[k]
-    face_normals, face_offsets  faces of all solids: normal . x + offset <= 0
+    face_normals, face_offsets  faces of all solids: normal . x + offset <= 0 inside
     face_starts                 faces of solid k begin at face_starts[k]
     """
 

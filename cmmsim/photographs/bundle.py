@@ -108,7 +108,7 @@ class BundleState:
         return np.asarray(seen.pixels - computed)
 
     def radius(self, seen: Observations) -> float:
-        """Return the radius of a sticker in the images, m: the median over all ellipses."""
+        """Return the radius of stickers, m, as the median over all ellipses in the images."""
         own = np.where(seen.moves[:, None, None], self.poses[seen.pair], np.eye(4))
         places, normals = self.places[seen.sticker], seen.normals[seen.sticker]
         shapes = sticker_outlines(self.rig, own, places, normals, seen.radius)[1]

@@ -58,7 +58,7 @@ class PhotographedTeaching:
     taught : Taught
         Frames and places, which `load_sensor` takes.
     frames : TaughtFrames
-        Frames and places with their whole covariance.
+        Frames and places with their joint covariance.
     observations : Observations
         Centres of stickers that were used.
     bundle : Bundle

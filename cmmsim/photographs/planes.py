@@ -28,7 +28,7 @@ STEP = 1e-6
 
 @dataclass(frozen=True)
 class TaughtFrames:
-    """Base frame and platform places, with the covariance of their common error.
+    """Base frame and platform places, with their joint covariance.
 
     base_from_camera  (4, 4)
     base_places       (k, 3), in base axes, m

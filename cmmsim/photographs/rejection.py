@@ -100,8 +100,8 @@ def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
     """Return the observations that are left out next.
 
     A wrong centre pulls the place of its sticker and the pose of its pair, so that right centres
-    seem wrong as well. Only centres are left out that are nearly the worst of their sticker and, on
-    the platform, the worst of their pair.
+    seem wrong as well. A centre is therefore left out only if it is nearly the worst of its sticker
+    and, on the platform, the worst of its pair.
     """
     of_sticker = np.zeros(seen.sticker.max() + 1)
     np.maximum.at(of_sticker, seen.sticker, squares)

@@ -82,7 +82,7 @@ class CameraNoise:
     full_well           saturation capacity, e-
     black_level         grey value without light
     enabled             False for no noise; grey values are rounded nevertheless
-    bit_depth           bits of a grey value, of BIT_DEPTHS; with more than 8, images are uint16
+    bit_depth           bits of a grey value, one of BIT_DEPTHS; above 8, images are uint16
     prnu                standard deviation of the pixels' sensitivities, relative to their mean
     dsnu                standard deviation of the pixels' offsets, e-
     frames              number of exposures averaged in each grey value; averaging reduces the
@@ -139,7 +139,7 @@ class CameraNoise:
         return constant + electrons * (linear + electrons * quadratic)
 
     def bright(self, grey: NDArray[Any]) -> NDArray[Any]:
-        """Return grey values in which stickers are bright, of the same type."""
+        """Return grey values of the same type in which stickers are bright."""
         return grey.dtype.type(self.white_level) - grey if self.inverted else grey
 
     @property

@@ -98,7 +98,7 @@ def moments_above(height: float, deviation: float, most: float) -> tuple[float, 
 
     The integer lies ``height`` above the mean of the normal variable. The excess is 0 below the
     integer, and it is limited to ``most``. Its mean is a sum over the steps from one integer to the
-    next. Each step counts with the probability that the normal variable lies beyond its middle.
+    next. Each step counts with the probability that the variable lies beyond the step's middle.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

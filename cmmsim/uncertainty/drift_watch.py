@@ -25,7 +25,7 @@ CHANCE = 0.01
 BLOCK_FRAMES = 6
 # Number of blocks that are evaluated together. Longer runs then need no more memory.
 BLOCKS_TOGETHER = 64
-# Fewest stickers of a frame that is used.
+# A frame with fewer stickers is not used.
 FEWEST_STICKERS = 4
 # Standard deviation of a centre's error from teaching and image formation. The error is constant
 # while the sticker stands still.
@@ -137,7 +137,7 @@ class DriftWatch:
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
         """Use the next frame, with the stickers of the ``base`` that it shows.
 
-        For a lost frame, only the time is advanced.
+        A lost frame only advances the time.
         """
         time = self._frames * self._period
         self._frames += 1

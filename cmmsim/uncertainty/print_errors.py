@@ -69,7 +69,7 @@ class PrintErrors:
 
 
 def known_errors(file: SensorFile) -> PrintErrors | None:
-    """Return the errors by print whose sizes an estimator with this sensor file knows, or None."""
+    """Return the print errors if an estimator with this sensor file knows their sizes, or None."""
     sizes = print_sizes(file)
     if file.print.known and (sizes.thickness or sizes.retro_shift):
         return PrintErrors(sizes, file.stickers.radius)

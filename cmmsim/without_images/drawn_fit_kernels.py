@@ -66,8 +66,8 @@ def fit_covariances(
     """Fill the covariances (n, m, m) that ``fit_window`` states for the first m parameters.
 
     The grey values are those of the model without noise. The n ellipses have centres (n, 2) px
-    relative to windows of ``size`` px, shapes (n, 2, 2) px, smears (n, 2) px, contrasts and grounds
-    (n,).
+    relative to windows of ``size`` px, shapes (n, 2, 2) px, movements ``smears`` (n, 2) px during
+    the exposure, and contrasts and grounds (n,), grey values.
     """
     mask = np.empty((size, size), np.bool_)
     window = np.empty((size, size))
@@ -248,7 +248,7 @@ class Windows(NamedTuple):
 class Fits(NamedTuple):
     """Results of k fits.
 
-    ``good`` (k,) is True for successful fits. Centres (k, 2) and shapes (k, 2, 2), px, have common
+    ``good`` (k,) is True for successful fits. Centres (k, 2) and shapes (k, 2, 2), px, have joint
     covariances (k, 5, 5). Contrasts and grounds (k,) are grey values.
     """
 

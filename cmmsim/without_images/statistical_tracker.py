@@ -50,7 +50,7 @@ from cmmsim.without_images.verified import require_short
 
 # Tabulated values of p and of q.
 OVAL = np.linspace(-0.78, 0.78, 14)
-# Number of tabulated mean half axes, up to half the fitted part.
+# Number of tabulated mean half axes. The largest is half the side of the fitted part.
 RADII = 8
 MOST_OVAL = 0.85
 # Number of positions within a pixel along each axis, without and with a point spread.
