@@ -311,7 +311,7 @@ class Robot(RobotDynamics):
         return self._in_form(passive_friction=tuple(names))
 
     def with_geometry(self, geometry: RobotGeometry) -> Robot:
-        """Robot with another geometry that has the same kinds of legs. It gets its own functions.
+        """Robot with another geometry of the same kinds of legs. Its functions are compiled anew.
 
         Parameters
         ----------

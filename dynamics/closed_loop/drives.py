@@ -6,8 +6,8 @@ is, up to the limit,
     torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
 `drive_kernels.drive` computes the torque. At the limit, li z - lx theta is kept constant while it
-would otherwise grow further (conditional integration). The laws differ in the
-gains that they use, in c, and in lx:
+would otherwise grow further (conditional integration). The laws differ in the gains that they use,
+in c, and in lx:
 
     pid            c = 1, lx = 0                  law of the paper (eq. 31)
     pd             c = 1, lx = 0                  no li
@@ -23,10 +23,10 @@ The integral of theta_dot is theta except for a constant, which is a part of z. 
 kv = ld and ki = lx. In every law, a common factor of lp, li and ld is a factor of the torque.
 
 A law without an integral balances a load by an error: at rest, its command is the coordinate of the
-joint plus the torque over lp.
+joint plus the torque divided by lp.
 
-A drive can receive another command than the one that was sent, by a wrong scale s, a wrong zero
-z0 of the joint, steps q of a digital interface, and the limits of its range:
+A drive can receive another command U than the one that was sent. Causes are a wrong scale s, a
+wrong zero z0 of the joint, steps q of a digital interface, and the limits of its range:
 
     U = s clip(q round(sent / q), lowest, highest) + z0
 """
@@ -100,8 +100,7 @@ class JointLaw(NamedTuple):
     def held_by_parameters(
         self, torque: np.ndarray, angle: np.ndarray, by_dynamic: np.ndarray, own_gains: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives (n, p) of the command and the integral of `held` with respect to all
-        parameters.
+        """Derivatives (n, p) of both results of `held` with respect to all parameters.
 
         `by_dynamic` has the derivatives of the torque with respect to the dynamic parameters.
         `own_gains` is True if each joint has its own gains among the parameters.
@@ -157,12 +156,12 @@ class Drives:
     command_step : float, optional
         Step q of the received commands, rad or m. The default is no steps.
     command_limits : tuple of float, optional
-        Lowest and highest command that the drives take, rad or m. They cut others, after rounding
-        them to steps. The default is no limits.
+        Lowest and highest command that the drives take, rad or m. Commands are rounded to steps,
+        and then cut at these limits. The default is no limits.
     friction_offset : tuple of float
         Half the difference of the Coulomb friction of each joint in its positive and its negative
         direction, N m or N. It is a constant torque against the joint, which the integral of the
-        drive balances. Torques of a run are net of it. The default is none.
+        drive balances. The torques of a run do not include it. The default is none.
 
     Raises
     ------

@@ -113,7 +113,7 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 def issue_command(
     task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
 ) -> int:
-    """Measure the pose, unless a Python sensor has done so, and record the command issued."""
+    """Measure the pose, unless Python has done so, and record the command that is issued."""
     if not task.measured:
         measure_ideally(now, plan, record, k)
     now.elapsed += task.period

@@ -1,7 +1,7 @@
 """Small dense linear algebra, for vectors and for rows of derivatives.
 
-Each row holds the derivatives of one unknown. Each column is for one variable with respect to which
-they are taken. `width` is the number of columns in use.
+Each row holds the derivatives of one unknown, and each column those with respect to one variable.
+`width` is the number of columns in use.
 """
 
 from dynamics.compiled.kernel import Array, add_row, kernel, part

@@ -2,7 +2,8 @@
 
 Each joint slips in one direction (mode +1 or -1) or sticks (mode 0). A stuck joint has the friction
 torque that makes its acceleration zero. A joint at rest sticks if this torque is below its
-breakaway torque. For friction and elastic joints see `joints`.
+breakaway torque. For friction and elastic joints see `joints`. The arguments `task`, `now`, `at`
+and `d` are explained in `run_memory`.
 """
 
 import numpy as np
@@ -159,7 +160,7 @@ def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Arr
 
 @kernel
 def push(task: Record, now: Record, at: Record) -> None:
-    """Compute the net torques in the present modes, without the torques that stop stuck joints.
+    """Compute the net torques in the present modes, without the torques that hold stuck joints.
 
     The slope is the time derivative of the state. All its entries are set, except for the
     acceleration of the platform.
@@ -311,7 +312,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
     """Return the least margin of the modes, at most 1, and the joint that has it.
 
-    The margin is >= 0 as long as all modes hold. The joint is -1 if no joint has less than 1.
+    The margin is >= 0 as long as all modes hold. The joint is -1 if no margin is less than 1.
     """
     least = 1.0
     joint = -1

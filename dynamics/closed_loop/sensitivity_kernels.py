@@ -69,7 +69,7 @@ def differentiate_stages(task: Record, now: Record) -> None:
 
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
-    """Copy the values that all columns of a slope need, besides the derivatives of the motion."""
+    """Copy the values, besides derivatives of the motion, that all columns of a slope need."""
     stages = now.stages
     size = len(at.bias)
     for i in range(size):
@@ -315,16 +315,16 @@ def step_tangent(
 ) -> None:
     """Differentiate the step whose stages are in `at`.
 
-    A step that ends on the grid becomes shorter if its start becomes later. A step that is `cut` by
-    an event has the length that the event determines. Until the derivative of this length is known,
-    the length is a variable of its own.
+    A step that ends at a planned time becomes shorter if its start becomes later. A step that is
+    `cut` by an event has the length that the event determines. Until the derivative of this length
+    is known, the length is a variable of its own.
     """
     fill(d.length[:], 0.0)
     if cut:
         now.width = whole_vectors(now.step_column + 1)
         d.length[now.step_column] = 1.0
     if not event:
-        # the step ends on the grid, and a later start makes it shorter
+        # the step ends at a planned time, and a later start makes it shorter
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(END):
