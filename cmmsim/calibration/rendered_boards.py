@@ -71,7 +71,6 @@ def plate_corners(board: Board) -> Array:
 
 
 def _plate(board: Board, level: float) -> Mesh:
-    """Return the plate of a board with the reflectance ``level``."""
     corners = plate_corners(board)
     size = [*(corners[2, :2] - corners[0, :2]), THICKNESS]
     mesh = trimesh.creation.box(extents=size)

@@ -133,7 +133,6 @@ def frames_of_points(
 
 
 def _dot(first: Array, second: Array) -> Array:
-    """Return inner products (...) of vectors (..., 3)."""
     return np.einsum("...i,...i->...", first, second)
 
 

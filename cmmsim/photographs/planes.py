@@ -167,6 +167,6 @@ def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> A
 
 
 def _small_error(moved: Array, other: Array) -> Array:
-    """Return the small movement [dt, dphi] (6,) from transform ``other`` to ``moved``."""
+    """Return the small movement [dt, dphi] (6,) that turns transform ``other`` into ``moved``."""
     turn = moved[:3, :3] @ other[:3, :3].T
     return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])

@@ -187,7 +187,6 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _begin_block(self, measurement: Measurement, base: StickerObservation | None) -> None:
-        """Begin a block of frames with the stickers of a frame."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
@@ -207,7 +206,6 @@ class DriftWatch:
             self._evaluate_blocks()
 
     def _evaluate_blocks(self) -> None:
-        """Evaluate the finished blocks."""
         # with more than one thread, BLAS takes ten times as long for these small matrices
         with self._threads.limit(limits=1, user_api="blas"):
             for block, products in zip(self._blocks, self._products(), strict=True):

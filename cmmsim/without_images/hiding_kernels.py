@@ -80,8 +80,8 @@ def hidden_stickers(
     The surroundings are a disc of radius ``clear`` m around the sticker, in its plane. Its middle
     and PROBES points on its rim are tested. ``camera_from_bodies`` (b, 4, 4) belong to the solids,
     and places and normals (n, 3) of stickers are in camera axes. A sticker is not hidden by the
-    solid ``owners`` (n,) to which it belongs. Only stickers in the mask ``asked`` (n,) are tested;
-    the others count as not hidden.
+    solid ``owners`` (n,) to which it belongs. Stickers outside of the mask ``asked`` (n,) are not
+    tested and count as not hidden.
     """
     camera = np.zeros(3)
     eyes = np.empty((len(camera_from_bodies), 3))
