@@ -76,6 +76,14 @@ POSES = {
 }
 """Its figures of predicted poses, which older kept answers lack."""
 
+UNCENTRED = {
+    "intervals": "identified quantities",
+    "covered_percent": "their 95 % intervals that contain the truth, %",
+    "unseen_position_rms_um": "position error on unseen motion, µm",
+    "unseen_orientation_rms_urad": "orientation error on unseen motion, µrad",
+}
+"""Figures of bodies that are not centred."""
+
 ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "friction_timing": (
         {
@@ -140,6 +148,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
         "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
     ),
     "answer_calibration_full.md": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
+    "answer_full_bodies.md": kept_figures.answer("full_bodies", {}, UNCENTRED),
     **{f"answer_{name}.md": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws.md": kept_figures.answers(
         at_both_rates("control_laws"), TIMING, {"options.law": "law"}, COMPARED

@@ -58,6 +58,7 @@ ANSWERS = {
     "estimators",
     "excitation_methods",
     "friction_timing",
+    "full_bodies",
     "inexact",
 }
 ANSWERS |= {
@@ -85,12 +86,18 @@ LARGEST_SHARE = {"feedforward": 25.0, "computed_torque": 12.5}
 """Of the error under the law pid, %, that a law with the identified model may leave."""
 
 
-def kept_points(name):
-    """Law and figures of each point of a kept answer, whose 95 % bands are of their means."""
+def kept_content(name):
+    """Content of a kept answer of which no row failed."""
     content = json.loads(
         (Path(__file__).parents[2] / ".readme" / "answers" / f"{name}.json").read_text()
     )
     assert not content["rows"]["failed"]
+    return content
+
+
+def kept_points(name):
+    """Law and figures of each point of a kept answer, whose 95 % bands are of their means."""
+    content = kept_content(name)
     return [(point["factors"]["options.law"], point["figures"]) for point in content["points"]]
 
 
@@ -118,6 +125,17 @@ def test_kept_answers_say_the_same_of_other_robots(timing):
                 assert figures[f"{what}_share_percent"]["mean"] < LARGEST_SHARE[law]
                 assert figures[f"true_{what}_ratio"]["mean"] < 1.5
                 assert figures[f"starting_{what}_excess_{unit}"]["mean"] > 0
+
+
+def test_kept_answers_say_that_full_bodies_are_identified_with_right_intervals():
+    """By the bands of 200 records."""
+    (point,) = kept_content("full_bodies")["points"]
+    figures = point["figures"]
+    assert figures["covered_percent"]["rows"] == 200
+    low, high = figures["covered_percent"]["mean_band"]
+    assert 93.0 < low < high < 97.0
+    assert figures["unseen_position_rms_um"]["rms_band"][1] < 2.0
+    assert figures["unseen_orientation_rms_urad"]["rms_band"][1] < 10.0
 
 
 TOO_SMALL = (

@@ -318,8 +318,9 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     # If a wrong model identifies nothing, the row has only its other figures.
     if seen.any():
         normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
+        sized = seen & (true_groups != 0)  # first moments and products of inertia can be zero
         row["group_std_percent"] = 100.0 * float(
-            np.median(groups.std[seen] / np.abs(true_groups[seen]))
+            np.median(groups.std[sized] / np.abs(true_groups[sized]))
         )
         row["normalised_error"] = float(np.sqrt(np.mean(normalised**2)))
     return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
