@@ -74,7 +74,7 @@ def gauntlet(
     """
     with interruptible_imports():
         from identify.studies.gauntlet_table import write
-        from identify.studies.memory import check_memory
+        from identify.studies.processes import check_memory
         from identify.studies.runner import run_study
         from identify.studies.study_design import prepare
         from identify.studies.study_file import Study

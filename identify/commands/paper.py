@@ -13,7 +13,7 @@ from identify.progress import Progress, terminal_progress
 from identify.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
-    from identify.paper.runs import PaperRuns
+    from identify.paper.exhibit import PaperRuns
     from identify.setup import Setup
 
 OURS = "paper"
@@ -99,7 +99,7 @@ def _results(folder: Path, ours: Scenario, progress: Progress) -> "PaperRuns":
     """Read both runs, and compare engines and identifications."""
     from dynamics import load_robot
     from identify.estimation.identification import identify
-    from identify.paper.runs import PaperRuns
+    from identify.paper.exhibit import PaperRuns
     from identify.reporting.run_data import read_run
     from identify.validation.variation import identify_each, variation
     from identify.verification.against_mujoco import verify

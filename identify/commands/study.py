@@ -200,7 +200,7 @@ def _run(
 ) -> "tuple[Outcome, dict[str, Any]]":
     """Run a study in its folder, and return its rows and its summary."""
     with interruptible_imports():
-        from identify.studies.memory import check_memory
+        from identify.studies.processes import check_memory
         from identify.studies.runner import run_study
         from identify.studies.study_design import prepare
         from identify.studies.table import rows_beside

@@ -7,12 +7,11 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.experiment.true_robot import true_deviations
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate
-from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.pose_selection import Candidates, Designer, Limits
 from identify.geometry.static_experiment import encoders_of, measure_static_poses, true_poses
-from identify.geometry.static_poses import FrameKnowledge, StaticPoses
+from identify.geometry.static_poses import FrameKnowledge, StaticPoses, check_encoders
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import STATIC_POSES, UNSEEN_POSES, child

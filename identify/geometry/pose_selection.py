@@ -1,8 +1,8 @@
 """Selection of static poses by an observability index over candidates within the travel.
 
-The index (see `indices`) is computed from the information about geometry and frames together. Poses
-are chosen one by one from the candidates (greedy) and exchanged until no exchange improves the
-index. Then all poses are optimised together in joint space by a gradient search.
+The index (see `observability`) is computed from the information about geometry and frames together.
+Poses are chosen one by one from the candidates (greedy) and exchanged until no exchange improves
+the index. Then all poses are optimised together in joint space by a gradient search.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.excitation.constraints import required_stickers
 from identify.geometry.calibration import PoseModel, whiteners
-from identify.geometry.indices import ObservabilityIndex, chosen_index
+from identify.geometry.observability import ObservabilityIndex, chosen_index
 from identify.progress import Advance
 
 STEP = 1e-5

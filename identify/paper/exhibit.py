@@ -1,4 +1,4 @@
-"""Exhibit: one figure or table of the paper, made from our own runs."""
+"""Exhibit: one figure or table of the paper, and our own runs from which all are made."""
 
 import csv
 import io
@@ -9,10 +9,43 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from dynamics import Robot
 from identify.arrays import Array
 from identify.reporting.figures.style import COMPONENTS, INK, LINE, WIDTH
 from identify.reporting.number_format import number
+from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
+from identify.validation.variation import Variation
+from identify.verification.against_mujoco import EngineRuns
+
+
+@dataclass(frozen=True)
+class PaperRuns:
+    """Results from which all exhibits are drawn.
+
+    Attributes
+    ----------
+    robot : Robot
+        Robot of both runs.
+    ours, settings : RunData
+        Run of the scenario `paper`, and run of the scenario `paper_settings`.
+    variation : Variation
+        Scatter of the estimates from the validation runs of `ours`.
+    engines : EngineRuns
+        Motion of the model and of MuJoCo.
+    """
+
+    robot: Robot
+    ours: RunData
+    settings: RunData
+    variation: Variation
+    engines: EngineRuns
+
+    @property
+    def both(self) -> Mapping[str, RunData]:
+        """Both runs, by their names in the tables."""
+        return {"ours": self.ours, "paper's settings": self.settings}
+
 
 Columns = Mapping[str, Collection[Any]]
 """Columns of text and numbers by their headings. All columns have the same length."""

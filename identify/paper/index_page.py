@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from identify.files.atomic import figure_bytes
-from identify.paper.exhibit import Exhibit
+from identify.paper.exhibit import Exhibit, PaperRuns
 from identify.paper.paper_figures import figures
 from identify.paper.paper_tables import tables
-from identify.paper.runs import PaperRuns
 from identify.progress import Progress
 from identify.reporting import paper
 from identify.reporting.figures.style import drawn

@@ -13,8 +13,7 @@ from identify.errors import OutputFolderError
 from identify.experiment.truth import true_poses
 from identify.paper import marked_planes, robot_sketch
 from identify.paper.block_diagrams import diagrams
-from identify.paper.exhibit import Exhibit, pose_columns
-from identify.paper.runs import PaperRuns
+from identify.paper.exhibit import Exhibit, PaperRuns, pose_columns
 from identify.record.recording import intended_motion
 from identify.reporting import paper
 from identify.reporting.figures import fit

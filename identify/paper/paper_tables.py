@@ -6,8 +6,7 @@ import numpy as np
 
 from dynamics import Robot
 from identify.files.run_folder import rms_row
-from identify.paper.exhibit import Exhibit
-from identify.paper.runs import PaperRuns
+from identify.paper.exhibit import Exhibit, PaperRuns
 from identify.reporting import paper
 from identify.reporting.figures.style import COMPONENTS, UNITS
 from identify.reporting.variation_tables import PAPER_PERCENT, PAPER_WORST_PERCENT

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dynamics import Robot
 from identify.arrays import Array
 from identify.filtering import interpolated
-from identify.record.motion_lag import MotionLag, motion_lag
+from identify.record.delays import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 
 TRIED = 200

@@ -15,8 +15,7 @@ from identify.errors import StudyError
 from identify.progress import Progress, SilentProgress
 from identify.runtime import cores
 from identify.scenario import Scenario, load_scenario
-from identify.studies.memory import check_memory
-from identify.studies.processes import local_processes
+from identify.studies.processes import check_memory, local_processes
 from identify.studies.runner import in_this_process, run_study
 from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile

@@ -1,4 +1,4 @@
-"""Batches of a study on processes of this machine.
+"""Batches of a study on processes of this machine, and a check that they fit into its memory.
 
 Each process is connected to the main process by a pipe. The pipe has no name, address or file, so
 other users cannot reach it. A process gets its next batch when the rows of the batch before are on
@@ -21,10 +21,45 @@ import psutil
 
 from identify.errors import StudyError
 from identify.runtime import delay_interrupts, shield_children
-from identify.studies.memory import GB
+from identify.setup import Setup
+from identify.studies.rows import find_kind
 from identify.studies.runner import Batches, Suspects
 from identify.studies.study_design import Case, Finished, Shared
+from identify.studies.study_file import Range, Study
 from identify.studies.worker import work
+
+LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
+"""Factors that determine the length of a record or of a stretch of a path."""
+
+PROCESS = 0.5e9
+"""Memory of a process before its first row, bytes."""
+
+GB = 1e9
+
+
+def check_memory(study: Study, shared: Shared, workers: int) -> None:
+    """Raise StudyError if the longest rows, one per worker, need more memory than is installed."""
+    kind = find_kind(study.kind)
+    if kind.memory is None:
+        return
+    longest = {path: _largest(study.factors[path]) for path in LENGTH if path in study.factors}
+    case = Case(0, 0, longest)
+    options = kind.checked(shared.row_options(case))
+    needed = PROCESS + kind.memory(Setup(shared.row_scenario(case)), options)
+    available = psutil.virtual_memory().total
+    if workers * needed > available:
+        fit = int(available // needed)
+        raise StudyError(
+            f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in "
+            f"{workers} processes "
+            f"{workers * needed / GB:.3g} GB, and this machine has {available / GB:.3g} GB: "
+            + (f"--workers {fit} fits" if fit else "shorten its rows")
+        )
+
+
+def _largest(values: list[float] | Range) -> float:
+    return values.high if isinstance(values, Range) else max(values)
+
 
 SPAWN = get_context("spawn")
 """Start method of the processes, by which they inherit neither threads nor locks."""

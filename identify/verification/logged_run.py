@@ -23,8 +23,8 @@ from identify.estimation.prior import friction, model_guess
 from identify.estimation.scale_anchor import MEASURING, default_std, measured_parameter
 from identify.model.model_side import ModelSide, model_side
 from identify.record.conditions import COMMAND_TIME
+from identify.record.delays import MotionLag, ServoDelay, servo_delay
 from identify.record.frame_times import GAP
-from identify.record.motion_lag import MotionLag
 from identify.record.own_record import (
     description_file,
     is_log,
@@ -32,11 +32,9 @@ from identify.record.own_record import (
     read_description,
     read_telemetry,
 )
-from identify.record.pose_noise import Spectrum, pose_noise, spectrum
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import is_timed, poses, read, recorded_reference
-from identify.record.servo_delay import ServoDelay, servo_delay
-from identify.record.smoothness import wrong_poses
+from identify.record.smoothness import Spectrum, pose_noise, spectrum, wrong_poses
 from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification

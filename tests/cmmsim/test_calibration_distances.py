@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cmmsim.calibration import calibrate
-from cmmsim.calibration.distances import measured_distances
+from cmmsim.calibration.halves import measured_distances
 from tests.cmmsim.test_calibration_adjustment import BOARD, SIZE, board_poses, seen_pairs
 
 COUNT = 24

@@ -21,10 +21,14 @@ from identify.errors import EstimationError, RecordError
 from identify.files.dataset import read_covariance
 from identify.files.run_folder import rms_figures
 from identify.geometry.calibration import calibrate
-from identify.geometry.encoders import check_encoders
 from identify.geometry.observability import check_enough, combinations
 from identify.geometry.static_experiment import Encoders, measure_static_poses, measured
-from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
+from identify.geometry.static_poses import (
+    FrameKnowledge,
+    StaticPoses,
+    check_encoders,
+    read_static_poses,
+)
 from identify.progress import SilentProgress
 from identify.record.geometry_errors import covariance_fault
 from identify.setup import Setup

@@ -16,13 +16,12 @@ from dynamics.kinematics.platform import base_from_platform
 from identify.errors import WriteError
 from identify.files.run_folder import RunFolder, load_result
 from identify.paper.block_diagrams import HALF_HEIGHT, HALF_WIDTH, LOOP, diagrams
-from identify.paper.exhibit import Exhibit, table_figure
+from identify.paper.exhibit import Exhibit, PaperRuns, table_figure
 from identify.paper.index_page import page
 from identify.paper.marked_planes import draw, marked_planes
 from identify.paper.paper_figures import trajectories
 from identify.paper.paper_tables import errors_of_the_fit, initial_parameters
 from identify.paper.robot_sketch import leg_points
-from identify.paper.runs import PaperRuns
 from identify.reporting.run_data import read_run
 from identify.scene import workcell
 from tests.identify.commands import command, one_line

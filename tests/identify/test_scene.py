@@ -36,8 +36,8 @@ from identify.scene import (
     stereo_view,
     workcell,
 )
-from identify.scene.gltf import gltf
 from identify.scene.painter import Painter, Viewpoint
+from identify.scene.replay import gltf
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import changed_robot_file, rss6
 

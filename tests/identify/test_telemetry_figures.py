@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from identify.record.motion_lag import motion_lag
-from identify.record.pose_noise import pose_noise, spectrum
+from identify.record.delays import motion_lag, servo_delay
 from identify.record.recording import poses
-from identify.record.servo_delay import servo_delay
-from identify.record.smoothness import gross_errors
+from identify.record.smoothness import gross_errors, pose_noise, spectrum
 from identify.record.telemetry import CommandLog, PoseLog, Rows, Telemetry
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant
 

@@ -1,0 +1,214 @@
+"""Delays of a log: of the motion behind its commands, and of commands behind the servo's poses.
+
+The lag of the motion is found by correlation. It is the sum of the lag of the drives, the latency,
+and the difference of the clocks with which poses and commands are logged.
+
+The delay of the servo is found from the sensor's noise. The visual servo computes a command from
+each measured pose, so the noise of the pose appears in the commands after the delay. The delay is
+the sum of the latency and the difference of the clocks. Drives and friction do not affect it. If no
+servo used these poses, the commands do not have their noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.filtering import interpolated
+from identify.record.smoothness import windows_of
+from identify.record.telemetry import Telemetry
+
+FINEST_S = 1e-3
+"""Smallest step, s, of the lags that are tried. The best is then refined by a parabola."""
+
+CLOSE_S = 1.0
+"""Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion."""
+
+ALIKE = 0.02
+"""Difference of correlations below which the smaller lag is taken."""
+
+FEWEST = 8
+"""Smallest number of poses that overlap with commands."""
+
+
+@dataclass(frozen=True)
+class MotionLag:
+    """Lag, s, positive where the motion is later, and the correlation (-1 to 1) at this lag."""
+
+    seconds: float
+    correlation: float
+
+
+def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Array) -> MotionLag:
+    """Return the lag at which joint coordinates follow commands best.
+
+    Parameters
+    ----------
+    time : ndarray, shape (N,)
+        Times of the coordinates, s.
+    coordinates : ndarray, shape (N, n)
+        Joint coordinates at measured poses.
+    command_time : ndarray, shape (M,)
+        Times of the commands, s.
+    command : ndarray, shape (M, n)
+        Joint commands.
+
+    Returns
+    -------
+    MotionLag
+        The lag, of at most half the duration. The correlation is zero if there is no motion, or
+        times do not overlap.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 10, 1 / 60)
+    >>> found = motion_lag(t, np.sin(3 * (t - 0.05))[:, None], t, np.sin(3 * t)[:, None])
+    >>> round(found.seconds, 4)
+    0.05
+    """
+    if min(len(time), len(command_time)) < FEWEST:
+        return MotionLag(0.0, 0.0)
+    duration = min(np.ptp(time), np.ptp(command_time)) / 2
+    step = max(float(np.median(np.diff(time))) / 2, FINEST_S)
+    for reach in (min(CLOSE_S, duration), duration):
+        lags = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
+        found = np.array(
+            [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
+        )
+        # If a lag near zero has a good correlation, larger lags are not tried.
+        if len(found) and found.max() > 1 - 5 * ALIKE:
+            break
+    if not len(found) or found.max() <= 0:
+        return MotionLag(0.0, 0.0)
+    good = np.flatnonzero(found >= found.max() - ALIKE)
+    nearest = good[np.argmin(np.abs(lags[good]))]
+    # From the good lag nearest to zero, climb to the peak to which it belongs.
+    best = int(nearest)
+    while 0 < best < len(lags) - 1 and found[best] < max(found[best - 1], found[best + 1]):
+        best += 1 if found[best + 1] > found[best - 1] else -1
+    shift = 0.0
+    if 0 < best < len(lags) - 1:
+        before, at, after = found[best - 1 : best + 2]
+        bend = before - 2 * at + after
+        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return MotionLag(float(lags[best] + shift * step), float(found[best]))
+
+
+def _correlation(time: Array, coordinates: Array, command_time: Array, command: Array) -> float:
+    """Return the mean correlation of the joints at these times, or zero without an overlap."""
+    inside = (time >= command_time[0]) & (time <= command_time[-1])
+    if inside.sum() < FEWEST:
+        return 0.0
+    held = interpolated(time[inside], command_time, command)
+    one, other = held - held.mean(axis=0), coordinates[inside] - coordinates[inside].mean(axis=0)
+    scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
+    moving = scale > 0
+    if not moving.any():
+        return 0.0
+    return float(((one * other).sum(axis=0)[moving] / scale[moving]).mean())
+
+
+REACH_S = 0.5
+"""Largest delay, s, of either sign that is tried."""
+
+PARTS = 4
+"""Number of tried delays per time between two poses."""
+
+CERTAIN = 6.0
+"""Smallest correlation, in standard deviations of the correlation of independent noises."""
+
+
+@dataclass(frozen=True)
+class ServoDelay:
+    """Delay of a command after its pose.
+
+    Attributes
+    ----------
+    seconds : float
+        Median delay, s. It is negative if the clock of the poses is ahead by more than the latency.
+    drift : float
+        Growth of the delay, s per s.
+    spread : float
+        Median deviation from the delay and its drift, s.
+    correlation : float
+        Correlation of the noise of poses and commands, as joint coordinates.
+    resolution : float
+        Time between two rows of the commands, s. If there are more commands than poses, a command
+        can have been written earlier than its first row by up to this time.
+    """
+
+    seconds: float
+    drift: float
+    spread: float
+    correlation: float
+    resolution: float
+
+
+def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
+    """Return the delay of the servo's commands, or None if they show no noise of the poses."""
+    log = telemetry.poses
+    time = log.time[log.ok]
+    poses = np.asarray(robot.pose(robot.coordinates(log.pose[log.ok])))
+    reached = (robot.reach_margin(poses) > 0).all(axis=-1)
+    time, joints = time[reached], robot.inverse_kinematics(poses[reached])
+    windows = windows_of(time)
+    if not len(windows.rows):
+        return None
+    noise = windows.deviations(joints)
+    moments = _written(telemetry)
+    rows = np.flatnonzero(np.isfinite(moments))
+    step = float(np.median(np.diff(time))) / PARTS
+    reach = np.ceil(REACH_S / step)
+    delays = step * (np.arange(-reach, reach + 1) + 0.5)
+    found = np.array(
+        [
+            _correlation_of_noises(
+                noise, windows.deviations(_held(telemetry, rows, moments, time + delay)[1])
+            )
+            for delay in delays
+        ]
+    )
+    # A command is held until the next, so that PARTS delays in a row correlate. Take their middle.
+    best = int(np.argmax(np.convolve(np.abs(found), np.ones(PARTS), mode="same")))
+    correlation = float(found[best])
+    if abs(correlation) * np.sqrt(noise.size) < CERTAIN:
+        return None
+    held = _held(telemetry, rows, moments, time[windows.rows] + delays[best])[0]
+    each = moments[held] - time[windows.rows]
+    since = time[windows.rows] - time[windows.rows].mean()
+    median = float(np.median(each))
+    drift = float(since @ (each - median) / (since @ since))
+    return ServoDelay(
+        median,
+        drift,
+        float(np.median(np.abs(each - median - drift * since))),
+        correlation,
+        float(np.median(np.diff(telemetry.commands.time))),
+    )
+
+
+def _written(telemetry: Telemetry) -> Array:
+    """Return the times (M,) at which commands were written, or else the times of their rows."""
+    commands = telemetry.commands
+    return commands.time if commands.written is None else commands.written
+
+
+def _held(
+    telemetry: Telemetry, rows: NDArray[np.intp], moments: Array, time: Array
+) -> tuple[NDArray[np.intp], Array]:
+    """Return the rows (K,) in which the commands at times (K,) first appear, and the commands."""
+    command = telemetry.commands.command[rows]
+    changed = np.concatenate([[True], (np.diff(command, axis=0) != 0).any(axis=1)])
+    first = np.maximum.accumulate(np.where(changed, np.arange(len(rows)), 0))
+    places = np.maximum(np.searchsorted(moments[rows], time, side="right") - 1, 0)
+    return rows[first[places]], command[places]
+
+
+def _correlation_of_noises(one: Array, other: Array) -> float:
+    """Return the mean correlation of the n columns of two noises (K, n)."""
+    product = (one * other).sum(axis=0)
+    scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
+    moving = scale > 0
+    return float((product[moving] / scale[moving]).mean()) if moving.any() else 0.0
