@@ -40,16 +40,10 @@ INEXACT = 1e-3
 class Selected:
     """Selected candidate.
 
-    Attributes
-    ----------
-    ranked : Ranked
-        The candidate as it was ranked.
-    places : tuple of int
-        Places of those of its causes whose sizes chance does not explain.
-    gain : float
-        Fall of the cost as it was fitted.
-    alike : tuple of str
-        Names of the candidates that cannot be told apart from it.
+    ranked  The candidate as it was ranked.
+    places  Places of those of its causes whose sizes chance does not explain.
+    gain    Fall of the cost as it was fitted.
+    alike   Names of the candidates that cannot be told apart from it.
     """
 
     ranked: Ranked

@@ -65,18 +65,11 @@ class OrthogonalComplement:
 class Score:
     """Score statistic of one or several causes.
 
-    Attributes
-    ----------
-    statistic : float
-        Fall of the cost that is expected if the causes are fitted.
-    freedoms : int
-        Number of directions in which their sizes show.
-    sizes : ndarray, shape (k,)
-        Sizes that are expected.
-    directions : ndarray, shape (m, freedoms)
-        Orthonormal directions U of the residuals in which the causes show.
-    by_directions : ndarray, shape (k, freedoms)
-        Change of the sizes by U^T r.
+    statistic                    Fall of the cost that is expected if the causes are fitted.
+    freedoms                     Number of directions in which their sizes show.
+    sizes (k,)                   Sizes that are expected.
+    directions (m, freedoms)     Orthonormal directions U of the residuals in which the causes show.
+    by_directions (k, freedoms)  Change of the sizes by U^T r.
     """
 
     statistic: float

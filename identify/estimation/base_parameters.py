@@ -57,18 +57,12 @@ It shrinks with the share.
 class BaseParameters:
     """Base parameters of a regression matrix.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the columns, the p dynamic parameters of a robot.
-    combinations : ndarray, shape (rank, p)
-        Matrix with base parameters = combinations @ parameters.
-    pivots : tuple of int
-        Index of the parameter that names each group. It has the coefficient 1.
-    unseen : tuple of str
-        Names of the parameters without any effect.
-    gap : tuple of float
-        Largest remainder of a dependent column, and smallest remainder of an independent column.
+    names                   Names of the columns, the p dynamic parameters of a robot.
+    combinations (rank, p)  Matrix with base parameters = combinations @ parameters.
+    pivots                  Index of the parameter that names each group. It has the coefficient 1.
+    unseen                  Names of the parameters without any effect.
+    gap                     Largest remainder of a dependent column, and smallest remainder of an
+                            independent column.
     """
 
     names: tuple[str, ...]

@@ -29,15 +29,11 @@ correct digits.
 class Conditioning:
     """Condition numbers of the scaled information, largest over smallest eigenvalue.
 
-    Attributes
-    ----------
-    with_guess : float
-        Condition number with the initial guess.
-    poses_alone : float
-        Condition number of the poses alone, infinite if rounding hides the smallest eigenvalue.
-    directions, unshown : int
-        Number of directions of base parameters and gains, and number of directions that the guess
-        determines better than the poses.
+    with_guess           Condition number with the initial guess.
+    poses_alone          Condition number of the poses alone, infinite if rounding hides the
+                         smallest eigenvalue.
+    directions, unshown  Number of directions of base parameters and gains, and number of directions
+                         that the guess determines better than the poses.
     """
 
     with_guess: float

@@ -71,22 +71,15 @@ FEWEST = 50
 class Uncertainty:
     """Uncertainty of an estimate without regard to bounds.
 
-    Attributes
-    ----------
-    whole : ndarray, shape (p + k, p + k)
-        Covariance of the estimate and the k common errors. The common errors follow record by
-        record, in units of their prior standard deviations.
-    sources : dict of ndarray, shape (p + k, p + k)
-        Parts of `whole` by source of the uncertainty: NOISE, MODEL, LOAD, GUESS, ANCHOR, the kinds
-        of common errors, and CORRELATED. Their sum is `whole`.
-    information : ndarray, shape (p, p)
-        Information of the poses alone.
-    gradient : ndarray, shape (p,)
-        Gradient J^T r of poses and prior at the estimate.
-    misfit : Misfit
-        Misfit of the record.
-    unstable : int
-        Number of unstable repetitions, which were left out.
+    whole (p + k, p + k)    Covariance of the estimate and the k common errors. The common errors
+                            follow record by record, in units of their prior standard deviations.
+    sources (p + k, p + k)  Parts of `whole` by source of the uncertainty: NOISE, MODEL, LOAD,
+                            GUESS, ANCHOR, the kinds of common errors, and CORRELATED. Their sum is
+                            `whole`.
+    information (p, p)      Information of the poses alone.
+    gradient (p,)           Gradient J^T r of poses and prior at the estimate.
+    misfit                  Misfit of the record.
+    unstable                Number of unstable repetitions, which were left out.
     """
 
     whole: Array

@@ -123,18 +123,12 @@ def identifiability(
 class GroupEstimates:
     """Estimates of the base parameters, in SI units of the leading parameter of each group.
 
-    Attributes
-    ----------
-    names, expressions : tuple of str
-        Name of each group, and the group as a sum.
-    combinations : ndarray, shape (rank, p)
-        Groups as combinations of the dynamic parameters.
-    initial, estimate, std : ndarray, shape (rank,)
-        Initial guesses, estimates, and standard deviations of the estimates.
-    identifiable : ndarray of bool, shape (rank,)
-        True for identified groups.
-    prior_share : ndarray, shape (rank,)
-        Share of the variance due to errors of the initial guess.
+    names, expressions              Name of each group, and the group as a sum.
+    combinations (rank, p)          Groups as combinations of the dynamic parameters.
+    initial, estimate, std (rank,)  Initial guesses, estimates, and standard deviations of the
+                                    estimates.
+    identifiable (rank,)            True for identified groups.
+    prior_share (rank,)             Share of the variance due to errors of the initial guess.
     """
 
     names: tuple[str, ...]
@@ -226,28 +220,21 @@ def scale_warnings(
 class Judgement:
     """Judgement of an estimate: identifiability, intervals and warnings.
 
-    Attributes
-    ----------
-    identifiable : ndarray of bool, shape (p,)
-        True for identified parameters.
-    prior_share : ndarray, shape (p,)
-        Share of the variance due to errors of the initial guess.
-    common_share : dict of ndarray, shape (p,)
-        Share of the variance due to errors that all poses have in common, by kind.
-    intervals, group_intervals : ndarray, shapes (p, 2) and (rank, 2)
-        95 % intervals of parameters and groups, truncated at the bounds.
-    groups : GroupEstimates
-        Estimates of the base parameters.
-    bounded : BoundedEstimate
-        Estimate within bounds, which states the distribution of every quantity.
-    conditioning : Conditioning
-        Conditioning of the estimate.
-    base_rank : int
-        Number of independent groups that the references excite, by the paper's rule.
-    active_bounds : tuple of str
-        Bounds that limit the estimate.
-    warnings : tuple of str
-        Warnings of the records, the model and the estimate.
+    identifiable (p,)               True for identified parameters.
+    prior_share (p,)                Share of the variance due to errors of the initial guess.
+    common_share (p,)               Share of the variance due to errors that all poses have in
+                                    common, by kind.
+    intervals, group_intervals (p, 2) and (rank, 2)
+                                    95 % intervals of parameters and groups, truncated at the
+                                    bounds.
+    groups                          Estimates of the base parameters.
+    bounded                         Estimate within bounds, which states the distribution of every
+                                    quantity.
+    conditioning                    Conditioning of the estimate.
+    base_rank                       Number of independent groups that the references excite, by the
+                                    paper's rule.
+    active_bounds                   Bounds that limit the estimate.
+    warnings                        Warnings of the records, the model and the estimate.
     """
 
     identifiable: NDArray[np.bool_]

@@ -48,20 +48,16 @@ class TorqueEquations:
 
     The first m rows are equations of the dynamics, and the other m rows of the controller.
 
-    Attributes
-    ----------
-    layout : ParameterLayout
-        Layout of the parameters, the first of the u unknowns. The torques of the joints at the
-        start follow.
-    matrix, right : ndarray, shapes (2 m, u) and (2 m,)
-        Coefficients and right side.
-    kind : ndarray of int, shape (2 m,)
-        Index of the joint, plus the number of joints in rows of the controller.
-    correlation : float
-        Samples that count as one independent sample. After a low-pass filter with cutoff f there
-        are 2 f independent samples per second.
-    slipping : ndarray of bool, shape (N, joints)
-        True for the frames and joints of the rows.
+    layout                          Layout of the parameters, the first of the u unknowns. The
+                                    torques of the joints at the start follow.
+    matrix, right (2 m, u) and (2 m,)
+                                    Coefficients and right side.
+    kind (2 m,)                     Index of the joint, plus the number of joints in rows of the
+                                    controller.
+    correlation                     Samples that count as one independent sample. After a low-pass
+                                    filter with cutoff f there are 2 f independent samples per
+                                    second.
+    slipping (N, joints)            True for the frames and joints of the rows.
     """
 
     layout: ParameterLayout

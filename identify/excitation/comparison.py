@@ -29,26 +29,18 @@ COMPARISON_REFINEMENT = 10
 class Entry:
     """Result of one method.
 
-    Attributes
-    ----------
-    method : str
-        Name of the method.
-    trajectory : FourierTrajectory
-        Trajectory that was found.
-    value : float
-        Value of the criterion that the method maximised.
-    observability : float
-        Observability index (eq. 39).
-    information : float or None
-        D of the simulated loop; None if the loop is unstable at the initial guess.
-    seconds : float
-        Duration of the search.
-    evaluations, gradients, iterations : int
-        Evaluations of the criterion and of its gradient, and iterations.
-    reason : str
-        Reason why the search stopped.
-    worst : tuple of WorstCase
-        Instants at which the trajectory comes nearest to each limit.
+    method                          Name of the method.
+    trajectory                      Trajectory that was found.
+    value                           Value of the criterion that the method maximised.
+    observability                   Observability index (eq. 39).
+    information                     D of the simulated loop; None if the loop is unstable at the
+                                    initial guess.
+    seconds                         Duration of the search.
+    evaluations, gradients, iterations
+                                    Evaluations of the criterion and of its gradient, and
+                                    iterations.
+    reason                          Reason why the search stopped.
+    worst                           Instants at which the trajectory comes nearest to each limit.
     """
 
     method: str

@@ -173,20 +173,12 @@ def _schatten_norm(matrix: ca.SX) -> ca.SX:
 class Limit:
     """One constraint.
 
-    Attributes
-    ----------
-    name : str
-        Name of the constraint.
-    share : casadi.SX
-        Used shares of the limit, one row per entry of ``limit``.
-    limit : tuple of float
-        Limits in their unit.
-    unit : str
-        Unit, with a space before it.
-    who : tuple of str
-        Legs, coordinates or stickers of the rows.
-    lower : bool
-        True for a lower bound. A share is then limit / value.
+    name   Name of the constraint.
+    share  Used shares of the limit, one row per entry of ``limit``.
+    limit  Limits in their unit.
+    unit   Unit, with a space before it.
+    who    Legs, coordinates or stickers of the rows.
+    lower  True for a lower bound. A share is then limit / value.
     """
 
     name: str

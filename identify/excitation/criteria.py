@@ -59,15 +59,10 @@ def smoothing_of(robot: Robot) -> float:
 class Criterion:
     """Objective of a search.
 
-    Attributes
-    ----------
-    value : casadi.Function
-        Function z -> logarithm of the criterion.
-    smooth : casadi.Function
-        Differentiable approximation of `value`.
-    judge : callable, optional
-        More accurate measure by which the results of a gradient search are ranked; larger is
-        better. It raises TrajectoryError for a trajectory that cannot be judged.
+    value   Function z -> logarithm of the criterion.
+    smooth  Differentiable approximation of `value`.
+    judge   More accurate measure by which the results of a gradient search are ranked; larger is
+            better. It raises TrajectoryError for a trajectory that cannot be judged.
     """
 
     value: ca.Function

@@ -88,19 +88,12 @@ They are scaled to the box at sampled times, and can exceed it slightly between 
 class Design:
     """Task of choosing trajectories for a robot.
 
-    Attributes
-    ----------
-    robot : Robot
-        Robot that shall follow the trajectories.
-    settings : Excitation
-        Form of the trajectories, and the search method of the exciting trajectory.
-    unseen : Validation
-        Number and length of the validation trajectories.
-    limits : MotionConstraints
-        Limits of the motion.
-    criterion : callable
-        Function (unknowns, typical) that returns the criterion of the search, see
-        `identify.excitation.criteria`.
+    robot      Robot that shall follow the trajectories.
+    settings   Form of the trajectories, and the search method of the exciting trajectory.
+    unseen     Number and length of the validation trajectories.
+    limits     Limits of the motion.
+    criterion  Function (unknowns, typical) that returns the criterion of the search, see
+               `identify.excitation.criteria`.
     """
 
     robot: Robot

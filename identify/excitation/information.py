@@ -88,20 +88,12 @@ def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: A
 class Knowledge:
     """Knowledge before the run.
 
-    Attributes
-    ----------
-    start : str
-        Name of the parameter set of the guess.
-    guess : StartingGuess
-        Initial guess of the parameters.
-    settings : LoopSettings
-        Loop of the model.
-    times : ndarray, shape (N,)
-        Times of the frames of the run, s.
-    covariance : ndarray, shape (6, 6)
-        Covariance of a measured pose, m and rad.
-    scaled_prior : ndarray, shape (p, p)
-        Information of the prior in units of its standard deviations.
+    start                Name of the parameter set of the guess.
+    guess                Initial guess of the parameters.
+    settings             Loop of the model.
+    times (N,)           Times of the frames of the run, s.
+    covariance (6, 6)    Covariance of a measured pose, m and rad.
+    scaled_prior (p, p)  Information of the prior in units of its standard deviations.
     """
 
     start: str

@@ -93,18 +93,11 @@ class SearchProblem:
 class SearchResult:
     """Result of a search.
 
-    Attributes
-    ----------
-    z : ndarray
-        Unknowns of the trajectory.
-    log_value : float
-        Logarithm of the criterion.
-    evaluations, gradients : int
-        Number of evaluations of the criterion and of its gradient.
-    iterations : int
-        Number of iterations or generations.
-    reason : str
-        Reason why the search stopped.
+    z                       Unknowns of the trajectory.
+    log_value               Logarithm of the criterion.
+    evaluations, gradients  Number of evaluations of the criterion and of its gradient.
+    iterations              Number of iterations or generations.
+    reason                  Reason why the search stopped.
     """
 
     z: Array

@@ -62,16 +62,10 @@ class JointInstruments:
     The defaults are a torque noise of 1 % of the holding torque of `rss6`, 2 to 3 N m, and an
     encoder of 17 bits.
 
-    Attributes
-    ----------
-    torque_noise : float
-        Standard deviation of one sample of torque, N m.
-    encoder_noise : float
-        Standard deviation of one reading of the angle, rad.
-    encoder_resolution : float
-        Quantisation step of the encoder, rad. 0 means no quantisation.
-    prismatic : bool
-        True if the actuators slide.
+    torque_noise        Standard deviation of one sample of torque, N m.
+    encoder_noise       Standard deviation of one reading of the angle, rad.
+    encoder_resolution  Quantisation step of the encoder, rad. 0 means no quantisation.
+    prismatic           True if the actuators slide.
 
     Raises
     ------

@@ -45,16 +45,10 @@ from identify.scenario.sections import Rig
 class KnownLoop:
     """Closed loop as an experimenter without knowledge of the plant knows it.
 
-    Attributes
-    ----------
-    side : ModelSide
-        Nominal robot and the loop around its model.
-    prior : mapping of str to PriorValue
-        More accurate priors of single parameters, by name.
-    filter_time : float or None
-        Time constant of drives with a filter, s, if one is stated.
-    control : Control
-        Settings of control laws, and limits of the drives.
+    side         Nominal robot and the loop around its model.
+    prior        More accurate priors of single parameters, by name.
+    filter_time  Time constant of drives with a filter, s, if one is stated.
+    control      Settings of control laws, and limits of the drives.
     """
 
     side: ModelSide
@@ -67,18 +61,12 @@ class KnownLoop:
 class RunSettings:
     """Settings of all runs of a plant.
 
-    Attributes
-    ----------
-    timing : Timing
-        Frames and latencies.
-    limits : mapping of str to float
-        Limits that keep the robot away from singularities, for `check_travel`.
-    rig : Rig
-        Errors and drift of the cameras, and the drift watch.
-    anchor, anchor_std : str, float or None
-        Measurement that fixes the scale of the parameters, and its standard deviation.
-    scenario_toml : str
-        Text of the scenario for the records.
+    timing              Frames and latencies.
+    limits              Limits that keep the robot away from singularities, for `check_travel`.
+    rig                 Errors and drift of the cameras, and the drift watch.
+    anchor, anchor_std  Measurement that fixes the scale of the parameters, and its standard
+                        deviation.
+    scenario_toml       Text of the scenario for the records.
     """
 
     timing: Timing

@@ -35,20 +35,12 @@ OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE
 class SensorPlan:
     """Description of the sensor of an experiment.
 
-    Attributes
-    ----------
-    name : str
-        Name in messages.
-    file : SensorFile
-        Sensor file, with the changes and the timing of the experiment.
-    renderer : str
-        Renderer of the images.
-    method : str
-        Method of the pose measurement.
-    rig : Rig
-        Knowledge, errors and drift of the cameras, and the drift watch.
-    frames : int
-        Default number of frames over which the cameras drift.
+    name      Name in messages.
+    file      Sensor file, with the changes and the timing of the experiment.
+    renderer  Renderer of the images.
+    method    Method of the pose measurement.
+    rig       Knowledge, errors and drift of the cameras, and the drift watch.
+    frames    Default number of frames over which the cameras drift.
     """
 
     name: str

@@ -32,28 +32,16 @@ NOISY = 4.0
 class GeometryOutcome:
     """Calibration with its poses.
 
-    Attributes
-    ----------
-    scenario : Scenario
-        Scenario of the calibration.
-    seed : int
-        Seed of the experiment.
-    model : PoseModel
-        Model of the poses.
-    calibration : Calibration
-        Estimated geometry.
-    data : StaticPoses
-        Measured poses.
-    lost_frames : int
-        Number of lost frames.
-    true : ndarray, shape (g,), or None
-        True deviations in a simulation.
-    unseen : Candidates
-        Validation poses, which were not measured.
-    chosen : Candidates or None
-        Chosen poses in a simulation.
-    among : Candidates
-        Candidates for the choice of poses.
+    scenario     Scenario of the calibration.
+    seed         Seed of the experiment.
+    model        Model of the poses.
+    calibration  Estimated geometry.
+    data         Measured poses.
+    lost_frames  Number of lost frames.
+    true (g,)    True deviations in a simulation.
+    unseen       Validation poses, which were not measured.
+    chosen       Chosen poses in a simulation.
+    among        Candidates for the choice of poses.
     """
 
     scenario: Scenario

@@ -98,16 +98,10 @@ def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> 
 class MeasuredPlatform:
     """Measured static poses.
 
-    Attributes
-    ----------
-    poses : ndarray, shape (N, 6)
-        Means of the frames, m and rad.
-    covariances : ndarray, shape (N, 6, 6)
-        Covariances of the means.
-    seen : ndarray, shape (N,)
-        True for poses with at least one measured frame.
-    lost : int
-        Number of lost frames.
+    poses (N, 6)           Means of the frames, m and rad.
+    covariances (N, 6, 6)  Covariances of the means.
+    seen (N,)              True for poses with at least one measured frame.
+    lost                   Number of lost frames.
     """
 
     poses: Array

@@ -55,21 +55,13 @@ class FrameKnowledge:
 class StaticPoses:
     """Measurements of a robot at static poses.
 
-    Attributes
-    ----------
-    joints : ndarray, shape (N, n)
-        Joint coordinates measured by encoders, rad or m.
-    joint_std : ndarray, shape (n,)
-        Standard deviations of the joint coordinates.
-    poses : ndarray, shape (N, 6)
-        Measured poses, each the mean of some frames, m and rad.
-    covariances : ndarray, shape (N, 6, 6)
-        Covariances of the poses.
-    frames : FrameKnowledge
-        Covariances of the errors of the two frames.
-    common : ndarray, shape (N, 6, k), optional
-        Shift of each pose by further independent errors of variance one that all poses have in
-        common, for example of inexact cameras.
+    joints (N, n)          Joint coordinates measured by encoders, rad or m.
+    joint_std (n,)         Standard deviations of the joint coordinates.
+    poses (N, 6)           Measured poses, each the mean of some frames, m and rad.
+    covariances (N, 6, 6)  Covariances of the poses.
+    frames                 Covariances of the errors of the two frames.
+    common (N, 6, k)       Shift of each pose by further independent errors of variance one that all
+                           poses have in common, for example of inexact cameras.
     """
 
     joints: Array

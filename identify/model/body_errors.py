@@ -40,15 +40,11 @@ LEAST_COMMAND = 1e-10
 class BodyError:
     """Error that all bodies of a kind, or the passive joints at one place, have in common.
 
-    Attributes
-    ----------
-    kind, name : str
-        Kind of the error in `identification.nuisances`, and name of the error. The name begins with
-        the kind and ends with the unit.
-    owners : tuple of int
-        Rows of the bodies in the layout of the robot. There are none for a passive joint.
-    parameters : tuple of str
-        Parameters that the model takes as zero: one for each owner, or the friction of the joint.
+    kind, name  Kind of the error in `identification.nuisances`, and name of the error. The name
+                begins with the kind and ends with the unit.
+    owners      Rows of the bodies in the layout of the robot. There are none for a passive joint.
+    parameters  Parameters that the model takes as zero: one for each owner, or the friction of the
+                joint.
     """
 
     kind: str

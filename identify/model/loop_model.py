@@ -36,35 +36,31 @@ from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Ma
 class LoopModel(Residuals):
     """Model of one run of a robot, for the output error of its parameters (p,).
 
-    Attributes
-    ----------
-    measured, ok : ndarray, shapes (N, 6) and (N,)
-        Measured poses, NaN where lost, and marks of the measured frames.
-    covariance : ndarray, shape (6, 6)
-        Covariance of one measured pose.
-    logged : ndarray, shape (N, n)
-        Logged commands of the joints.
-    payload, payload_errors : ndarray, shapes (p,) and (p, 7)
-        Change of the parameters by a known load on the platform, and its `load_errors`.
-    common : CommonErrors
-        Errors that all measured poses have in common.
-    driven : bool
-        True if the model's joints get the logged commands, False if its own servo acts.
-    acted : ndarray, shape (N,), optional
-        Logged latencies of the commands, s. If None, all commands have the latency of the timing.
-    drawn : ndarray, shape (k,), optional
-        Common errors that the model contains, in their standard deviations. None means no errors.
-    marginal : Marginal, optional
-        Whitener of the residuals for common errors, see `with_common_errors`.
-    torques : ndarray, shape (N, n), optional
-        Torques or forces that the joints need at the frames in addition to those of the model, if
-        the logged commands drive it. See `joint_torques`.
-    bodies : ndarray, shape (k, N, n), optional
-        Changes of the commands with the effect of one standard deviation of each error of bodies,
-        see `body_errors`. `with_common_errors` computes them.
-    groups : RigidGroups, optional
-        Combinations of the inertial parameters on which the motion depends. If they are given,
-        sensitivities are with respect to their pivots and to all other parameters.
+    measured, ok (N, 6) and (N,)    Measured poses, NaN where lost, and marks of the measured
+                                    frames.
+    covariance (6, 6)               Covariance of one measured pose.
+    logged (N, n)                   Logged commands of the joints.
+    payload, payload_errors (p,) and (p, 7)
+                                    Change of the parameters by a known load on the platform, and
+                                    its `load_errors`.
+    common                          Errors that all measured poses have in common.
+    driven                          True if the model's joints get the logged commands, False if its
+                                    own servo acts.
+    acted (N,)                      Logged latencies of the commands, s. If None, all commands have
+                                    the latency of the timing.
+    drawn (k,)                      Common errors that the model contains, in their standard
+                                    deviations. None means no errors.
+    marginal                        Whitener of the residuals for common errors, see
+                                    `with_common_errors`.
+    torques (N, n)                  Torques or forces that the joints need at the frames in addition
+                                    to those of the model, if the logged commands drive it. See
+                                    `joint_torques`.
+    bodies (k, N, n)                Changes of the commands with the effect of one standard
+                                    deviation of each error of bodies, see `body_errors`.
+                                    `with_common_errors` computes them.
+    groups                          Combinations of the inertial parameters on which the motion
+                                    depends. If they are given, sensitivities are with respect to
+                                    their pivots and to all other parameters.
     """
 
     robot: Robot

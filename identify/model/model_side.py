@@ -17,24 +17,17 @@ from identify.scenario.plant_sections import DriveName
 class ModelSide:
     """Robot and loop as the estimator knows them, and its settings for reading a record.
 
-    Attributes
-    ----------
-    robot : Robot
-        Robot with its known geometry.
-    settings : LoopSettings
-        Settings of the loop around the model. Its mean latency is used if a record does not state
-        when commands acted.
-    model : Model
-        Parameter set of the initial guess, and the law of the drives, which can be left open.
-    timing : Timing
-        Timing of the frames. In addition to the timing in `settings`, it has the standard deviation
-        of the latency.
-    low_pass : Filter
-        Filter of the measured poses in all linear fits.
-    nuisances : tuple of str
-        Kinds of errors that all poses have in common. They are estimated with the parameters.
-    fewest_frames : int
-        Smallest number of frames of a record for an identification.
+    robot          Robot with its known geometry.
+    settings       Settings of the loop around the model. Its mean latency is used if a record does
+                   not state when commands acted.
+    model          Parameter set of the initial guess, and the law of the drives, which can be left
+                   open.
+    timing         Timing of the frames. In addition to the timing in `settings`, it has the
+                   standard deviation of the latency.
+    low_pass       Filter of the measured poses in all linear fits.
+    nuisances      Kinds of errors that all poses have in common. They are estimated with the
+                   parameters.
+    fewest_frames  Smallest number of frames of a record for an identification.
     """
 
     robot: Robot

@@ -35,20 +35,13 @@ WIDE = 20.0
 class Stretch:
     """Part of a run, and the state in which it begins.
 
-    Attributes
-    ----------
-    robot : Robot
-        Robot as the estimator knows it.
-    number : int
-        Number of the stretch in its record, from 1.
-    rows : slice
-        Rows of the poses of the stretch.
-    coordinates, rates : ndarray, shape (m,)
-        Coordinates of the platform at the start, and their rates.
-    integral : ndarray, shape (n,)
-        Integrals of the drives minus those at rest at the same coordinates, rad s or m s.
-    std : ndarray, shape (2 m + n,)
-        Standard deviations of coordinates, rates and integrals.
+    robot                    Robot as the estimator knows it.
+    number                   Number of the stretch in its record, from 1.
+    rows                     Rows of the poses of the stretch.
+    coordinates, rates (m,)  Coordinates of the platform at the start, and their rates.
+    integral (n,)            Integrals of the drives minus those at rest at the same coordinates,
+                             rad s or m s.
+    std (2 m + n,)           Standard deviations of coordinates, rates and integrals.
     """
 
     robot: Robot

@@ -55,14 +55,10 @@ ROUNDING = 9
 class TimedModel(LoopModel):
     """Model of a timed run, driven by commands.
 
-    Attributes
-    ----------
-    times : ndarray, shape (N,)
-        Times of the poses, s.
-    acting : ndarray, shape (M,)
-        Stated times, s, at which the commands `logged` (M, n) begin to act. They do not decrease.
-    stretches : tuple of Stretch
-        Parts of the run, each with its own start.
+    times (N,)   Times of the poses, s.
+    acting (M,)  Stated times, s, at which the commands `logged` (M, n) begin to act. They do not
+                 decrease.
+    stretches    Parts of the run, each with its own start.
     """
 
     times: Array = field(kw_only=True)

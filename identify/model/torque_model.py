@@ -57,15 +57,10 @@ RATE = 20.0
 class Fit:
     """Run of a span from a start (2 m,).
 
-    Attributes
-    ----------
-    start, run
-        Coordinates and rates of the start, and the run from there.
-    jacobian : ndarray, shape (6 n, 2 m)
-        Derivatives of the whitened poses with respect to the start.
-    residuals : ndarray, shape (6 n + 2 m,)
-        Residuals of the measured poses, then differences from the filtered start, both in standard
-        deviations.
+    start, run              Coordinates and rates of the start, and the run from there.
+    jacobian (6 n, 2 m)     Derivatives of the whitened poses with respect to the start.
+    residuals (6 n + 2 m,)  Residuals of the measured poses, then differences from the filtered
+                            start, both in standard deviations.
     """
 
     start: Array

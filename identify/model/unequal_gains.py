@@ -17,10 +17,7 @@ from identify.model.timed_model import TimedModel
 class UnequalGains(LoopModel):
     """Model of a run in which the gains of each joint differ from the shared gains.
 
-    Attributes
-    ----------
-    differences : ndarray, shape (n, 3)
-        Gains lp, li, ld of each joint beyond the shared gains.
+    differences (n, 3)  Gains lp, li, ld of each joint beyond the shared gains.
     """
 
     differences: Array = field(default_factory=lambda: np.zeros((0, len(JOINT_PID))))

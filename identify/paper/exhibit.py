@@ -23,16 +23,10 @@ from identify.verification.against_mujoco import EngineRuns
 class PaperRuns:
     """Results from which all exhibits are drawn.
 
-    Attributes
-    ----------
-    robot : Robot
-        Robot of both runs.
-    ours, settings : RunData
-        Run of the scenario `paper`, and run of the scenario `paper_settings`.
-    variation : Variation
-        Scatter of the estimates from the validation runs of `ours`.
-    engines : EngineRuns
-        Motion of the model and of MuJoCo.
+    robot           Robot of both runs.
+    ours, settings  Run of the scenario `paper`, and run of the scenario `paper_settings`.
+    variation       Scatter of the estimates from the validation runs of `ours`.
+    engines         Motion of the model and of MuJoCo.
     """
 
     robot: Robot
@@ -55,18 +49,12 @@ Columns = Mapping[str, Collection[Any]]
 class Exhibit:
     """Figure or table of the paper, and its counterpart from our own runs.
 
-    Attributes
-    ----------
-    name : str
-        Name in the paper, such as "Figure 8".
-    title : str
-        Subject of the figure or table.
-    paper, ours : str
-        Sentences on what the paper shows, and on what our counterpart shows and why it differs.
-    columns : mapping
-        Numbers of the exhibit, which become its CSV file.
-    draw : callable, optional
-        Function that draws the figure. It is None for a table, whose columns are drawn.
+    name         Name in the paper, such as "Figure 8".
+    title        Subject of the figure or table.
+    paper, ours  Sentences on what the paper shows, and on what our counterpart shows and why it
+                 differs.
+    columns      Numbers of the exhibit, which become its CSV file.
+    draw         Function that draws the figure. It is None for a table, whose columns are drawn.
     """
 
     name: str

@@ -25,20 +25,12 @@ COLOURS = (BLUE, RED, GREEN)
 class MarkedPlanes:
     """Planes fitted to measured stickers.
 
-    Attributes
-    ----------
-    ids : tuple of str
-        Names (n,) of the stickers.
-    plane : ndarray of int, shape (n,)
-        Plane of each sticker, 0 to 2.
-    points : ndarray, shape (n, 3)
-        Measured places in the frame of the planes, m.
-    distances : ndarray, shape (n,)
-        Signed distances of the stickers from their planes, m.
-    normals : ndarray, shape (3, 3)
-        Unit normals of the planes in the frame of the planes, one per row.
-    base_from_planes : ndarray, shape (4, 4)
-        Frame of the planes in the base frame.
+    ids                      Names (n,) of the stickers.
+    plane (n,)               Plane of each sticker, 0 to 2.
+    points (n, 3)            Measured places in the frame of the planes, m.
+    distances (n,)           Signed distances of the stickers from their planes, m.
+    normals (3, 3)           Unit normals of the planes in the frame of the planes, one per row.
+    base_from_planes (4, 4)  Frame of the planes in the base frame.
     """
 
     ids: tuple[str, ...]

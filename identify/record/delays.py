@@ -124,19 +124,13 @@ CERTAIN = 6.0
 class ServoDelay:
     """Delay of a command after its pose.
 
-    Attributes
-    ----------
-    seconds : float
-        Median delay, s. It is negative if the clock of the poses is ahead by more than the latency.
-    drift : float
-        Growth of the delay, s per s.
-    spread : float
-        Median deviation from the delay and its drift, s.
-    correlation : float
-        Correlation of the noise of poses and commands, as joint coordinates.
-    resolution : float
-        Time between two rows of the commands, s. If there are more commands than poses, a command
-        can have been written earlier than its first row by up to this time.
+    seconds      Median delay, s. It is negative if the clock of the poses is ahead by more than the
+                 latency.
+    drift        Growth of the delay, s per s.
+    spread       Median deviation from the delay and its drift, s.
+    correlation  Correlation of the noise of poses and commands, as joint coordinates.
+    resolution   Time between two rows of the commands, s. If there are more commands than poses, a
+                 command can have been written earlier than its first row by up to this time.
     """
 
     seconds: float

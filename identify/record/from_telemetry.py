@@ -131,12 +131,8 @@ def rates(reference: ReferenceLog, frame_period_s: float) -> Array:
 class GrossErrors(RecordError):
     """Error for a log with too many poses that are gross errors.
 
-    Attributes
-    ----------
-    log : PoseLog
-        The log.
-    wrong : ndarray, shape (N,)
-        True for its poses that are gross errors.
+    log         The log.
+    wrong (N,)  True for its poses that are gross errors.
     """
 
     def __init__(self, message: str, log: PoseLog, wrong: NDArray[np.bool_]) -> None:

@@ -272,15 +272,10 @@ def pose_noise(time: Array, poses: Array) -> Array:
 class Spectrum:
     """Power of a motion by frequency.
 
-    Attributes
-    ----------
-    frequency : ndarray, shape (F,)
-        Frequencies, Hz.
-    power : ndarray, shape (F, 6)
-        Power of each entry of a pose, m2/Hz and rad2/Hz.
-    highest_hz : float
-        Frequency below which 99 % of the power of the positions and of the angles lies, zero if
-        nothing moves.
+    frequency (F,)  Frequencies, Hz.
+    power (F, 6)    Power of each entry of a pose, m2/Hz and rad2/Hz.
+    highest_hz      Frequency below which 99 % of the power of the positions and of the angles lies,
+                    zero if nothing moves.
     """
 
     frequency: Array

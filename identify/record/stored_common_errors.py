@@ -53,27 +53,18 @@ ASSUMPTIONS = ("centres", "products", "passive_friction")
 class CommonErrors:
     """Common errors of the measured poses, and their covariance.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names of the k errors, each ending with its unit.
-    changes : ndarray, shape (N, 6, k)
-        Change of the measured poses per unit of each error.
-    covariance : ndarray, shape (k, k)
-        Covariance of the true values about the known values.
-    loop_std : dict of str to float
-        Standard deviations of errors in the loop by name, such as those of the mean latency of the
-        frames, s, of the zero of each joint, and of the scale of the commands. A model of the loop
-        is needed to compute their effect on the poses.
-    geometry : GeometryErrors, optional
-        Errors of the robot's geometry. A model of the loop is needed to compute their effect. None
-        if the geometry is exact.
-    body_std : dict of str to float
-        Standard deviations of errors of bodies and passive joints by name. See
-        `identify.model.body_errors`.
-    whitener : ndarray, shape (6, 6), optional
-        Whitener of the noise of the poses. It determines the noticed directions of the errors. If
-        None, all directions count as noticed.
+    names              Names of the k errors, each ending with its unit.
+    changes (N, 6, k)  Change of the measured poses per unit of each error.
+    covariance (k, k)  Covariance of the true values about the known values.
+    loop_std           Standard deviations of errors in the loop by name, such as those of the mean
+                       latency of the frames, s, of the zero of each joint, and of the scale of the
+                       commands. A model of the loop is needed to compute their effect on the poses.
+    geometry           Errors of the robot's geometry. A model of the loop is needed to compute
+                       their effect. None if the geometry is exact.
+    body_std           Standard deviations of errors of bodies and passive joints by name. See
+                       `identify.model.body_errors`.
+    whitener (6, 6)    Whitener of the noise of the poses. It determines the noticed directions of
+                       the errors. If None, all directions count as noticed.
     """
 
     names: tuple[str, ...]
@@ -173,12 +164,8 @@ NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
 class Marginal:
     """Whitener of residuals of unit covariance that have modes in common.
 
-    Attributes
-    ----------
-    modes : ndarray, shape (m, k)
-        Modes of the m residuals.
-    had : ndarray, shape (m,)
-        Part of the residuals that is due to the common errors that the model contains.
+    modes (m, k)  Modes of the m residuals.
+    had (m,)      Part of the residuals that is due to the common errors that the model contains.
     """
 
     modes: Array

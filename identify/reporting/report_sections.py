@@ -32,16 +32,10 @@ class FoldedText:
 class Section:
     """Section of the report.
 
-    Attributes
-    ----------
-    text
-        Paragraphs.
-    pictures
-        Names of pictures.
-    folded
-        Names of folded pictures, by title.
-    tables, folds
-        Tables, and folded texts.
+    text           Paragraphs.
+    pictures       Names of pictures.
+    folded         Names of folded pictures, by title.
+    tables, folds  Tables, and folded texts.
     """
 
     title: str

@@ -38,24 +38,14 @@ class RunData:
 
     For a record of a real robot, truth and trajectories are None, and there are no validation runs.
 
-    Attributes
-    ----------
-    folder
-        Folder of the run.
-    result
-        Content of `result.json`.
-    experiment, truth
-        Record of the excitation run, and its truth.
-    validation
-        Records of the validation runs.
-    validation_truth
-        Truth of the first validation run.
-    models
-        Poses of the models, by the name of the run.
-    covariance, names
-        Covariance (p, p) of the estimates, and the names (p,) of the parameters.
-    trajectories
-        Trajectories of excitation and validation.
+    folder             Folder of the run.
+    result             Content of `result.json`.
+    experiment, truth  Record of the excitation run, and its truth.
+    validation         Records of the validation runs.
+    validation_truth   Truth of the first validation run.
+    models             Poses of the models, by the name of the run.
+    covariance, names  Covariance (p, p) of the estimates, and the names (p,) of the parameters.
+    trajectories       Trajectories of excitation and validation.
     """
 
     folder: Path

@@ -22,19 +22,12 @@ Settings = TypeVar("Settings", bound=BaseModel)
 class SettingsFiles(Generic[Settings]):
     """Files of one kind: built-in files by name, and files of the user by path.
 
-    Attributes
-    ----------
-    kind
-        Name of the kind, such as ``scenario``.
-    folder
-        Folder of the package with the built-in files.
-    model
-        Model of the content.
-    error
-        Exception for a file that is refused, with the reason in one line.
-    files
-        Keys whose values name files of another kind, each with the built-in names of that kind.
-        Keys in tables are dotted. Such paths are relative to the file that states them.
+    kind    Name of the kind, such as ``scenario``.
+    folder  Folder of the package with the built-in files.
+    model   Model of the content.
+    error   Exception for a file that is refused, with the reason in one line.
+    files   Keys whose values name files of another kind, each with the built-in names of that kind.
+            Keys in tables are dotted. Such paths are relative to the file that states them.
     """
 
     kind: str

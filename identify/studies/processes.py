@@ -192,16 +192,10 @@ class ProcessExecutor:
 class _Worker:
     """Process of this machine, and the pipe to it.
 
-    Attributes
-    ----------
-    ready : bool
-        Whether the process has loaded its libraries.
-    cases : list of Case
-        Rows that the process computes now.
-    end_reason : str
-        Text for an error message about the end of the process.
-    pipe : Connection
-        Main process's end of the pipe.
+    ready       Whether the process has loaded its libraries.
+    cases       Rows that the process computes now.
+    end_reason  Text for an error message about the end of the process.
+    pipe        Main process's end of the pipe.
     """
 
     def __init__(self) -> None:

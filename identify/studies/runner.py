@@ -30,14 +30,9 @@ from identify.studies.table import FIRST, LAST, TABLE, tidy_table, write_table, 
 class Outcome:
     """Finished study.
 
-    Attributes
-    ----------
-    frame : DataFrame
-        Table of all rows.
-    found : int
-        Number of rows that were finished before this run.
-    surplus : int
-        Number of stored rows of repeats that the study no longer has.
+    frame    Table of all rows.
+    found    Number of rows that were finished before this run.
+    surplus  Number of stored rows of repeats that the study no longer has.
     """
 
     frame: pd.DataFrame

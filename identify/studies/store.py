@@ -59,14 +59,10 @@ FINISHED = TypeAdapter(Finished)
 class Journal:
     """Journal of the finished rows of a study with ``rows`` rows. As a context, it closes its file.
 
-    Attributes
-    ----------
-    path : Path
-        The file.
-    surplus : int
-        Number of rows in the file that belong to repeats that the study no longer has.
-    finished : ndarray of bool, shape (rows,)
-        True for each finished row.
+    path              The file.
+    surplus           Number of rows in the file that belong to repeats that the study no longer
+                      has.
+    finished (rows,)  True for each finished row.
     """
 
     def __init__(self, path: Path, rows: int) -> None:

@@ -47,14 +47,9 @@ STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 class Case:
     """Row to be computed.
 
-    Attributes
-    ----------
-    number : int
-        Number of the row.
-    repeat : int
-        Number of the repeat.
-    factors : dict
-        Value of each factor by dotted path.
+    number   Number of the row.
+    repeat   Number of the repeat.
+    factors  Value of each factor by dotted path.
     """
 
     number: int
@@ -66,16 +61,10 @@ class Case:
 class Finished:
     """Finished row.
 
-    Attributes
-    ----------
-    number : int
-        Number of the row.
-    figures : dict
-        Figures by name. Empty if the row failed.
-    seconds : float
-        Computing time, s.
-    error : str
-        Reason of the failure in one line. Empty if the row did not fail.
+    number   Number of the row.
+    figures  Figures by name. Empty if the row failed.
+    seconds  Computing time, s.
+    error    Reason of the failure in one line. Empty if the row did not fail.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = STRICT | ConfigDict(extra="forbid")
@@ -90,16 +79,10 @@ class Finished:
 class Shared:
     """Common data of all rows of a study.
 
-    Attributes
-    ----------
-    kind : str
-        Kind of row.
-    scenario : Scenario
-        Scenario with the changes of all rows.
-    options : dict
-        Options of the kind that hold in all rows.
-    seed : int
-        Seed of the study.
+    kind      Kind of row.
+    scenario  Scenario with the changes of all rows.
+    options   Options of the kind that hold in all rows.
+    seed      Seed of the study.
     """
 
     kind: str

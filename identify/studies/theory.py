@@ -41,14 +41,9 @@ SMALLEST = 1e-12
 class ScaleRegression:
     """Fit of the logarithm of a mean square.
 
-    Attributes
-    ----------
-    coefficients : ndarray, shape (k,)
-        Coefficients beta.
-    covariance : ndarray, shape (k, k)
-        Covariance of the coefficients.
-    freedom : int
-        Degrees of freedom.
+    coefficients (k,)  Coefficients beta.
+    covariance (k, k)  Covariance of the coefficients.
+    freedom            Degrees of freedom.
     """
 
     coefficients: Array
@@ -176,20 +171,12 @@ The interval is of an exponent, or of the logarithm of a ratio.
 class Verdict:
     """Result of the comparison of rows with a law.
 
-    Attributes
-    ----------
-    law : Law
-        The law.
-    verdict : str
-        "passed", "failed" or "undecided".
-    measured : float or None
-        Measured exponent or ratio.
-    low, high : float
-        Ends of the interval of the measured value.
-    rows : int
-        Number of rows used.
-    reason : str
-        Reason why nothing could be measured.
+    law        The law.
+    verdict    "passed", "failed" or "undecided".
+    measured   Measured exponent or ratio.
+    low, high  Ends of the interval of the measured value.
+    rows       Number of rows used.
+    reason     Reason why nothing could be measured.
     """
 
     law: Law

@@ -64,16 +64,10 @@ START = "starting guess"
 class ComparisonTruth:
     """Truth against which estimators are compared.
 
-    Attributes
-    ----------
-    side : ModelSide
-        Robot and loop that the estimator assumes.
-    true : ndarray, shape (p,)
-        True parameters.
-    combinations : ndarray, shape (k, p)
-        Combinations of the dynamic parameters that the record identifies.
-    unseen : tuple of (record, truth)
-        Validation runs of the plant.
+    side                 Robot and loop that the estimator assumes.
+    true (p,)            True parameters.
+    combinations (k, p)  Combinations of the dynamic parameters that the record identifies.
+    unseen               Validation runs of the plant.
     """
 
     side: ModelSide
@@ -110,26 +104,17 @@ class ComparisonTruth:
 class Score:
     """Row of the table of estimators.
 
-    Attributes
-    ----------
-    name, title, uses : str
-        Name and title of the estimator, and the data that it uses.
-    group_distance, group_median : float
-        RMS and median of the relative errors of the base parameters.
-    gain_distance : float
-        RMS of the relative errors of the gains.
-    position_um, orientation_urad : float
-        RMS pose errors of the worst axis and run on validation trajectories.
-    seconds : float
-        Duration of the estimation.
-    iterations, evaluations : int
-        Iterations and model evaluations.
-    note : str
-        Remark, such as the reason of a failure. After a failure all figures are NaN.
-    parameters, std : ndarray, shape (p,), optional
-        Estimates and their standard deviations.
-    names : tuple of str
-        Names of the parameters.
+    name, title, uses              Name and title of the estimator, and the data that it uses.
+    group_distance, group_median   RMS and median of the relative errors of the base parameters.
+    gain_distance                  RMS of the relative errors of the gains.
+    position_um, orientation_urad  RMS pose errors of the worst axis and run on validation
+                                   trajectories.
+    seconds                        Duration of the estimation.
+    iterations, evaluations        Iterations and model evaluations.
+    note                           Remark, such as the reason of a failure. After a failure all
+                                   figures are NaN.
+    parameters, std (p,)           Estimates and their standard deviations.
+    names                          Names of the parameters.
     """
 
     name: str

@@ -58,18 +58,13 @@ class PosePrediction:
       error is constant along the motion. Poses and covariance contain its estimate from the record
       of the identification.
 
-    Attributes
-    ----------
-    chart : Chart
-        Coordinates of the platform.
-    poses : ndarray, shape (N, 6)
-        Predicted poses, m and rad.
-    covariance : ndarray, shape (N, 6, 6)
-        Covariance of the plant's true poses about the predicted poses. It is zero along directions
-        in which the platform cannot move.
-    slopes : ndarray, shape (N, 6, p), optional
-        Sensitivities of the poses. They are given only if no frame is lost, poses have no common
-        errors, the platform carries no load, and the servo drives the model.
+    chart                 Coordinates of the platform.
+    poses (N, 6)          Predicted poses, m and rad.
+    covariance (N, 6, 6)  Covariance of the plant's true poses about the predicted poses. It is zero
+                          along directions in which the platform cannot move.
+    slopes (N, 6, p)      Sensitivities of the poses. They are given only if no frame is lost, poses
+                          have no common errors, the platform carries no load, and the servo drives
+                          the model.
     """
 
     chart: Chart

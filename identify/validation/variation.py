@@ -39,20 +39,12 @@ FEWEST_RUNS = 3
 class Variation:
     """Variation of the parameters (p,).
 
-    Attributes
-    ----------
-    layout : ParameterLayout
-        Names and units of the parameters.
-    mean : ndarray, shape (p,)
-        Means of the estimates, SI.
-    variation : ndarray, shape (p,)
-        Standard deviations of the estimates over the size of their means.
-    expected : ndarray, shape (p,)
-        Expected variation according to the standard deviations of the runs.
-    identified : ndarray of bool, shape (p,)
-        True for parameters that every run identifies.
-    runs : int
-        Number of runs.
+    layout           Names and units of the parameters.
+    mean (p,)        Means of the estimates, SI.
+    variation (p,)   Standard deviations of the estimates over the size of their means.
+    expected (p,)    Expected variation according to the standard deviations of the runs.
+    identified (p,)  True for parameters that every run identifies.
+    runs             Number of runs.
     """
 
     layout: ParameterLayout

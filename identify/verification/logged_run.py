@@ -50,18 +50,11 @@ MOST_FRAMES = 10_000
 class LoggedRun:
     """Telemetry with what an experimenter states about it.
 
-    Attributes
-    ----------
-    telemetry : Telemetry
-        Poses and commands.
-    side : ModelSide
-        Robot and loop as the estimator knows them.
-    settings : Identification
-        Settings of the identification: its prior and its scale anchor.
-    stated : ndarray, shape (6,), or None
-        Stated standard deviations of a measured pose, m and rad.
-    suspicions : tuple of str
-        What is likely wrong with the units, frames and joints.
+    telemetry    Poses and commands.
+    side         Robot and loop as the estimator knows them.
+    settings     Settings of the identification: its prior and its scale anchor.
+    stated (6,)  Stated standard deviations of a measured pose, m and rad.
+    suspicions   What is likely wrong with the units, frames and joints.
     """
 
     telemetry: Telemetry

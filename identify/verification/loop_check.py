@@ -29,20 +29,12 @@ from identify.verification.finding import Finding
 class CheckSettings:
     """Loop and sensor with which a robot is checked.
 
-    Attributes
-    ----------
-    settings : LoopSettings
-        Servo, timing, friction and drives.
-    control : Control
-        Requested bandwidth and damping for the design of the servo, if any.
-    feedback : Feedback
-        Bandwidth and damping of computed_torque.
-    limits : Excitation
-        Limits of leverage and condition number.
-    sensor, sensor_file : str and SensorFile
-        Name of the sensor for messages, and its file.
-    plant_steps : int
-        Integration steps of the plant per frame.
+    settings             Servo, timing, friction and drives.
+    control              Requested bandwidth and damping for the design of the servo, if any.
+    feedback             Bandwidth and damping of computed_torque.
+    limits               Limits of leverage and condition number.
+    sensor, sensor_file  Name of the sensor for messages, and its file.
+    plant_steps          Integration steps of the plant per frame.
     """
 
     settings: closed_loop.LoopSettings

@@ -33,19 +33,13 @@ AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 class WorkspacePlane:
     """Map in which two pose components vary and a third is fixed.
 
-    Attributes
-    ----------
-    across, up, fixed
-        Indices 0..5 of the components.
-    value
-        Value of the fixed component [m or rad].
-    horizontal, vertical
-        Grid lines (n,) [m or rad].
-    travel_share, condition
-        Used share of the travel limit and condition number of the joint Jacobian, each (n, n), with
-        a row for each entry of ``vertical``. They are NaN out of reach.
-    reach_margin
-        Margin (n, n) of the worst leg.
+    across, up, fixed        Indices 0..5 of the components.
+    value                    Value of the fixed component [m or rad].
+    horizontal, vertical     Grid lines (n,) [m or rad].
+    travel_share, condition  Used share of the travel limit and condition number of the joint
+                             Jacobian, each (n, n), with a row for each entry of ``vertical``. They
+                             are NaN out of reach.
+    reach_margin             Margin (n, n) of the worst leg.
     """
 
     across: int

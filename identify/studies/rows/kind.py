@@ -26,14 +26,9 @@ from identify.studies.study_file import Range, Study
 class IneffectiveKeys:
     """Keys that have no effect under a condition.
 
-    Attributes
-    ----------
-    keys : tuple of str
-        Dotted paths, or sections.
-    where : mapping of str to callable
-        Condition: a test of the value of each dotted path. All tests must hold.
-    why : str
-        The condition as text for an error message, after "where".
+    keys   Dotted paths, or sections.
+    where  Condition: a test of the value of each dotted path. All tests must hold.
+    why    The condition as text for an error message, after "where".
     """
 
     keys: tuple[str, ...]
@@ -45,14 +40,9 @@ class IneffectiveKeys:
 class KeysRead:
     """Keys that a kind reads, beside all of its options.
 
-    Attributes
-    ----------
-    keys : tuple of str
-        Dotted paths, or sections that end in a dot.
-    excluding : tuple of str
-        Keys in these sections that the kind does not read.
-    ineffective : tuple of IneffectiveKeys
-        Keys that have no effect under some conditions.
+    keys         Dotted paths, or sections that end in a dot.
+    excluding    Keys in these sections that the kind does not read.
+    ineffective  Keys that have no effect under some conditions.
     """
 
     keys: tuple[str, ...]
@@ -261,14 +251,9 @@ They are uniform over the rows if the stated distributions are right, see `studi
 class Column:
     """Figure of a row.
 
-    Attributes
-    ----------
-    unit : str
-        Unit, "1" for a number without unit.
-    meaning : str
-        Description of the figure.
-    main : bool
-        Whether summaries show and plot the figure.
+    unit     Unit, "1" for a number without unit.
+    meaning  Description of the figure.
+    main     Whether summaries show and plot the figure.
     """
 
     unit: str
@@ -283,26 +268,16 @@ class Kind:
     A user's own kind has only a name and a function. The figures of such a kind are known from its
     rows, and any options are allowed, or none.
 
-    Attributes
-    ----------
-    name : str
-        Name in study files.
-    compute : callable
-        Function (scenario, seed, options) that returns a row's figures by name. The same arguments
-        give the same row, whatever was computed before.
-    what : str
-        Description of a row.
-    columns : mapping of str to Column
-        Figures of a row.
-    options : type or None
-        Model of the options.
-    reads : KeysRead or None
-        Keys that rows read.
-    takes_options : bool
-        Whether options are allowed.
-    memory : callable or None
-        Function (setup, options) that returns the memory needed by a row, bytes. None means little
-        memory.
+    name           Name in study files.
+    compute        Function (scenario, seed, options) that returns a row's figures by name. The same
+                   arguments give the same row, whatever was computed before.
+    what           Description of a row.
+    columns        Figures of a row.
+    options        Model of the options.
+    reads          Keys that rows read.
+    takes_options  Whether options are allowed.
+    memory         Function (setup, options) that returns the memory needed by a row, bytes. None
+                   means little memory.
     """
 
     name: str

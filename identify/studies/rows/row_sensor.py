@@ -52,16 +52,10 @@ class SensorOptions(Section):
 class RowSensor:
     """Sensor of a row, and true values for the comparison.
 
-    Attributes
-    ----------
-    sensor : cmmsim.Sensor
-        The sensor.
-    truth : cmmsim.Taught
-        Teaching without error.
-    middle : ndarray, shape (3,)
-        Middle of the baseline in the base frame, m.
-    rim : float
-        Mean radiance of a sticker and its ring.
+    sensor       The sensor.
+    truth        Teaching without error.
+    middle (3,)  Middle of the baseline in the base frame, m.
+    rim          Mean radiance of a sticker and its ring.
     """
 
     sensor: cmmsim.Sensor

@@ -128,16 +128,10 @@ READS = KeysRead(
 class _Capture:
     """Result of one picture of a pose.
 
-    Attributes
-    ----------
-    pose : int
-        Number of the pose.
-    error : ndarray, shape (6,)
-        Error of the measured pose.
-    covariance : ndarray, shape (6, 6)
-        Stated covariance of the measured pose.
-    points, centres : ndarray
-        Errors of the stickers, as `_sticker_errors` returns them.
+    pose               Number of the pose.
+    error (6,)         Error of the measured pose.
+    covariance (6, 6)  Stated covariance of the measured pose.
+    points, centres    Errors of the stickers, as `_sticker_errors` returns them.
     """
 
     pose: int

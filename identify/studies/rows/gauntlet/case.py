@@ -46,27 +46,19 @@ class Recorded:
 class Case:
     """Finished case.
 
-    Attributes
-    ----------
-    troubles : tuple of Trouble
-        What was wrong.
-    diagnosis : Diagnosis
-        What the diagnosis of the plain model said.
-    named : tuple of int
-        For each trouble, the place of the finding that names it, from 1 on, or 0 if none does.
-    together : tuple of bool
-        For each trouble, True if that finding only names it as indistinguishable from its cause.
-    size_errors : tuple of float
-        Error of each trouble's size in standard deviations, NaN where it was not fitted.
-    before, after : tuple of bool
-        Whether each interval contains the truth, with the plain model and after the remedy.
-    explained : bool
-        True if noise explains the residuals of the remedied model.
-    alone : tuple of float
-        For each of two troubles, the misfit of the plain model with this trouble only, divided by
-        the misfit due to noise. NaN if the model cannot be identified.
-    seconds : tuple of float
-        Time of the first identification and of the diagnosis, s.
+    troubles       What was wrong.
+    diagnosis      What the diagnosis of the plain model said.
+    named          For each trouble, the place of the finding that names it, from 1 on, or 0 if none
+                   does.
+    together       For each trouble, True if that finding only names it as indistinguishable from
+                   its cause.
+    size_errors    Error of each trouble's size in standard deviations, NaN where it was not fitted.
+    before, after  Whether each interval contains the truth, with the plain model and after the
+                   remedy.
+    explained      True if noise explains the residuals of the remedied model.
+    alone          For each of two troubles, the misfit of the plain model with this trouble only,
+                   divided by the misfit due to noise. NaN if the model cannot be identified.
+    seconds        Time of the first identification and of the diagnosis, s.
     """
 
     troubles: tuple[Trouble, ...]

@@ -33,14 +33,9 @@ def unchanged_record(record: xr.Dataset) -> xr.Dataset:
 class Remedied:
     """Remedy of a laboratory for a finding.
 
-    Attributes
-    ----------
-    settings : mapping
-        Settings of the estimator by dotted path.
-    record : callable
-        Correction of the record.
-    mended : bool
-        True if the trouble is removed, and the experiment repeated without it.
+    settings  Settings of the estimator by dotted path.
+    record    Correction of the record.
+    mended    True if the trouble is removed, and the experiment repeated without it.
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -80,27 +75,19 @@ def _value(text: str) -> Any:
 class Trouble:
     """Something wrong in a laboratory.
 
-    Attributes
-    ----------
-    kind : str
-        Name of the kind of trouble, see `identify.studies.rows.gauntlet.drawn_troubles.TROUBLES`.
-    size : float
-        Size in the unit of the cause.
-    unit : str
-        Unit of the size.
-    groups : tuple of str
-        Groups of causes of the diagnosis. Each of them is a right answer. If there are none, the
-        trouble is outside the catalogue of the diagnosis, and "none of these" is right.
-    cause : str
-        Name of the cause of the diagnosis that has this size. Empty if it has no comparable size.
-    settings : mapping
-        Settings of the scenario of the plant by dotted path. The estimator does not see them.
-    plant : callable
-        Change of the plant.
-    record : callable
-        Change of the record.
-    remedy : callable
-        Function (finding) that returns what a laboratory does about the trouble, once it is found.
+    kind      Name of the kind of trouble, see
+              `identify.studies.rows.gauntlet.drawn_troubles.TROUBLES`.
+    size      Size in the unit of the cause.
+    unit      Unit of the size.
+    groups    Groups of causes of the diagnosis. Each of them is a right answer. If there are none,
+              the trouble is outside the catalogue of the diagnosis, and "none of these" is right.
+    cause     Name of the cause of the diagnosis that has this size. Empty if it has no comparable
+              size.
+    settings  Settings of the scenario of the plant by dotted path. The estimator does not see them.
+    plant     Change of the plant.
+    record    Change of the record.
+    remedy    Function (finding) that returns what a laboratory does about the trouble, once it is
+              found.
     """
 
     kind: str
@@ -118,20 +105,12 @@ class Trouble:
 class Laboratory:
     """Laboratory for which troubles are drawn.
 
-    Attributes
-    ----------
-    robot : Robot
-        Robot as it is known.
-    parameters : ndarray, shape (p,)
-        True parameters without trouble.
-    scenario : Scenario
-        Scenario without trouble.
-    trajectory : int
-        Seed of the exciting trajectory.
-    peak : float
-        Largest torque or force of a run without trouble, N m or N.
-    holding : float
-        Largest torque or force that holds the robot at rest at a pose of this run.
+    robot            Robot as it is known.
+    parameters (p,)  True parameters without trouble.
+    scenario         Scenario without trouble.
+    trajectory       Seed of the exciting trajectory.
+    peak             Largest torque or force of a run without trouble, N m or N.
+    holding          Largest torque or force that holds the robot at rest at a pose of this run.
     """
 
     robot: Robot
