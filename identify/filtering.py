@@ -88,10 +88,7 @@ def filtered_derivatives(
     A quintic spline interpolates the filtered samples and is then differentiated. The derivatives
     are less accurate towards both ends, so a fit should omit the first and last few samples.
 
-    Raises
-    ------
-    FilterError
-        See `zero_phase_filter`.
+    Raises FilterError, see `zero_phase_filter`.
     """
     smooth = zero_phase_filter(samples, rate_hz, cutoff_hz, order)
     return smooth, *spline_derivatives(smooth, rate_hz)
@@ -100,10 +97,8 @@ def filtered_derivatives(
 def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
     """Return the first and second time derivative of samples (N, ...) by a quintic spline.
 
-    Raises
-    ------
-    FilterError
-        There are fewer samples than a quintic spline needs, or a sample is not finite.
+    Raises FilterError if there are fewer samples than a quintic spline needs, or a sample is not
+    finite.
     """
     values = _finite(samples)
     if len(values) <= SPLINE_DEGREE:

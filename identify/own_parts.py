@@ -55,16 +55,9 @@ def check_choice(
 ) -> None:
     """Refuse a name that is neither built in nor ``module:function``.
 
-    Parameters
-    ----------
-    given : str
-        The name.
-    what : str
-        Noun for the error message, such as "law".
-    built_in : mapping
-        Built-in parts by name.
-    error : type, optional
-        Exception to be raised. Its message has the valid names.
+    what      Noun for the error message, such as "law".
+    built_in  Built-in parts by name.
+    error     Exception to be raised. Its message has the valid names.
     """
     if given not in built_in and not is_plugin_name(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
@@ -85,20 +78,12 @@ def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., 
 def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[..., Any]:
     """Return the function that ``module:function`` names.
 
-    Parameters
-    ----------
-    name : str
-        ``module:function``.
-    what : str
-        Noun for the error message, such as "kind" or "estimator".
-    error : type
-        Exception to be raised.
+    name   ``module:function``.
+    what   Noun for the error message, such as "kind" or "estimator".
+    error  Exception to be raised.
 
-    Raises
-    ------
-    error
-        The module is not allowed to run (the message states how to allow it), the module or the
-        function does not exist, or the named object is not a function.
+    Raises `error` if the module is not allowed to run (the message states how to allow it), the
+    module or the function does not exist, or the named object is not a function.
     """
     try:
         function = import_plugin(what, name)

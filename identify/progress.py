@@ -148,19 +148,12 @@ def print_table(
 ) -> None:
     """Print rows of text under a header to standard output.
 
-    Parameters
-    ----------
-    header : sequence of str
-        Names of the columns.
-    rows : iterable of sequences of str
-        Cells. Square brackets, for example of a unit, are printed and not read as markup.
-    words : collection of str
-        Names of the columns that hold words and are aligned left. Other columns are aligned right.
-    title, note : str, optional
-        Lines above and below the table.
+    header       Names of the columns.
+    rows         Cells. Square brackets, for example of a unit, are printed and not read as markup.
+    words        Names of the columns that hold words and are aligned left. Other columns are
+                 aligned right.
+    title, note  Lines above and below the table.
 
-    Notes
-    -----
     On a narrow terminal, words are folded, those of the first column last. Numbers and single words
     are never cut: a table that needs more columns than the terminal has is printed wider.
     """

@@ -209,16 +209,10 @@ def mapped(
     Ctrl-C is blocked in the processes. They end at once when an exception such as Ctrl-C leaves the
     block, or when this process has ended.
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of processes. None means one process per core.
-    function : callable
-        Function that is called with one item of each of the `tasks`.
-    *tasks : iterables
-        Items for each argument of the function.
-    start : callable, optional
-        Function that each process calls first.
+    count     Number of processes. None means one process per core.
+    function  Function that is called with one item of each of the `tasks`.
+    *tasks    Items for each argument of the function.
+    start     Function that each process calls first.
     """
     resource_tracker.ensure_running()  # a later start would unblock Ctrl-C
     others = set(active_children())

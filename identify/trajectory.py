@@ -191,29 +191,15 @@ def check_travel(
 ) -> float:
     """Check that a robot can follow a trajectory within its limits.
 
-    Parameters
-    ----------
-    robot : dynamics.Robot
-        Robot that shall follow the trajectory.
-    trajectory : FourierTrajectory
-        Trajectory of the platform.
-    t : array_like, shape (N,)
-        Times at which it is checked [s].
-    margin : float, optional
-        Margin to the travel limit of the joints, rad or m.
-    least_leverage, most_condition : float, optional
-        Limits that keep the robot away from singularities.
+    robot                           Robot that shall follow the trajectory.
+    trajectory                      Trajectory of the platform.
+    t (N,)                          Times at which it is checked [s].
+    margin                          Margin to the travel limit of the joints, rad or m.
+    least_leverage, most_condition  Limits that keep the robot away from singularities.
 
-    Returns
-    -------
-    float
-        Largest joint coordinate of the trajectory, rad or m.
-
-    Raises
-    ------
-    TrajectoryError
-        A pose is out of reach, beyond the travel limit less the margin, or near a singularity. The
-        message names time, leg, value and limit.
+    Returns the largest joint coordinate of the trajectory, rad or m. Raises TrajectoryError if a
+    pose is out of reach, beyond the travel limit less the margin, or near a singularity. The
+    message names time, leg, value and limit.
 
     See Also
     --------
@@ -302,10 +288,7 @@ def trajectories_json(trajectories: TrajectorySet) -> str:
 def load_trajectories(path: Path | str) -> TrajectorySet:
     """Read the file that `save_trajectories` wrote.
 
-    Raises
-    ------
-    TrajectoryError
-        The file cannot be read, is of another format, or is incomplete.
+    Raises TrajectoryError if the file cannot be read, is of another format, or is incomplete.
     """
     try:
         data = json_without_digest(path, dict(json.loads(Path(path).read_text(encoding="utf-8"))))

@@ -114,17 +114,10 @@ class Format:
 class Photographs:
     """Pairs of photographs, which can be read several times unless they are an iterator.
 
-    Parameters
-    ----------
-    left, right : str, Path, or iterable of ndarray
-        Folders of images, videos, or arrays (height, width) of both cameras.
-    format : Format
-        Required format of the images.
+    left, right  Folders of images, videos, or arrays (height, width) of both cameras.
+    format       Required format of the images.
 
-    Raises
-    ------
-    PhotographError
-        If folders or videos cannot be read or paired.
+    Raises PhotographError if folders or videos cannot be read or paired.
     """
 
     def __init__(self, left: Source, right: Source, format: Format) -> None:

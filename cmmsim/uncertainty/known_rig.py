@@ -31,20 +31,12 @@ points. The other entries are assumed to be consistent with these."""
 class KnownRig:
     """Known parameters of a rig, with the covariance of their errors.
 
-    Parameters
-    ----------
-    rig : StereoRig
-        Rig with the known parameters.
-    covariance : ndarray, shape (24, 24)
-        Covariance of true minus known parameters, in the order of PARAMETER_NAMES. Rows of exact
-        parameters are zero.
-    exposure_std : float
-        Standard deviation of the delay of the right camera's exposure, s.
+    rig                  Rig with the known parameters.
+    covariance (24, 24)  Covariance of true minus known parameters, in the order of PARAMETER_NAMES.
+                         Rows of exact parameters are zero.
+    exposure_std         Standard deviation of the delay of the right camera's exposure, s.
 
-    Raises
-    ------
-    CmmError
-        If the matrix is not a covariance.
+    Raises CmmError if the matrix is not a covariance.
     """
 
     rig: StereoRig

@@ -157,10 +157,7 @@ class SavedSession:
 def saved_path(folder: Path, name: str) -> Path:
     """Return the path of the file for a name in a folder.
 
-    Raises
-    ------
-    AccuracyError
-        The name is not a valid file name on every system.
+    Raises AccuracyError if the name is not a valid file name on every system.
     """
     if name.endswith(".json"):
         raise AccuracyError(
@@ -178,10 +175,7 @@ def saved_path(folder: Path, name: str) -> Path:
 def find_saved(folder: Path, name: str) -> SavedSession:
     """Read the session that was saved under a name.
 
-    Raises
-    ------
-    AccuracyError
-        There is no such session. The message lists the saved names.
+    Raises AccuracyError if there is no such session. The message lists the saved names.
     """
     path = saved_path(folder, name)
     if not path.is_file():
@@ -195,10 +189,7 @@ def find_saved(folder: Path, name: str) -> SavedSession:
 def read_saved(path: Path) -> SavedSession:
     """Read the session in a file.
 
-    Raises
-    ------
-    AccuracyError
-        The file cannot be read, holds no session, or is of another version.
+    Raises AccuracyError if the file cannot be read, holds no session, or is of another version.
     """
     from pydantic import TypeAdapter, ValidationError
 
@@ -227,10 +218,7 @@ def read_saved(path: Path) -> SavedSession:
 def check_writable(path: Path) -> None:
     """Check that a session can be saved to a path.
 
-    Raises
-    ------
-    AccuracyError
-        The path cannot be written, or the file to be replaced holds no figures.
+    Raises AccuracyError if the path cannot be written, or the file to be replaced holds no figures.
     """
     try:
         # If the folder does not exist yet, its nearest parent must be writable.
@@ -245,10 +233,8 @@ def check_writable(path: Path) -> None:
 def save(path: Path, session: SavedSession) -> None:
     """Write a session, whole or not at all.
 
-    Raises
-    ------
-    AccuracyError
-        The file cannot be written, or holds figures that this session did not measure.
+    Raises AccuracyError if the file cannot be written, or holds figures that this session did not
+    measure.
     """
     from identify.errors import WriteError
     from identify.files.atomic import write_text

@@ -141,13 +141,9 @@ def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
 def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     """Return the robot and sensor of one or two names or files, and notes for the user.
 
-    Raises
-    ------
-    ScenarioError
-        Two robots or two sensors are named, a file is neither robot nor sensor, or robot and
-        sensor do not fit each other.
-    RobotFileError, CmmError
-        A file cannot be used.
+    Raises ScenarioError if two robots or two sensors are named, a file is neither robot nor sensor,
+    or robot and sensor do not fit each other. Raises RobotFileError or CmmError if a file cannot be
+    used.
     """
     from cmmsim.files import read_sensor_file
     from dynamics import load_robot

@@ -88,25 +88,16 @@ def minimise(
 ) -> Solution:
     """Minimise a least-squares problem within bounds.
 
-    Parameters
-    ----------
-    problem : Problem
-        Problem to minimise.
-    start, lower : ndarray, shape (p,)
-        Parameters at the start, and their lower bounds.
-    scale : ndarray, shape (p,)
-        Typical size of a large change of each parameter.
-    criteria : StopCriteria
-        Criteria by which the search stops.
-    on_iteration : callable
-        Function (number of the iteration, cost) that is called after each iteration.
-    ahead : bool
-        True if the problem can be linearised at a trial step before the step is accepted. This
-        must be False for a problem with a state that follows the accepted steps.
-    upper : ndarray, shape (p,), optional
-        Upper bounds.
-    propose : Proposal, optional
-        Function that chooses a step. The default minimises the linearised cost.
+    problem            Problem to minimise.
+    start, lower (p,)  Parameters at the start, and their lower bounds.
+    scale (p,)         Typical size of a large change of each parameter.
+    criteria           Criteria by which the search stops.
+    on_iteration       Function (number of the iteration, cost) that is called after each iteration.
+    ahead              True if the problem can be linearised at a trial step before the step is
+                       accepted. This must be False for a problem with a state that follows the
+                       accepted steps.
+    upper (p,)         Upper bounds.
+    propose            Function that chooses a step. The default minimises the linearised cost.
     """
     if upper is None:
         upper = np.full(len(start), np.inf)

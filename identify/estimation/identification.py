@@ -233,14 +233,10 @@ def output_error_problem(
 
     The first record has the scale anchor.
 
-    Raises
-    ------
-    RecordError
-        A record has no scale anchor, or no measured poses.
-    EstimationError
-        A record is of another robot, timing or servo, or is not suitable for an identification.
-    ScenarioError
-        There is no parameter set for the initial guess, or the guess is not valid for the model.
+    Raises RecordError if a record has no scale anchor, or no measured poses. Raises EstimationError
+    if a record is of another robot, timing or servo, or is not suitable for an identification.
+    Raises ScenarioError if there is no parameter set for the initial guess, or the guess is not
+    valid for the model.
     """
     robot = side.robot
     # The motion depends only on the groups, so only their sensitivities are integrated.

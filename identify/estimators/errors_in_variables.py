@@ -164,24 +164,12 @@ def total_least_squares(evidence: Evidence) -> Estimate:
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
     """Solve matrix x = right by generalised total least squares in the determined directions.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, p)
-        Matrix. Its rows have the standard deviation 1.
-    right : ndarray, shape (n,)
-        Right side. The prior of x is 0 with standard deviation 1.
-    errors : ndarray, shape (draws, n, p + 1)
-        Sampled errors of (matrix | right).
+    matrix (n, p)             Matrix. Its rows have the standard deviation 1.
+    right (n,)                Right side. The prior of x is 0 with standard deviation 1.
+    errors (draws, n, p + 1)  Sampled errors of (matrix | right).
 
-    Returns
-    -------
-    tuple of ndarray, shapes (p,) and (p, p)
-        Solution x, and its covariance to first order.
-
-    Raises
-    ------
-    EstimationError
-        The entry of the right side in the singular vector is zero.
+    Returns the solution x (p,), and its covariance (p, p) to first order. Raises EstimationError if
+    the entry of the right side in the singular vector is zero.
     """
     size = matrix.shape[1]
     _, singular, directions = np.linalg.svd(matrix, full_matrices=False)

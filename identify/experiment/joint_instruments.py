@@ -67,10 +67,7 @@ class JointInstruments:
     encoder_resolution  Quantisation step of the encoder, rad. 0 means no quantisation.
     prismatic           True if the actuators slide.
 
-    Raises
-    ------
-    ScenarioError
-        If a figure is negative or not finite.
+    Raises ScenarioError if a figure is negative or not finite.
     """
 
     torque_noise: float = 0.02
@@ -129,18 +126,11 @@ def measure_joints(
 ) -> xr.Dataset:
     """Return the readings of the instruments during a run, `joint_torque` and `joint_angle` (N, n).
 
-    Parameters
-    ----------
-    record, truth : xarray.Dataset
-        Record and truth of the run.
-    timing : Timing
-        Timing of the scenario.
-    instruments : JointInstruments
-        Instruments at the joints.
-    rng : numpy.random.Generator
-        Source of the noise.
-    latencies : ndarray, shape (N,), optional
-        Latency of each frame's command, s. The default is the latency of the timing.
+    record, truth   Record and truth of the run.
+    timing          Timing of the scenario.
+    instruments     Instruments at the joints.
+    rng             Source of the noise.
+    latencies (N,)  Latency of each frame's command, s. The default is the latency of the timing.
     """
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle = truth[at_encoder].values
@@ -185,20 +175,12 @@ def frame_mean(
     interval. The sample contains either the whole jump or nothing of it. The difference is
     subtracted from the sample.
 
-    Parameters
-    ----------
-    torque : ndarray, shape (N, n)
-        Samples.
-    command : ndarray, shape (N, n)
-        Commands of the frames.
-    start : ndarray, shape (n,)
-        Command before the first frame.
-    gains : ndarray, shape (2, n)
-        Gains lp and ld of each joint.
-    timing : Timing
-        Frame rate, and whether commands are held or ramp.
-    latencies : ndarray, shape (N,)
-        Latencies of the commands, s.
+    torque (N, n)   Samples.
+    command (N, n)  Commands of the frames.
+    start (n,)      Command before the first frame.
+    gains (2, n)    Gains lp and ld of each joint.
+    timing          Frame rate, and whether commands are held or ramp.
+    latencies (N,)  Latencies of the commands, s.
     """
     issued = np.vstack([start, start, command])
     step = np.diff(issued, axis=0)

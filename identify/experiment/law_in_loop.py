@@ -97,31 +97,18 @@ def prepared(
 ) -> LawInLoop:
     """Prepare a law to follow a motion.
 
-    Parameters
-    ----------
-    plant : Plant
-        Plant that shall follow the motion.
-    law : str
-        Name of the law, or ``module:function``.
-    known : KnownModel
-        Robot as the law knows it.
-    motion : NamedMotion
-        Motion to follow.
-    seen : LoopSensor
-        Measurement in the loop.
-    latencies : ndarray, shape (frames,), optional
-        Latencies of the commands, s, that the law knows. The default is the latency of the timing.
+    plant                Plant that shall follow the motion.
+    law                  Name of the law, or ``module:function``.
+    known                Robot as the law knows it.
+    motion               Motion to follow.
+    seen                 Measurement in the loop.
+    latencies (frames,)  Latencies of the commands, s, that the law knows. The default is the
+                         latency of the timing.
 
-    Raises
-    ------
-    ScenarioError
-        If the law is unknown, if it needs torque commands but the drives do not accept them, or if
-        the actuators cannot hold the platform.
-    TrajectoryError
-        If the motion leaves the robot's reach or a joint's travel. The message names the time and
-        the leg.
-    SimulationError
-        If the gains are unstable with this model, or a user's own law fails.
+    Raises ScenarioError if the law is unknown, if it needs torque commands but the drives do not
+    accept them, or if the actuators cannot hold the platform. Raises TrajectoryError if the motion
+    leaves the robot's reach or a joint's travel. The message names the time and the leg. Raises
+    SimulationError if the gains are unstable with this model, or a user's own law fails.
     """
     loop = plant.loop
     timing = plant.runs.timing

@@ -101,35 +101,18 @@ def run_plant(
 ) -> Experiment:
     """Run the plant along a trajectory.
 
-    Parameters
-    ----------
-    plant : Plant
-        True robot in its loop.
-    sensor : PoseSensor
-        Sensor in the loop.
-    trajectory : FourierTrajectory
-        Desired motion.
-    duration_s : float
-        Length of the run.
-    seed : int
-        Seed of the experiment.
-    run : int
-        Number of the run; 0 is the excitation.
-    advance : callable
-        Function that is called once per frame.
-    load : PlatformLoad, optional
-        Load on the platform.
-    law : str
-        Name of the control law. It knows the scenario's initial guess and the stated load.
+    plant       True robot in its loop.
+    sensor      Sensor in the loop.
+    trajectory  Desired motion.
+    duration_s  Length of the run.
+    seed        Seed of the experiment.
+    run         Number of the run; 0 is the excitation.
+    advance     Function that is called once per frame.
+    load        Load on the platform.
+    law         Name of the control law. It knows the scenario's initial guess and the stated load.
 
-    Raises
-    ------
-    TrajectoryError
-        If the trajectory leaves the travel. This is checked before the run.
-    ScenarioError
-        If the law is not possible.
-    LoopFailure
-        If the loop is unstable.
+    Raises TrajectoryError if the trajectory leaves the travel. This is checked before the run.
+    Raises ScenarioError if the law is not possible. Raises LoopFailure if the loop is unstable.
     """
     runs = plant.runs
     times = runs.timing.frame_times(duration_s)

@@ -70,21 +70,13 @@ class SensorPlan:
 
         A process should make only one sensor, because the sensor owns the renderer.
 
-        Parameters
-        ----------
-        robot : Robot
-            Robot whose legs are in view.
-        seed : int
-            Seed of the sensor.
-        taught : cmmsim.Taught, optional
-            Frames taught before.
-        known : KnownRig, optional
-            Rig as the estimator knows it. The default is exact knowledge, or the rig of `taught`.
+        robot   Robot whose legs are in view.
+        seed    Seed of the sensor.
+        taught  Frames taught before.
+        known   Rig as the estimator knows it. The default is exact knowledge, or the rig of
+                `taught`.
 
-        Raises
-        ------
-        ScenarioError
-            If the platform in the sensor file is not the robot's platform.
+        Raises ScenarioError if the platform in the sensor file is not the robot's platform.
         """
         check_platform(robot, self.file, self.name)
         sensor = cmmsim.Sensor(

@@ -71,27 +71,16 @@ def build_truth(
 ) -> xr.Dataset:
     """Build the truth of one run.
 
-    Parameters
-    ----------
-    time : array_like, shape (N,)
-        Times of the frames, s.
-    pose : array_like, shape (N, 6)
-        True poses, m and rad.
-    joint_angle, joint_velocity, joint_torque : array_like, shape (N, n)
-        True joint coordinates, velocities, and torques or forces.
-    parameter_names : list of str
-        Names of the parameters.
-    parameters : array_like, shape (p,)
-        True parameters, SI.
-    mismatch : mapping, optional
-        Values of some of the variables of `MISMATCH`.
-    prismatic : bool
-        True if the joints slide.
+    time (N,)                       Times of the frames, s.
+    pose (N, 6)                     True poses, m and rad.
+    joint_angle, joint_velocity, joint_torque (N, n)
+                                    True joint coordinates, velocities, and torques or forces.
+    parameter_names                 Names of the parameters.
+    parameters (p,)                 True parameters, SI.
+    mismatch                        Values of some of the variables of `MISMATCH`.
+    prismatic                       True if the joints slide.
 
-    Raises
-    ------
-    RecordError
-        If a shape is wrong or a number is not finite.
+    Raises RecordError if a shape is wrong or a number is not finite.
     """
     truth = described_dataset(
         {

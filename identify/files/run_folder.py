@@ -82,12 +82,8 @@ class RunFolder:
 
         The digests of netCDF files are compared before a library opens any of these files.
 
-        Raises
-        ------
-        OutputFolderError
-            A file is missing. The message names the first one and the stage that writes it.
-        RecordError
-            A netCDF file cannot be read, or its digest is wrong.
+        Raises OutputFolderError if a file is missing. The message names the first one and the stage
+        that writes it. Raises RecordError if a netCDF file cannot be read, or its digest is wrong.
         """
         if not self.path.is_dir():
             raise OutputFolderError(

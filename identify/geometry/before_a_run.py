@@ -25,15 +25,9 @@ def run_geometry(
 ) -> GeometryOutcome:
     """Calibrate the geometry of a robot, simulated or from a user's own measurements.
 
-    Raises
-    ------
-    EstimationError
-        If the loops do not close, or if there are too few poses. The message states how many poses
-        are needed and for which numbers.
-    RecordError
-        If the encoder readings do not fit the poses.
-    UnreachablePoseError
-        If a measured pose is out of reach.
+    Raises EstimationError if the loops do not close, or if there are too few poses. The message
+    states how many poses are needed and for which numbers. Raises RecordError if the encoder
+    readings do not fit the poses. Raises UnreachablePoseError if a measured pose is out of reach.
     """
     robot = setup.nominal
     seed = setup.seed

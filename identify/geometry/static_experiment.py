@@ -234,34 +234,18 @@ def measure_static_poses(
 ) -> tuple[StaticPoses, int]:
     """Measure the true robot at rest after it has moved to joint coordinates (N, n).
 
-    Parameters
-    ----------
-    robot : Robot
-        Nominal robot.
-    settings : Geometry
-        Settings of the calibration.
-    sensor : cmmsim.Sensor
-        Taught sensor.
-    sight : SightLines
-        Stickers and cameras of the sensor, for the visibility.
-    deviations : ndarray, shape (g,)
-        True minus nominal geometric numbers.
-    joints, start : ndarray, shapes (N, n) and (N, 6)
-        Joint coordinates, and the corresponding poses of the nominal robot.
-    seed : int
-        Seed of the experiment.
-    progress : Progress
-        Display of the progress.
+    robot                           Nominal robot.
+    settings                        Settings of the calibration.
+    sensor                          Taught sensor.
+    sight                           Stickers and cameras of the sensor, for the visibility.
+    deviations (g,)                 True minus nominal geometric numbers.
+    joints, start (N, n) and (N, 6)
+                                    Joint coordinates, and the corresponding poses of the nominal
+                                    robot.
+    seed                            Seed of the experiment.
 
-    Returns
-    -------
-    tuple of StaticPoses and int
-        Readings at the measured poses, and the number of lost frames.
-
-    Raises
-    ------
-    EstimationError
-        If the true robot cannot reach a pose. The message names it.
+    Returns the readings at the measured poses, and the number of lost frames. Raises
+    EstimationError if the true robot cannot reach a pose. The message names it.
     """
     taught = sensor.taught
     encoders = encoders_of(robot, settings)

@@ -54,25 +54,15 @@ def with_recorded_errors(
 ) -> Run:
     """Return a model with the common errors that are estimated with the parameters.
 
-    Parameters
-    ----------
-    run : LoopModel
-        Model without common errors. Its whitener is needed for them.
-    record : xarray.Dataset
-        Record of the run, with the errors of its poses and of the geometry.
-    side : ModelSide
-        Kinds of errors, and the standard deviations of the errors of the loop and of bodies.
-    motion : ndarray, shape (N, 6)
-        Poses of the run, which show the errors of the geometry.
-    own : mapping of str to float
-        Standard deviations of further errors in the loop, by name.
+    run            Model without common errors. Its whitener is needed for them.
+    record         Record of the run, with the errors of its poses and of the geometry.
+    side           Kinds of errors, and the standard deviations of the errors of the loop and of
+                   bodies.
+    motion (N, 6)  Poses of the run, which show the errors of the geometry.
+    own            Standard deviations of further errors in the loop, by name.
 
-    Raises
-    ------
-    RecordError
-        The record states errors that are not valid.
-    EstimationError
-        Constants of friction are to be estimated under torques.
+    Raises RecordError if the record states errors that are not valid. Raises EstimationError if
+    constants of friction are to be estimated under torques.
     """
     kinds = side.nuisances
     geometry = None

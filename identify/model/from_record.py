@@ -41,12 +41,9 @@ from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
 def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     """Return the model of a record that is suitable for an identification.
 
-    Raises
-    ------
-    RecordError, EstimationError
-        The errors of `predicting_model`. In addition, EstimationError if the record is too short,
-        if a channel is constant, if the reference does not move, is too fast for the frame rate, or
-        does not begin at rest, or if units or frames differ from those of the robot.
+    Raises the errors of `predicting_model`. In addition, raises EstimationError if the record is
+    too short, if a channel is constant, if the reference does not move, is too fast for the frame
+    rate, or does not begin at rest, or if units or frames differ from those of the robot.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
     # Checked before the model is made, because a short record cannot be filtered.
@@ -70,15 +67,10 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
 def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     """Return the model of a record that is suitable for a prediction.
 
-    Raises
-    ------
-    RecordError
-        Something is missing, has a wrong shape or is not finite, or the payload is not valid.
-    TooFewFramesError
-        Too many frames were lost.
-    EstimationError
-        The record is of another robot, timing or servo, or the covariance of its poses is not
-        symmetric and positive definite.
+    Raises RecordError if something is missing, has a wrong shape or is not finite, or the payload
+    is not valid. Raises TooFewFramesError if too many frames were lost. Raises EstimationError if
+    the record is of another robot, timing or servo, or the covariance of its poses is not symmetric
+    and positive definite.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
     return timed_model(record, side) if is_timed(record) else _model(record, side)
@@ -120,13 +112,9 @@ SAME_RATE = 0.05
 def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
     """Return the model of a timed record, which the commands drive.
 
-    Raises
-    ------
-    RecordError
-        Something is missing or not valid.
-    EstimationError
-        A channel is constant, units or frames differ from those of the robot, the covariance of
-        the poses is not positive definite, or the commands are torques.
+    Raises RecordError if something is missing or not valid. Raises EstimationError if a channel is
+    constant, units or frames differ from those of the robot, the covariance of the poses is not
+    positive definite, or the commands are torques.
     """
     if takes_torques(record):
         raise EstimationError(

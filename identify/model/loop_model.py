@@ -197,19 +197,12 @@ class LoopModel(Residuals):
     ) -> ClosedLoopRun:
         """Simulate the model with the common errors that it contains.
 
-        Parameters
-        ----------
-        parameters : ndarray, shape (p,)
-            Parameters without the known load. The load is added.
-        sensitivities : bool
-            True to compute derivatives with respect to the parameters as well.
-        robot : Robot, optional
-            Robot that moves, without sensitivities. The default is the robot that the servo knows.
+        parameters (p,)  Parameters without the known load. The load is added.
+        sensitivities    True to compute derivatives with respect to the parameters as well.
+        robot            Robot that moves, without sensitivities. The default is the robot that the
+                         servo knows.
 
-        Raises
-        ------
-        LoopFailure
-            The run is unstable.
+        Raises LoopFailure if the run is unstable.
         """
         if sensitivities:
             return self.along(parameters)

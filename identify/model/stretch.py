@@ -82,15 +82,13 @@ class Stretch:
     ) -> StartState:
         """Return the state in which a model begins the stretch.
 
-        Parameters
-        ----------
-        robot, parameters, settings
-            Robot that moves, its parameters (p,) with the load, and the settings of the loop.
-        errors : mapping of str to float
-            Errors of the start by name, in their units. Others are zero.
-        commands, since : ndarray, shapes (k, n) and (k,)
-            Commands that began to act before the start, and the times at which they began, relative
-            to the start, s.
+        robot, parameters, settings     Robot that moves, its parameters (p,) with the load, and the
+                                        settings of the loop.
+        errors                          Errors of the start by name, in their units. Others are
+                                        zero.
+        commands, since (k, n) and (k,)
+                                        Commands that began to act before the start, and the times
+                                        at which they began, relative to the start, s.
         """
         chart = robot.geometry.chart
         off = np.array([errors.get(name, 0.0) for name in self.error_names])
@@ -127,18 +125,12 @@ def begun_stretch(
 ) -> Stretch:
     """Return a stretch with the start that its poses and commands suggest.
 
-    Parameters
-    ----------
-    robot, number, rows
-        As for `Stretch`.
-    times, measured : ndarray, shapes (k,) and (k, 6)
-        Times and poses of the stretch, without lost ones.
-    covariance : ndarray, shape (6, 6)
-        Covariance of a pose.
-    commands : ndarray, shape (k, n)
-        Commands that act at these times.
-    law : JointLaw
-        Law of the drives with the gains of the initial guess.
+    robot, number, rows             As for `Stretch`.
+    times, measured (k,) and (k, 6)
+                                    Times and poses of the stretch, without lost ones.
+    covariance (6, 6)               Covariance of a pose.
+    commands (k, n)                 Commands that act at these times.
+    law                             Law of the drives with the gains of the initial guess.
     """
     chart = robot.geometry.chart
     since = times - times[0]

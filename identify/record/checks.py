@@ -49,12 +49,8 @@ class TooFewFramesError(EstimationError):
 def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoGains) -> None:
     """Check that a record is complete, of this robot, and made with the model's timing and servo.
 
-    Raises
-    ------
-    RecordError
-        The record is not complete, or does not state its scenario.
-    EstimationError
-        Robot, joints, timing or servo differ, or frames are missing.
+    Raises RecordError if the record is not complete, or does not state its scenario. Raises
+    EstimationError if robot, joints, timing or servo differ, or frames are missing.
     """
     check_record(record, "the record")
     check_robot(record, robot)

@@ -44,22 +44,13 @@ class MotionLag:
 def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Array) -> MotionLag:
     """Return the lag at which joint coordinates follow commands best.
 
-    Parameters
-    ----------
-    time : ndarray, shape (N,)
-        Times of the coordinates, s.
-    coordinates : ndarray, shape (N, n)
-        Joint coordinates at measured poses.
-    command_time : ndarray, shape (M,)
-        Times of the commands, s.
-    command : ndarray, shape (M, n)
-        Joint commands.
+    time (N,)           Times of the coordinates, s.
+    coordinates (N, n)  Joint coordinates at measured poses.
+    command_time (M,)   Times of the commands, s.
+    command (M, n)      Joint commands.
 
-    Returns
-    -------
-    MotionLag
-        The lag, of at most half the duration. The correlation is zero if there is no motion, or
-        times do not overlap.
+    The lag is at most half the duration. The correlation is zero if there is no motion, or times do
+    not overlap.
 
     Examples
     --------

@@ -50,16 +50,10 @@ def likelier_times(times: Array, poses: Array, covariance: Array, rate_hz: float
 
     These are the stated times (N,), or the nearest frames.
 
-    Parameters
-    ----------
-    times : ndarray, shape (N,)
-        Stated times of measured poses, s.
-    poses : ndarray, shape (N, 6)
-        Measured poses, without lost ones.
-    covariance : ndarray, shape (6, 6)
-        Covariance of a pose.
-    rate_hz : float
-        Frame rate.
+    times (N,)         Stated times of measured poses, s.
+    poses (N, 6)       Measured poses, without lost ones.
+    covariance (6, 6)  Covariance of a pose.
+    rate_hz            Frame rate.
 
     Examples
     --------

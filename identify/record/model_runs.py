@@ -69,19 +69,14 @@ def build_model_run(
 ) -> xr.Dataset:
     """Build the dataset of the poses of the initial and the identified model in a run.
 
-    Parameters
-    ----------
-    time : array_like, shape (N,)
-        Times of the frames, s.
-    initial_pose, identified_pose : array_like, shape (N, 6)
-        Poses of the models, m and rad. Poses of a diverged model that are not finite become NaN.
-    std : array_like, shape (N, 6), optional
-        Predicted standard deviations of the plant's poses from the identified model.
+    time (N,)                       Times of the frames, s.
+    initial_pose, identified_pose (N, 6)
+                                    Poses of the models, m and rad. Poses of a diverged model that
+                                    are not finite become NaN.
+    std (N, 6)                      Predicted standard deviations of the plant's poses from the
+                                    identified model.
 
-    Raises
-    ------
-    RecordError
-        A shape is wrong.
+    Raises RecordError if a shape is wrong.
     """
     values = pose_parts(initial_pose, "initial_pose", "initial_position", "initial_orientation")
     values |= pose_parts(

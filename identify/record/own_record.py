@@ -89,15 +89,9 @@ def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
 
     Further records are of the same robot: other motions, days, settings or loads.
 
-    Raises
-    ------
-    RecordError
-        A file cannot be read, or violates a rule of records (`csv_record.RULES`). The message
-        names the line.
-    ScenarioError
-        Robot, timing or servo are not valid.
-    dynamics.RobotFileError
-        There is no such robot.
+    Raises RecordError if a file cannot be read, or violates a rule of records (`csv_record.RULES`).
+    The message names the line. Raises ScenarioError if robot, timing or servo are not valid. Raises
+    dynamics.RobotFileError if there is no such robot.
     """
     pairs = [_of_log(path) if is_log(path) else _of_netcdf(path) for path in paths]
     return [record for record, _ in pairs], pairs[0][1]

@@ -117,12 +117,8 @@ def store_robot(record: xr.Dataset, robot: Robot) -> None:
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
     """Check that a record is of a robot with this name and, if stated, with this geometry.
 
-    Raises
-    ------
-    EstimationError
-        The name or a number of the geometry differs. The message names the first such number.
-    RecordError
-        The geometry cannot be read.
+    Raises EstimationError if the name or a number of the geometry differs. The message names the
+    first such number. Raises RecordError if the geometry cannot be read.
     """
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(
@@ -230,13 +226,9 @@ class RunFiles:
         Files without a digest in the result are not checked. If the first record is checked, all
         records are. The default result is the result in the folder, if there is one.
 
-        Raises
-        ------
-        OutputFolderError
-            A file is missing.
-        RecordError
-            A file has changed (the message names the stage to repeat), a file is damaged, or the
-            digests of the result are not valid.
+        Raises OutputFolderError if a file is missing. Raises RecordError if a file has changed (the
+        message names the stage to repeat), a file is damaged, or the digests of the result are not
+        valid.
         """
         run = self.folder
         if result is None:

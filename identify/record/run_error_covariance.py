@@ -45,17 +45,11 @@ def factor(covariance: Array) -> Array:
 def noticed_directions(root: Array, seen: Array) -> tuple[Array, int]:
     """Turn a factor of a covariance so that its columns are independent directions.
 
-    Parameters
-    ----------
-    root : ndarray, shape (k, k)
-        Factor of the covariance.
-    seen : ndarray, shape (..., k)
-        Effect of each column on the measurements, in standard deviations of their noise.
+    root (k, k)    Factor of the covariance.
+    seen (..., k)  Effect of each column on the measurements, in standard deviations of their noise.
 
-    Returns
-    -------
-    tuple of ndarray, shape (k, k), and int
-        Turned factor, with the most noticed direction first, and the number of noticed directions.
+    Returns the turned factor (k, k), with the most noticed direction first, and the number of
+    noticed directions.
     """
     sizes, turns = np.linalg.svd(np.linalg.qr(seen.reshape(-1, len(root)), mode="r"))[1:]
     return np.asarray(root @ turns.T), int(np.sum(sizes > NOTICED))

@@ -119,12 +119,8 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
     Of several polynomials through most neighbours, the one nearest to most of them is used (least
     trimmed squares).
 
-    Parameters
-    ----------
-    times, poses : ndarray, shapes (N,) and (N, 6)
-        Times, s, and measured poses, without lost ones.
-    covariance : ndarray, shape (6, 6)
-        Covariance of a pose.
+    times, poses (N,) and (N, 6)  Times, s, and measured poses, without lost ones.
+    covariance (6, 6)             Covariance of a pose.
 
     Examples
     --------

@@ -53,14 +53,8 @@ def write_report(
     The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. Either all or none of
     them are written. ``further`` returns additional files to write.
 
-    Raises
-    ------
-    OutputFolderError
-        An earlier stage has not been run.
-    RecordError
-        A file of the run is damaged.
-    WriteError
-        A file cannot be written.
+    Raises OutputFolderError if an earlier stage has not been run. Raises RecordError if a file of
+    the run is damaged. Raises WriteError if a file cannot be written.
     """
     run = RunFolder(Path(folder))
     data = read_run(run)

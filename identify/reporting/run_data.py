@@ -174,12 +174,8 @@ def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
 def read_run(run: RunFolder) -> RunData:
     """Read the files of a run. A record of a real robot, without truth, needs no validation.
 
-    Raises
-    ------
-    OutputFolderError
-        An earlier stage has not been run.
-    RecordError
-        A file is damaged, or the files are not of one run.
+    Raises OutputFolderError if an earlier stage has not been run. Raises RecordError if a file is
+    damaged, or the files are not of one run.
     """
     # A missing file is reported before anything is read, with the stage that writes it.
     run.require("result.json", "covariance.nc", "experiment.nc")

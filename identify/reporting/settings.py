@@ -30,13 +30,9 @@ def changed_settings(
 ) -> tuple[str, list[Setting]]:
     """Return the built-in scenario with which a recorded one is compared, and the differences.
 
-    Parameters
-    ----------
-    recorded
-        The scenario of the record, as TOML.
-    estimator
-        Settings of the identification by dotted key. A user can change them after the record was
-        made.
+    recorded   The scenario of the record, as TOML.
+    estimator  Settings of the identification by dotted key. A user can change them after the record
+               was made.
     """
     ours = _settings(recorded)
     name = ours["name"].value if "name" in ours else ""

@@ -131,22 +131,13 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
 
     Values from the sensor do not count as set. With another sensor, they come from that sensor.
 
-    Parameters
-    ----------
-    stated
-        Timing that the scenario states. The other values come from the sensor.
-    sensor
-        Name of a built-in sensor, or path of a sensor's file.
-    changes
-        A scenario's ``[sensor_changes]`` by dotted key.
+    stated   Timing that the scenario states. The other values come from the sensor.
+    sensor   Name of a built-in sensor, or path of a sensor's file.
+    changes  A scenario's ``[sensor_changes]`` by dotted key.
 
-    Raises
-    ------
-    ValueError
-        A change has no effect, because the scenario itself states another value, or the timing is
-        not valid.
-    cmmsim.CmmError
-        There is no such sensor, or its file is not valid.
+    Raises ValueError if a change has no effect, because the scenario itself states another value,
+    or the timing is not valid. Raises cmmsim.CmmError if there is no such sensor, or its file is
+    not valid.
     """
     from cmmsim.files import read_sensor_file
 

@@ -62,14 +62,9 @@ class ImagingSensor:
 
     The sensor is not taught, so a sticker is searched near its nominal place.
 
-    Parameters
-    ----------
-    seed
-        Seed of the noise.
-    renderer
-        "analytic", which needs no OpenGL, or "pyrender".
-    region
-        First pixels (2, 2) and side, in px, of the shown part; None for the whole images.
+    seed      Seed of the noise.
+    renderer  "analytic", which needs no OpenGL, or "pyrender".
+    region    First pixels (2, 2) and side, in px, of the shown part; None for the whole images.
     """
 
     def __init__(

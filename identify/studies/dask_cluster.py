@@ -66,10 +66,8 @@ class DaskExecutor:
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches in the order in which they finish.
 
-        Raises
-        ------
-        StudyError
-            The scheduler or all workers are gone, or workers cannot run this program.
+        Raises StudyError if the scheduler or all workers are gone, or workers cannot run this
+        program.
         """
         try:
             while self._send_more(shared, batches):
@@ -187,18 +185,11 @@ ENCRYPTED = ("tls", "wss")
 def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecutor]:
     """Provide the workers of a cluster that is running.
 
-    Parameters
-    ----------
-    address : str
-        Address of the scheduler.
-    insecure : bool, optional
-        Also accept a scheduler to which everyone on the network can connect.
+    address   Address of the scheduler.
+    insecure  Also accept a scheduler to which everyone on the network can connect.
 
-    Raises
-    ------
-    StudyError
-        No scheduler answers at the address, everyone can connect to it, it has no workers, or a
-        worker has another version of cmmsim.
+    Raises StudyError if no scheduler answers at the address, everyone can connect to it, it has no
+    workers, or a worker has another version of cmmsim.
     """
     _silence_dask()
     try:
@@ -267,10 +258,7 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
     A worker that answered with an error cannot run cmmsim. A worker that did not answer (OSError)
     is gone, and is not checked.
 
-    Raises
-    ------
-    StudyError
-        A worker has another cmmsim, or none.
+    Raises StudyError if a worker has another cmmsim, or none.
     """
     for worker, answer in there.items():
         if isinstance(answer, Exception) and not isinstance(answer, OSError):

@@ -95,10 +95,7 @@ class ProcessExecutor:
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches in the order in which they finish.
 
-        Raises
-        ------
-        StudyError
-            Processes cannot be started, or die before they compute anything.
+        Raises StudyError if processes cannot be started, or die before they compute anything.
         """
         suspects = Suspects()
         try:

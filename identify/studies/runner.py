@@ -93,34 +93,16 @@ def run_study(
     The figures do not depend on the workers. Finished rows are stored, and the same call continues
     the study.
 
-    Parameters
-    ----------
-    study : Study
-        The study.
-    folder : Path
-        Folder of its files.
-    progress : Progress
-        Display of the number of finished rows.
-    workers : callable
-        Function that starts the workers.
-    so_far : callable
-        Function that gets the table of finished rows from time to time while the study runs.
-    shared : Shared, optional
-        Common data of the rows, from `prepare`. By default it is prepared from the study.
+    folder    Folder of its files.
+    progress  Display of the number of finished rows.
+    workers   Function that starts the workers.
+    so_far    Function that gets the table of finished rows from time to time while the study runs.
+    shared    Common data of the rows, from `prepare`. By default it is prepared from the study.
 
-    Returns
-    -------
-    Outcome
-        The table of all rows.
-
-    Raises
-    ------
-    StudyError
-        The study is not valid (see `identify.studies.study_design.prepare`), the folder cannot be
-        used (see `identify.studies.store.open_folder`), the disk is full, or the workers are
-        lost.
-    StudyInterrupted
-        Ctrl-C stopped the study.
+    Returns the table of all rows. Raises StudyError if the study is not valid (see
+    `identify.studies.study_design.prepare`), the folder cannot be used (see
+    `identify.studies.store.open_folder`), the disk is full, or the workers are lost. Raises
+    StudyInterrupted if Ctrl-C stopped the study.
     """
     shared = shared or prepare(study)
     entry = resolved(study, shared)

@@ -166,20 +166,12 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
     If a new study is refused before its first row, its new files and folders are removed. After
     Ctrl-C they are not removed.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    entry : dict
-        The resolved study.
-    rows : int
-        Number of its rows.
+    entry  The resolved study.
+    rows   Number of its rows.
 
-    Raises
-    ------
-    StudyError
-        The folder belongs to another study, is in use, holds other files or cannot be made. One of
-        its files is damaged, or its rows were computed by another version of cmmsim.
+    Raises StudyError if the folder belongs to another study, is in use, holds other files or cannot
+    be made, if one of its files is damaged, or if its rows were computed by another version of
+    cmmsim.
     """
     _check_content(folder)
     _check_entries(folder)

@@ -39,30 +39,13 @@ def write(
 ) -> dict[str, Any]:
     """Write summary.json, summary.md and, by default, plots into a study's folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder of the study.
-    study : Study
-        The study.
-    frame : DataFrame
-        Table of the study.
-    figures : bool, optional
-        Whether plots are drawn.
-    others : sequence of (str, DataFrame), optional
-        Names and finished rows of other studies, which are plotted beside this study.
+    folder   Folder of the study.
+    frame    Table of the study.
+    figures  Whether plots are drawn.
+    others   Names and finished rows of other studies, which are plotted beside this study.
 
-    Returns
-    -------
-    dict
-        Content of summary.json.
-
-    Raises
-    ------
-    WriteError
-        A file cannot be written.
-    StudyError
-        The study chooses a figure that no row has.
+    Returns the content of summary.json. Raises WriteError if a file cannot be written. Raises
+    StudyError if the study chooses a figure that no row has.
     """
     done = frame[frame["error"] == ""]
     names = [

@@ -128,11 +128,8 @@ def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.Dat
     If two studies have the same name, the name of the folder is used, or else the path of the
     folder.
 
-    Raises
-    ------
-    StudyError
-        A folder has no table, its rows are of another kind or have other factors, or the folder is
-        named twice.
+    Raises StudyError if a folder has no table, its rows are of another kind or have other factors,
+    or the folder is named twice.
     """
     found: dict[str, pd.DataFrame] = {}
     for folder in folders:

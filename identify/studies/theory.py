@@ -67,11 +67,8 @@ def reach(confidence: float, freedom: int) -> float:
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:
     """Fit non-negative squares (n,) to exp(design (n, k) @ beta).
 
-    Raises
-    ------
-    StudyError
-        There are too few rows, the columns of the design are linearly dependent, the figure is
-        zero in every row, or the fit does not converge.
+    Raises StudyError if there are too few rows, the columns of the design are linearly dependent,
+    the figure is zero in every row, or the fit does not converge.
     """
     rows, columns = design.shape
     if rows <= columns:

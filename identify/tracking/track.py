@@ -73,19 +73,12 @@ def track(
 ) -> dict[str, Any]:
     """Return the content of track.json.
 
-    Parameters
-    ----------
-    run_folder
-        Folder of a finished run. Its estimates are the identified model. With None, the robot is
-        identified first, according to the scenario.
-    own
-        CSV file with poses to follow in place of the standard motions.
+    run_folder  Folder of a finished run. Its estimates are the identified model. With None, the
+                robot is identified first, according to the scenario.
+    own         CSV file with poses to follow in place of the standard motions.
 
-    Raises
-    ------
-    ScenarioError, TrajectoryError, RecordError
-        The scenario, a motion or the run folder does not fit. Errors of the identification are also
-        raised.
+    Raises ScenarioError, TrajectoryError or RecordError if the scenario, a motion or the run folder
+    does not fit. Errors of the identification are also raised.
     """
     scenario = setup.scenario
     seed = setup.seed

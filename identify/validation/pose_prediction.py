@@ -102,24 +102,17 @@ def predict_poses(
     The prediction uses the reference, the sensor's covariance and the lost frames of the run, but
     not its measured poses.
 
-    Parameters
-    ----------
-    run : LoopModel
-        Model of the run.
-    parameters : ndarray, shape (p,)
-        Estimates.
-    covariance : ndarray, shape (p, p) or (p + k, p + k)
-        Covariance of the estimates, or of the estimates and the learned errors.
-    rng : numpy.random.Generator
-        Source of the noise of the repeated experiments.
-    learned : mapping, optional
-        Estimates, by name, of k common errors of this run and of the record of the identification.
-        If the names differ from the errors of the run, the prior of the run's errors is used.
+    run                             Model of the run.
+    parameters (p,)                 Estimates.
+    covariance (p, p) or (p + k, p + k)
+                                    Covariance of the estimates, or of the estimates and the learned
+                                    errors.
+    rng                             Source of the noise of the repeated experiments.
+    learned                         Estimates, by name, of k common errors of this run and of the
+                                    record of the identification. If the names differ from the
+                                    errors of the run, the prior of the run's errors is used.
 
-    Raises
-    ------
-    LoopFailure
-        If the model, or its repetition with the sensor's noise, is unstable.
+    Raises LoopFailure if the model, or its repetition with the sensor's noise, is unstable.
     """
     basis = _basis(run, parameters, covariance, rng, learned or {})
     alone = run.ok.all() and not (run.driven or run.common.all_names or run.payload.any())

@@ -103,12 +103,8 @@ def compare_engines(
 
     The parameters are the dynamic parameters and the gains.
 
-    Raises
-    ------
-    DynamicsError
-        MuJoCo is missing or refuses the model, or the loop is unstable.
-    TrajectoryError
-        No exciting trajectory of this amplitude stays inside the robot's travel.
+    Raises DynamicsError if MuJoCo is missing or refuses the model, or the loop is unstable. Raises
+    TrajectoryError if no exciting trajectory of this amplitude stays inside the robot's travel.
     """
     # MuJoCo is optional. If it is missing, this raises an error before anything runs.
     import_mujoco()

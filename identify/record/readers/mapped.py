@@ -49,21 +49,13 @@ def open_log(path: Path) -> LoggedFile:
 def read_mapped(columns: Columns, path: Path, robot: Robot, rate_hz: float) -> Telemetry:
     """Read the log at a path, and the further files that its columns name.
 
-    Parameters
-    ----------
-    columns
-        Names, units and frames of the columns.
-    path
-        File of the record. Other files are relative to its folder.
-    robot
-        Robot whose joints the commands move.
-    rate_hz
-        Rate of times that are counted in frames.
+    columns  Names, units and frames of the columns.
+    path     File of the record. Other files are relative to its folder.
+    robot    Robot whose joints the commands move.
+    rate_hz  Rate of times that are counted in frames.
 
-    Raises
-    ------
-    RecordError
-        A file cannot be read, has no such column, or a row is wrong. The message names the row.
+    Raises RecordError if a file cannot be read, has no such column, or a row is wrong. The message
+    names the row.
     """
     return _Reader(path, rate_hz).telemetry(columns, robot)
 

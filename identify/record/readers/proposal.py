@@ -73,19 +73,11 @@ def propose(
 ) -> Proposal:
     """Propose the columns of logs.
 
-    Parameters
-    ----------
-    files
-        Logs by their names in the description.
-    robot
-        Robot whose joints are commanded.
-    body, commands
-        Body of the platform and group of commands, to choose between several.
+    files           Logs by their names in the description.
+    robot           Robot whose joints are commanded.
+    body, commands  Body of the platform and group of commands, to choose between several.
 
-    Raises
-    ------
-    RecordError
-        There are no poses or commands, or several; the message names them.
+    Raises RecordError if there are no poses or commands, or several; the message names them.
     """
     places = [
         Place(name, topic if len(file.headers) > 1 else None, header, file, topic)

@@ -181,17 +181,11 @@ def ellipse_figure(
 ) -> Figure:
     """Draw 95 % ellipses of the measured poses along the path, enlarged.
 
-    Parameters
-    ----------
-    poses
-        Measured poses (N, 6) [m, rad], NaN for a lost pose.
-    covariances
-        Covariances (N, 6, 6) of the poses according to the sensor.
-    shown
-        Indices of the components that move. Each pair of them has a panel.
-    errors
-        True minus measured poses (N, 6), if the truth is known. They are enlarged like the
-        ellipses.
+    poses        Measured poses (N, 6) [m, rad], NaN for a lost pose.
+    covariances  Covariances (N, 6, 6) of the poses according to the sensor.
+    shown        Indices of the components that move. Each pair of them has a panel.
+    errors       True minus measured poses (N, 6), if the truth is known. They are enlarged like the
+                 ellipses.
     """
     # Lost frames have neither a pose nor a covariance.
     kept = np.flatnonzero(

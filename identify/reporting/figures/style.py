@@ -125,16 +125,10 @@ def panel_grid(
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``count`` panels, three per row.
 
-    Parameters
-    ----------
-    count
-        Number of panels.
-    width, height
-        Size of a panel, in inches.
-    above
-        Space for a title above the panels, in inches.
-    **shared
-        Arguments of `matplotlib.figure.Figure.subplots`.
+    count          Number of panels.
+    width, height  Size of a panel, in inches.
+    above          Space for a title above the panels, in inches.
+    **shared       Arguments of `matplotlib.figure.Figure.subplots`.
     """
     columns = min(count, 3)
     rows = -(-count // columns)

@@ -168,22 +168,12 @@ def check_read(study: Study, reads: KeysRead, first: Scenario, options: BaseMode
     The check uses the statements of each kind about its keys. Computing rows to find keys without
     effect would take minutes per key.
 
-    Parameters
-    ----------
-    study : Study
-        The study.
-    reads : KeysRead
-        Keys that its kind reads.
-    first : Scenario
-        Scenario of the first row.
-    options : BaseModel
-        Options of the first row, with their defaults.
+    reads    Keys that its kind reads.
+    first    Scenario of the first row.
+    options  Options of the first row, with their defaults.
 
-    Raises
-    ------
-    StudyError
-        A key is never read, or has no effect. The message names the keys that the kind reads, or
-        the setting that makes the key ineffective.
+    Raises StudyError if a key is never read, or has no effect. The message names the keys that the
+    kind reads, or the setting that makes the key ineffective.
     """
     settings = {f"factors.{path}": path for path in study.factors}
     # Changes are allowed to hold some keys that rows do not read, see BESIDE.
