@@ -248,7 +248,7 @@ def variation(
     from identify.record.recording import run_groups
     from identify.reporting import variation_tables as tables
     from identify.setup import Setup
-    from identify.stages.repeat import designed_runs
+    from identify.stages.validate import designed_runs
     from identify.trajectory import load_trajectories
     from identify.validation.variation import identify_each
     from identify.validation.variation import variation as variation_of

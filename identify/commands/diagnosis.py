@@ -37,7 +37,7 @@ def diagnose(
     much it explains of what the model leaves of the record. The first one is fitted beside the
     parameters, then the next one is asked. cmmsim identify does the same where noise does not
     explain the record. A cause of one's own is a function (run, size) that returns the model of the
-    run with it, see identify.diagnosis.own_cause.
+    run with it, see identify.diagnosis.diagnose.
 
     Reads scenario.toml, experiment.nc and result.json of the folder.
 
@@ -49,7 +49,7 @@ def diagnose(
       cmmsim diagnose mine --add my_module:backlash
     """
     with interruptible_imports():
-        from identify.diagnosis.own_cause import own_cause
+        from identify.diagnosis.diagnose import own_cause
         from identify.stages.diagnose import diagnose as diagnose_run
 
     RunFolder(run).require("scenario.toml", "experiment.nc", "result.json")

@@ -10,8 +10,7 @@ from identify.arrays import Array, triangular_factor
 from identify.diagnosis.cause import Cause, with_causes
 from identify.diagnosis.linearisation import Linearisation, allowed, linearisation
 from identify.diagnosis.score import OrthogonalComplement, Score, score
-from identify.estimation.bounded_least_squares import minimise
-from identify.estimation.convergence import StopCriteria
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.output_error import OutputErrorProblem
 
 STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=5)

@@ -21,13 +21,13 @@ from dynamics.closed_loop.drives import DriveName
 from dynamics.closed_loop.start_state import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.base_parameters import structure
+from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.clock_hint import clock_hints
 from identify.estimation.common_error_estimates import (
     clock_notes,
     common_error_estimates,
     with_first_errors,
 )
-from identify.estimation.convergence import StopCriteria
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation

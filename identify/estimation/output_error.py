@@ -17,8 +17,8 @@ import numpy as np
 
 from dynamics import DynamicsError
 from identify.arrays import Array, triangular_factor
+from identify.estimation.bounded_least_squares import StopCriteria
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
-from identify.estimation.convergence import StopCriteria
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.model.loop_model import LoopModel

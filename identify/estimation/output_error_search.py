@@ -2,7 +2,7 @@
 
 The linear warm start comes first. The search for the command-driven output error follows, which has
 few local minima. The search for the closed-loop output error is last, because stick-slip gives it
-narrow local minima. Both searches end by the criteria of `convergence`. In the first search, errors
+narrow local minima. Both searches end by the criteria of eq. 35. In the first search, errors
 that all poses have in common are treated as noise, because far from the optimum they would hide the
 relevant residuals. If the model is unstable with both the warm start and the initial guess,
 multiple shooting finds a stable model.

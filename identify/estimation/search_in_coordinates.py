@@ -14,9 +14,14 @@ from functools import partial
 import numpy as np
 
 from identify.arrays import Array
-from identify.estimation.bounded_least_squares import Linearisation, Problem, Solution, minimise
+from identify.estimation.bounded_least_squares import (
+    Linearisation,
+    Problem,
+    Solution,
+    StopCriteria,
+    minimise,
+)
 from identify.estimation.bounds import ParameterBounds
-from identify.estimation.convergence import StopCriteria
 
 ALONG_CURVE = StopCriteria(cost_tolerance=1e-10, parameter_tolerance=0.0, max_iterations=200)
 """Criteria of the search for a step along a curved function."""

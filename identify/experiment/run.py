@@ -31,7 +31,7 @@ from identify.random_streams import (
 )
 from identify.record import recording
 from identify.record.conditions import SERVO, store_finding, store_law
-from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.known_geometry import store_geometry_covariance
 from identify.record.load import store_load
 from identify.record.provenance import store_robot
 from identify.record.stored_common_errors import CommonErrors, store_common_errors

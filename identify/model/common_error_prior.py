@@ -22,7 +22,7 @@ from identify.loop_parameters import of_actuators
 from identify.model.body_errors import body_error_stds
 from identify.model.model_side import ModelSide
 from identify.record.conditions import takes_torques
-from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
+from identify.record.known_geometry import GeometryErrors, read_geometry_covariance
 from identify.record.stored_common_errors import (
     FRICTION,
     FRICTION_OFFSET,

@@ -26,7 +26,7 @@ from scipy.linalg import block_diag
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.geometry_errors import GeometryErrors
+from identify.record.known_geometry import GeometryErrors
 from identify.record.run_error_covariance import covariance_fault, factor, noticed_directions
 
 CHANGES = "common_error"

@@ -24,9 +24,8 @@ from identify.progress import Progress
 from identify.record import recording
 from identify.record.conditions import DRIFT, read_finding
 from identify.record.from_telemetry import GrossErrors
-from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
-from identify.record.geometry_errors import store_geometry_covariance
-from identify.record.known_geometry import known_geometry
+from identify.record.known_geometry import COVARIANCE as GEOMETRY_COVARIANCE
+from identify.record.known_geometry import known_geometry, store_geometry_covariance
 from identify.record.model_runs import build_model_run, model_groups
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RunFiles, digest

@@ -1,7 +1,12 @@
-"""Stage that compares the identified model with the plant on the validation trajectories."""
+"""Stage that compares the identified model with the plant on the validation trajectories.
+
+Runs on several exciting trajectories can take the place of validation runs. They show the scatter
+of the estimates.
+"""
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +14,8 @@ import cmmsim
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import OutputFolderError, RecordError
+from identify.excitation.design import design_trajectories
+from identify.experiment.run import Experiment
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_files
 from identify.files.dataset import netcdf
@@ -19,7 +26,8 @@ from identify.files.run_folder import (
     result_json,
 )
 from identify.loop_parameters import settled_drive
-from identify.progress import Progress
+from identify.progress import Progress, SilentProgress
+from identify.random_streams import DESIGN, stream_seed
 from identify.record import recording
 from identify.record.model_runs import build_model_run, model_groups
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
@@ -30,7 +38,10 @@ from identify.reporting.run_result import (
     sensor_entry,
     validation_entry,
 )
+from identify.runtime import mapped
+from identify.setup import Setup
 from identify.stages.plan import check_planned, open_run
+from identify.trajectory import FourierTrajectory
 from identify.validation.pose_prediction import predicted_runs
 from identify.validation.unseen import model_on_record, run_unseen
 
@@ -121,3 +132,38 @@ def _identified_models(robot: Robot, run_folder: RunFolder, result: dict[str, An
     except RecordError as error:
         again = f"run `cmmsim identify --out {run_folder.path}` again"
         raise RecordError(f"{run_folder.result}: {error}; {again}") from None
+
+
+def designed_runs(
+    setup: Setup, count: int, workers: int | None, progress: Progress
+) -> list[Experiment]:
+    """Run the plant with images in the loop on `count` exciting trajectories.
+
+    The scenario's method designs each trajectory from separate random candidates. All runs are as
+    long as the exciting run. For the workers see `run_unseen`.
+
+    Raises the errors of the stages `excite` and `record`.
+    """
+    # Separate seeds make these runs independent of the experiment's runs.
+    stream = stream_seed(setup.seed, DESIGN)
+    seeds = [stream_seed(stream, number) for number in range(count)]
+    trajectories = []
+    with (
+        progress.stage("design the runs", count) as advance,
+        mapped(workers, partial(_designed, setup), seeds) as found,
+    ):
+        for trajectory in found:
+            trajectories.append(trajectory)
+            advance()
+    duration_s = setup.scenario.excitation.duration_s
+    # These runs take the place of validation runs, so their duration is set as that of validation.
+    scenario = setup.scenario.with_overrides({"validation.duration_s": duration_s})
+    setup = replace(setup, scenario=scenario, seed=stream)
+    plan = setup.sensor_plan
+    taught = plan.taught(setup.robot, stream, progress).taught
+    paths = tuple(trajectories)
+    return run_unseen(setup.plant, plan, taught, paths, duration_s, stream, workers, progress)
+
+
+def _designed(setup: Setup, seed: int) -> FourierTrajectory:
+    return design_trajectories(setup.design, seed, SilentProgress()).excitation

@@ -31,8 +31,7 @@ from dynamics.closed_loop import (
     differentiate_commands,
     simulate_commands,
 )
-from identify.estimation.bounded_least_squares import minimise
-from identify.estimation.convergence import StopCriteria
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.warm_start import SLIPPING_SHARE
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.scenario import load_scenario

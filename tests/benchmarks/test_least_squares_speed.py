@@ -19,9 +19,8 @@ from scipy.optimize import OptimizeResult, least_squares
 
 import identify
 from dynamics import DynamicsError
-from identify.estimation.bounded_least_squares import minimise
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import parameter_bounds
-from identify.estimation.convergence import StopCriteria
 from identify.estimation.warm_start import linear_warm_start
 from identify.excitation.comparison import compare_methods
 from identify.progress import SilentProgress

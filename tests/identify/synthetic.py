@@ -17,7 +17,7 @@ from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.files.run_folder import RunFolder
 from identify.model.model_side import model_side
-from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.known_geometry import store_geometry_covariance
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
 from identify.scenario import load_scenario

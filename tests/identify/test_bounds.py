@@ -12,9 +12,8 @@ from scipy.optimize import least_squares, minimize, nnls
 
 from dynamics.inertia import UnphysicalInertiaError, physical_inertias
 from dynamics.pseudo_inertia import pseudo_inertia
-from identify.estimation.bounded_least_squares import minimise
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
-from identify.estimation.convergence import StopCriteria
 from identify.estimation.identification import identify
 from identify.estimation.intervals import BoundedEstimate, bounded_estimate
 from identify.estimation.prior import StartingGuess

@@ -13,11 +13,10 @@ import identify
 from dynamics.geometry import RobotGeometry
 from identify.diagnosis.candidate_fits import shown_sizes
 from identify.diagnosis.cause import Cause, InList, in_each_run
-from identify.diagnosis.diagnose import diagnosis_from
+from identify.diagnosis.diagnose import diagnosis_from, own_cause
 from identify.diagnosis.diagnosis import Size, remedies_of
 from identify.diagnosis.fit import Point
 from identify.diagnosis.linearisation import Linearisation
-from identify.diagnosis.own_cause import own_cause
 from identify.diagnosis.score import OrthogonalComplement, score
 from identify.diagnosis.selection import CHANCE
 from identify.errors import EstimationError

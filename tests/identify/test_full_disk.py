@@ -318,7 +318,7 @@ def prepared(case):
             patch.setattr(import_module(module), "figure_bytes", bytes_once)
         patch.setattr("identify.verification.against_mujoco.DURATION_S", 2.1)
         patch.setattr("identify.scene.replay.KEY_FRAMES", 2)
-        patch.setattr("identify.stages.repeat.designed_runs", designed_runs)
+        patch.setattr("identify.stages.validate.designed_runs", designed_runs)
         patch.setattr("identify.reporting.report.drawn", simple_picture)
         patch.setattr(time, "perf_counter", lambda: 0.0)
         yield

@@ -30,7 +30,7 @@ from identify.geometry.static_poses import (
     read_static_poses,
 )
 from identify.progress import SilentProgress
-from identify.record.geometry_errors import covariance_fault
+from identify.record.known_geometry import covariance_fault
 from identify.setup import Setup
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.static_poses import (

@@ -19,8 +19,12 @@ from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.files.atomic import write_bytes
 from identify.files.dataset import covariance_netcdf
-from identify.record.geometry_errors import read_geometry_covariance, store_geometry_covariance
-from identify.record.known_geometry import KnownGeometry, known_geometry
+from identify.record.known_geometry import (
+    KnownGeometry,
+    known_geometry,
+    read_geometry_covariance,
+    store_geometry_covariance,
+)
 from identify.record.recording import write
 from identify.scenario import load_scenario
 from identify.validation.unseen import model_run
