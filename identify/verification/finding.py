@@ -1,6 +1,6 @@
 """Result of one check of a robot or of a record."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from textwrap import shorten
 from typing import Any
 
@@ -19,9 +19,9 @@ class Finding:
     check: str
     ok: bool
     value: float | None
-    limit: float | None
-    unit: str
-    leg: int | None
+    limit: float | None = field(default=None, kw_only=True)
+    unit: str = field(default="1", kw_only=True)
+    leg: int | None = field(default=None, kw_only=True)
     text: str
 
     @property

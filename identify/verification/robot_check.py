@@ -114,7 +114,7 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
     names = robot.coordinate_names
     joints = robot.layout.joints
     text = f"{joints} actuators for {len(names)} freedoms of the platform: {', '.join(names)}"
-    yield Finding("freedoms", joints == len(names), joints, len(names), "1", None, text)
+    yield Finding("freedoms", joints == len(names), joints, text, limit=len(names))
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
@@ -125,7 +125,7 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     yield from _extremes("at home", at_home, limits)
     most, leg = _worst(np.abs(at_home.theta), np.argmax)
     text = f"joint {leg} is {most:.3g} {unit} from zero at home, of a travel of {limit:g} {unit}"
-    yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
+    yield Finding("travel at home", most <= limit, most, text, limit=limit, unit=unit, leg=leg)
     travel = workspace.measure_travel(robot, SAMPLES)
     # Samples without a pose are left out of the measures.
     share = len(travel.theta) / SAMPLES
@@ -133,7 +133,7 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
         f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
         "pose near home"
     )
-    yield Finding("travel closes", share > 0, share, 0.0, "1", None, text)
+    yield Finding("travel closes", share > 0, share, text, limit=0.0)
     if share > 0:
         yield from _extremes("over the travel", travel, limits)
 
@@ -145,20 +145,20 @@ def _extremes(
     text = (
         f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
     )
-    yield Finding(f"reach {where}", reach > 0, reach, 0.0, "1", leg, text)
+    yield Finding(f"reach {where}", reach > 0, reach, text, limit=0.0, leg=leg)
     leverage, leg = _worst(measures.leverage, np.argmin)
     least = limits.least_leverage
     most = limits.most_condition
     text = (
         f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
     )
-    yield Finding(f"leverage {where}", leverage >= least, leverage, least, "1", leg, text)
+    yield Finding(f"leverage {where}", leverage >= least, leverage, text, limit=least, leg=leg)
     condition = float(np.max(measures.platform_condition))
     text = (
         f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at "
         "infinity the platform can move with fixed joints"
     )
-    yield Finding(f"condition {where}", condition <= most, condition, most, "1", None, text)
+    yield Finding(f"condition {where}", condition <= most, condition, text, limit=most)
 
 
 def _worst(values: Array, pick: Callable[..., np.intp]) -> tuple[float, int]:
@@ -180,7 +180,7 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
             f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
             f"{turn.magnitude():.3g} rad from it"
         )
-    yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
+    yield Finding("assembly modes", len(modes) > 0, len(modes), text)
 
 
 def _holding(robot: Robot, parameters: Array, limit: float | None) -> Iterator[Finding]:
@@ -195,7 +195,13 @@ def _holding(robot: Robot, parameters: Array, limit: float | None) -> Iterator[F
     )
     text += "" if limit is None else f", and the actuators have {limit:.3g} {unit}"
     yield Finding(
-        "holding torque", limit is None or most <= limit, most, limit, unit, leg + 1, text
+        "holding torque",
+        limit is None or most <= limit,
+        most,
+        text,
+        limit=limit,
+        unit=unit,
+        leg=leg + 1,
     )
 
 
@@ -203,7 +209,7 @@ def _visible(robot: Robot) -> Iterator[Finding]:
     found = structure(robot)
     unseen = f"no motion shows {', '.join(found.unseen)}" if found.unseen else "all are seen"
     text = f"{found.rank} base parameters of {len(robot.parameter_names)}; {unseen}"
-    yield Finding("base parameters", found.rank > 0, found.rank, None, "1", None, text)
+    yield Finding("base parameters", found.rank > 0, found.rank, text)
 
 
 def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
@@ -232,7 +238,7 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
         )
         text = f"no rigid body has these; corrected, {felt}: {'; '.join(grouped(inertias.changes))}"
     yield Finding(
-        "inertias", largest <= NEGLIGIBLE_CHANGE, largest, NEGLIGIBLE_CHANGE, "1", leg, text
+        "inertias", largest <= NEGLIGIBLE_CHANGE, largest, text, limit=NEGLIGIBLE_CHANGE, leg=leg
     )
 
 
@@ -253,7 +259,7 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
         f"its drawing reaches {reach[worst]:.3g} m"
     )
     share = float(off[worst] / reach[worst])
-    yield Finding("centres of mass", share <= 1.0, share, 1.0, "1", leg, text)
+    yield Finding("centres of mass", share <= 1.0, share, text, limit=1.0, leg=leg)
 
 
 def check_meshes(robot: Robot) -> Iterator[Finding]:
@@ -264,7 +270,7 @@ def check_meshes(robot: Robot) -> Iterator[Finding]:
     try:
         meshes = robot_meshes(robot)
     except (CmmError, RobotFileError) as error:
-        yield Finding(name, False, 0.0, None, "1", None, str(error))
+        yield Finding(name, False, 0.0, str(error))
         return
     parts = parts_of(robot.geometry).all
     legs = {part.name: part.leg for part in parts}
@@ -280,7 +286,7 @@ def check_meshes(robot: Robot) -> Iterator[Finding]:
     if ratio > MOST_MESH_RATIO:
         text += ": give the length of one unit of the mesh by scale, 0.001 for mm"
     yield Finding(
-        name, ratio <= MOST_MESH_RATIO, ratio, MOST_MESH_RATIO, "1", legs[worst] + 1, text
+        name, ratio <= MOST_MESH_RATIO, ratio, text, limit=MOST_MESH_RATIO, leg=legs[worst] + 1
     )
 
 
@@ -295,9 +301,11 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
         text = f"all legs end on the platform that sensor {sensor} sees"
     elif most > limit:
         text += f": {OWN_SENSOR}"
-    yield Finding("sensor's platform", most <= limit, most, limit, "m", leg + 1, text)
+    yield Finding(
+        "sensor's platform", most <= limit, most, text, limit=limit, unit="m", leg=leg + 1
+    )
     text = f"at home that platform is {away:.3g} m from the robot's"
     if away > limit:
         home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
         text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
-    yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)
+    yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")

@@ -89,11 +89,10 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         "pose rate",
         abs(rate / wanted - 1) <= RATE,
         rate,
-        wanted,
-        "Hz",
-        None,
         f"{len(time)} rows of poses in {np.ptp(time):.4g} s, {rate:.6g} a second without gaps; "
         f"timing.frame_rate_hz is {wanted:g}",
+        limit=wanted,
+        unit="Hz",
     )
     # Rows that are lost do not count as jitter.
     even = np.round(steps * rate)
@@ -106,16 +105,14 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         if np.allclose(time, np.round(time, digits), rtol=0, atol=1e-9):
             text += f"; times are rounded to {name}"
             break
-    yield Finding("pose jitter", True, float(off.max()), None, "s", None, text)
+    yield Finding("pose jitter", True, float(off.max()), text, unit="s")
     commands = logged.telemetry.commands.time
     yield Finding(
         "command rate",
         True,
         mean_rate(commands),
-        None,
-        "Hz",
-        None,
         f"{len(commands)} rows of commands in {np.ptp(commands):.4g} s",
+        unit="Hz",
     )
 
 
@@ -127,10 +124,8 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
         "lost poses",
         lost <= MINIMUM_GOOD_SHARE * due,
         lost / due,
-        MINIMUM_GOOD_SHARE,
-        "1",
-        None,
         f"{lost} of {due} poses are empty or missing, in {len(logged.gaps)} gaps",
+        limit=MINIMUM_GOOD_SHARE,
     )
     if not len(logged.gaps):
         return
@@ -143,13 +138,12 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
         "longest gap",
         bool(widths[longest] <= LONG_GAP_S),
         float(widths[longest]),
-        LONG_GAP_S,
-        "s",
-        None,
         f"no pose from {begin:.4f} to {end:.4f} s; commands changed in {changed} of "
         f"{len(widths)} gaps"
         + (", in which the servo had poses that the log has not" if changed else "")
         + (f"; rows of commands are missing in {missing}" if missing else ""),
+        limit=LONG_GAP_S,
+        unit="s",
     )
 
 
@@ -167,7 +161,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         text = f"standard deviations of the poses beside their neighbours: {listed} {word}"
         if not np.isfinite(value):
             text = "no poses are near enough in time to tell their noise"
-            yield Finding(name, False, None, None, unit, None, text)
+            yield Finding(name, False, None, text, unit=unit)
             continue
         stated = (
             None if logged.stated is None else float(np.sqrt(np.mean(logged.stated[kind] ** 2)))
@@ -175,7 +169,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         ok = stated is None or 1 / NOISE <= value / stated <= NOISE
         if stated is not None:
             text += f"; stated are {scale * stated:.3g} {word}, {value / stated:.2g} times that"
-        yield Finding(name, ok, value, stated, unit, None, text)
+        yield Finding(name, ok, value, text, limit=stated, unit=unit)
     jumps = logged.jumps
     listed = ", ".join(f"{one:.4f}" for one in jumps[:LISTED])
     more = f" and {len(jumps) - LISTED} more" if len(jumps) > LISTED else ""
@@ -183,11 +177,9 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         "jumps",
         len(jumps) <= MOST_GROSS * len(logged.time),
         len(jumps) / len(logged.time),
-        MOST_GROSS,
-        "1",
-        None,
         f"{len(jumps)} poses are far from the motion of their neighbours"
         + (f", at {listed} s{more}" if len(jumps) else ""),
+        limit=MOST_GROSS,
     )
 
 
@@ -198,10 +190,8 @@ def _frozen(logged: LoggedRun) -> Iterator[Finding]:
         "frozen poses",
         bool(same.mean() <= FROZEN),
         float(same.mean()),
-        FROZEN,
-        "1",
-        None,
         f"{same.sum()} poses are the pose before in all digits{first}",
+        limit=FROZEN,
     )
 
 
@@ -216,9 +206,6 @@ def _motion(logged: LoggedRun) -> Iterator[Finding]:
             "travel",
             bool(largest[joint] <= robot.travel_limit),
             float(largest[joint]),
-            robot.travel_limit,
-            unit,
-            joint + 1,
             f"joint coordinates of the poses reach {largest[joint]:.4g} {unit} of "
             f"{robot.travel_limit:.4g}; the poses move by "
             + ", ".join(
@@ -226,6 +213,9 @@ def _motion(logged: LoggedRun) -> Iterator[Finding]:
                 for name, value in zip(POSE, np.ptp(logged.poses, axis=0), strict=True)
             )
             + " m and rad",
+            limit=robot.travel_limit,
+            unit=unit,
+            leg=joint + 1,
         )
     highest = logged.spectrum.highest_hz
     rate = mean_rate(logged.time)
@@ -233,11 +223,10 @@ def _motion(logged: LoggedRun) -> Iterator[Finding]:
         "spectrum",
         highest * FRAMES_A_PERIOD <= rate,
         highest,
-        rate / FRAMES_A_PERIOD,
-        "Hz",
-        None,
         f"99 % of the power of the motion lies below {highest:.3g} Hz, "
         f"{rate / max(highest, 1e-9):.3g} frames a period",
+        limit=rate / FRAMES_A_PERIOD,
+        unit="Hz",
     )
 
 
@@ -250,9 +239,6 @@ def _saturation(logged: LoggedRun) -> Iterator[Finding]:
         "saturation",
         shares[joint] <= SATURATED,
         shares[joint],
-        SATURATED,
-        "1",
-        joint + 1 if shares[joint] > 0 else None,
         f"the largest command is {most.max():.4g} {logged.side.robot.layout.joint_unit}, of joint "
         f"{int(np.argmax(most)) + 1}; "
         + (
@@ -261,16 +247,18 @@ def _saturation(logged: LoggedRun) -> Iterator[Finding]:
             if shares[joint] > 0
             else "no command stays at the end of its range"
         ),
+        limit=SATURATED,
+        leg=joint + 1 if shares[joint] > 0 else None,
     )
 
 
 def _plausible(logged: LoggedRun) -> Iterator[Finding]:
     if not logged.suspicions:
         text = "nothing contradicts the units, axes, directions and zeros of the robot file"
-        yield Finding("units and frames", True, 0, 0, "1", None, text)
+        yield Finding("units and frames", True, 0, text, limit=0)
     for one in logged.suspicions:
         count = len(logged.suspicions)
-        yield Finding("units and frames", False, count, 0, "1", None, one)
+        yield Finding("units and frames", False, count, one, limit=0)
 
 
 def _clocks(logged: LoggedRun) -> Iterator[Finding]:
@@ -279,12 +267,11 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         "motion behind commands",
         lag.correlation >= FOLLOWS and lag.seconds >= -BEFORE_S,
         lag.seconds,
-        -BEFORE_S,
-        "s",
-        None,
         f"the motion follows the commands by {1e3 * lag.seconds:.1f} ms, with a correlation of "
         f"{lag.correlation:.3f}: drives, friction, latency and the clocks; less than "
         f"{-BEFORE_S:g} s, a motion before its commands, or a correlation below {FOLLOWS:g} fails",
+        limit=-BEFORE_S,
+        unit="s",
     )
     delay = logged.delay
     timing = logged.side.timing
@@ -293,7 +280,7 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
             "the commands show no noise of the poses: no servo was on these poses, or the clocks "
             "differ by more than half a second"
         )
-        yield Finding("clock offset", True, None, None, "s", None, text)
+        yield Finding("clock offset", True, None, text, unit="s")
         return
     # The row of a command without its own time is that of its pose.
     expected = 0.0 if logged.telemetry.commands.written is None else timing.latency_s
@@ -307,13 +294,12 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         "clock offset",
         abs(offset) <= allowed,
         offset,
-        allowed,
-        "s",
-        None,
         f"the noise of a pose is in the command {1e3 * delay.seconds:.3f} ms later (correlation "
         f"{delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
         f"{1e3 * expected:.3f} ms: the clock of the commands is ahead by {1e3 * offset:.3f} ms, or "
         f"the latency is another{beyond}",
+        limit=allowed,
+        unit="s",
     )
     duration = float(np.ptp(logged.time))
     grown = delay.drift * duration
@@ -321,11 +307,9 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         "clock drift",
         abs(grown) <= step + STDS * timing.clock_drift_std * duration,
         delay.drift,
-        step / duration + STDS * timing.clock_drift_std,
-        "1",
-        None,
         f"this delay grows by {1e6 * delay.drift:.1f} us in a second, {1e3 * grown:.3f} ms over "
         "the run",
+        limit=step / duration + STDS * timing.clock_drift_std,
     )
 
 
@@ -337,7 +321,7 @@ def _parameters(logged: LoggedRun) -> Iterator[Finding]:
     limit = SHOWN_GROUPS * len(names)
     if isinstance(run, DynamicsError):
         text = f"the guessed model does not run under the commands: {run}"
-        yield Finding("parameters", False, None, limit, "1", None, text)
+        yield Finding("parameters", False, None, text, limit=limit)
         return
     shown = logged.can_show(run)
     weak = [name for name, seen in zip(names, shown, strict=True) if not seen]
@@ -346,11 +330,9 @@ def _parameters(logged: LoggedRun) -> Iterator[Finding]:
         "parameters",
         bool(shown.sum() >= limit),
         int(shown.sum()),
-        limit,
-        "1",
-        None,
         f"the motion can show {shown.sum()} of {len(names)} groups of parameters, by the guessed "
         "model" + (f"; not {', '.join(weak[:LISTED])}{more}" if weak else ""),
+        limit=limit,
     )
 
 

@@ -66,7 +66,7 @@ def test_a_limit_that_is_missed_and_a_command_that_cannot_be_done_have_statuses_
     tmp_path, capfd, monkeypatch
 ):
     assert len(STATUSES) == 6
-    far = Finding("reach", False, None, None, "1", None, "too far")
+    far = Finding("reach", False, None, "too far")
     monkeypatch.setattr("identify.verification.robot_check.check_robot", lambda *_: [far])
     assert command("check", "rss6", "--quiet") == BEYOND_LIMIT
     assert "1 of 1 findings about rss6 fail: reach: too far" in one_line(capfd.readouterr().err)
