@@ -24,7 +24,6 @@ from dynamics.kinematics.platform import Chart
 from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.files.atomic import write_text
 from identify.files.digest import json_with_digest, json_without_digest
 
 
@@ -260,11 +259,6 @@ class TrajectorySet:
     median_index: float
 
 
-def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
-    """Write the set as JSON, whole or not at all."""
-    write_text(path, trajectories_json(trajectories))
-
-
 def trajectories_json(trajectories: TrajectorySet) -> str:
     """Return the text of the file of the set, with its digest."""
     data = {
@@ -286,7 +280,7 @@ def trajectories_json(trajectories: TrajectorySet) -> str:
 
 
 def load_trajectories(path: Path | str) -> TrajectorySet:
-    """Read the file that `save_trajectories` wrote.
+    """Read a file with the text of `trajectories_json`.
 
     Raises TrajectoryError if the file cannot be read, is of another format, or is incomplete.
     """

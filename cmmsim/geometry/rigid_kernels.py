@@ -242,24 +242,3 @@ def checkable_misfit(gap: Array, noise: Array, residual_entries: Array, smallest
         if ratios[i] > smallest:
             total += whitened[i] ** 2 / ratios[i]
     return total
-
-
-@compiled
-def residual_misfits(
-    transforms: Array, spreads: Array, of: Array, places: Array, points: Array,
-    covariances: Array, smallest: float, misfits: Array,
-) -> None:  # fmt: skip
-    """Fill ``misfits`` (n,) with the ``residual_misfit`` of each measured point (n, 3).
-
-    The points have covariances (n, 3, 3) and known ``places`` (n, 3). ``of`` (n,) is the index of
-    each point's fit among transforms (f, 4, 4) with covariances ``spreads`` (f, 6, 6).
-    """
-    arm = np.empty(3)
-    gap = np.empty(3)
-    half = np.empty((3, 6))
-    residual_entries = np.empty(6)
-    inverse = np.empty(6)
-    for n in range(len(points)):
-        turn_arm(transforms[of[n]], places[n], points[n], arm, gap)
-        residual_covariance(arm, covariances[n], spreads[of[n]], half, residual_entries)
-        misfits[n] = residual_misfit(gap, covariances[n], residual_entries, smallest, inverse)

@@ -11,7 +11,6 @@ instrument avoids this by an anti-aliasing filter.
 
 from dataclasses import dataclass
 from math import pi
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -21,15 +20,12 @@ from dynamics.closed_loop.command_schedule import acting_times
 from dynamics.closed_loop.drives import joint_law
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
-from identify.errors import RecordError, ScenarioError
+from identify.errors import ScenarioError
 from identify.experiment.truth import true_parameters, true_values
 from identify.files.dataset import (
     Variables,
-    check_finite,
-    check_variables,
     described_dataset,
     joint_numbers,
-    read_group,
     with_joint_units,
 )
 from identify.scenario import Timing
@@ -195,20 +191,3 @@ def frame_mean(
     mean = torque.copy()
     np.subtract.at(mean, nearest[within], (excess[:, None] * jump)[within])
     return np.asarray(mean, dtype=float)
-
-
-def read_channels(path: Path) -> xr.Dataset:
-    """Read and check the channels of a file.
-
-    Raises RecordError if it is truncated, lacks a channel or a standard deviation, or has values
-    that are not finite.
-    """
-    channels = read_group(path)
-    check_variables(channels, VARIABLES, str(path))
-    for name in VARIABLES:
-        check_finite(channels[name].values, name, str(path))
-    wanted = ATTRIBUTES[channels["joint_angle"].attrs.get("units") == "m"]
-    missing = [name for name in wanted if name not in channels.attrs]
-    if missing:
-        raise RecordError(f"{path} lacks the attributes {', '.join(missing)}")
-    return channels

@@ -239,16 +239,6 @@ SUM_TOLERANCE = 1e-9
 DIMENSIONS = ("parameter", "parameter_2")
 
 
-def write_covariance(
-    path: Path | str, layout: ParameterLayout, covariance: Array, others: Sequence[str] = ()
-) -> None:
-    """Write the covariance (p + k, p + k) of a robot's parameters and of k other quantities.
-
-    The names of the others end with their units. Raises WriteError.
-    """
-    write_bytes(path, covariance_netcdf(parameter_units(layout, others), covariance))
-
-
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
     """Return the units of a robot's parameters, and of others, whose names end with their units."""
     units = {name: layout.unit(name) for name in layout.names}

@@ -17,7 +17,6 @@ from identify.files.dataset import (
     group_names,
     pose_parts,
     read_group,
-    write_groups,
 )
 from identify.record.recording import run_name
 
@@ -91,17 +90,10 @@ def build_model_run(
     return described_dataset(finite, time, variables)
 
 
-def write_model_runs(
-    path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
-) -> None:
-    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..."""
-    write_groups(path, model_groups(excitation, validation))
-
-
 def model_groups(
     excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
 ) -> dict[str, xr.Dataset]:
-    """Return the groups of a file of model runs, which `write_model_runs` writes."""
+    """Return the groups ``excitation``, ``run01``, ``run02``, ... of a file of model runs."""
     named = {run_name(number): run for number, run in enumerate(validation, start=1)}
     return {EXCITATION: excitation} | named
 

@@ -203,15 +203,10 @@ def read(path: Path | str, run: str = "") -> xr.Dataset:
     return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
 
 
-def write_runs(path: Path | str, runs: Sequence[tuple[xr.Dataset, xr.Dataset | None]]) -> None:
-    """Write several (record, truth) pairs as the groups ``run01``, ``run01/truth``, ..."""
-    write_groups(path, run_groups(runs))
-
-
 def run_groups(
     runs: Sequence[tuple[xr.Dataset, xr.Dataset | None]],
 ) -> dict[str, xr.Dataset]:
-    """Return the groups of a file of several runs, which `write_runs` writes."""
+    """Return several (record, truth) pairs as the groups ``run01``, ``run01/truth``, ..."""
     groups = {}
     for number, (record, truth) in enumerate(runs, start=1):
         groups[run_name(number)] = record

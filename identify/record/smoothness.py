@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import welch
 from scipy.special import chdtri
 
 from identify.arrays import Array
@@ -285,6 +284,9 @@ def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     Poses are interpolated at N evenly spaced times. Positions or angles that move no more than
     their noise (6,), m and rad, have no highest frequency.
     """
+    # imported here, because it imports scipy.stats, for which a process of a study must not wait
+    from scipy.signal import welch
+
     even = np.linspace(time[0], time[-1], len(time))
     rate = (len(time) - 1) / (time[-1] - time[0])
     values = interpolated(even, time, poses)

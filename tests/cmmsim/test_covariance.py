@@ -27,7 +27,7 @@ from cmmsim.geometry.pose import (
     transform_to_pose,
 )
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.rigid_kernels import residual_misfits
+from cmmsim.geometry.rigid_kernels import residual_covariance, residual_misfit, turn_arm
 from cmmsim.geometry.stereo_rig import toed_in_rig
 from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.frame_solver import (
@@ -149,10 +149,13 @@ def solved(seen):
 
 def misfits_of(fit, points, places, covariances):
     """Squared residuals (n,) of a registration, compiled."""
-    found, own = np.empty(len(points)), np.zeros(len(points), dtype=int)
-    fits = fit.transform[None], fit.covariance[None], own
-    residual_misfits(*fits, places, points, covariances, SMALLEST_SHARE, found)
-    return found
+    arm, gap, half, found = np.empty(3), np.empty(3), np.empty((3, 6)), []
+    entries, inverse = np.empty(6), np.empty(6)
+    for place, point, covariance in zip(places, points, covariances, strict=True):
+        turn_arm(fit.transform, place, point, arm, gap)
+        residual_covariance(arm, covariance, fit.covariance, half, entries)
+        found.append(residual_misfit(gap, covariance, entries, SMALLEST_SHARE, inverse))
+    return np.array(found)
 
 
 @pytest.mark.parametrize("stickers", [ALL, [0, 5, 7, 12, 16]])

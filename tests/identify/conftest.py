@@ -8,11 +8,10 @@ import pytest
 
 from dynamics import DynamicsError
 from identify.files import limited_process
-from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, rms_figures, save_result
-from identify.record.model_runs import build_model_run, write_model_runs
+from identify.record.model_runs import build_model_run
 from identify.record.readers import bags
-from identify.record.recording import write_runs
+from tests.identify.run_files import write_covariance, write_model_runs, write_runs
 from tests.identify.synthetic import LAYOUT, NAMES, recorded_run_folder, rss6, short_run, truth_of
 
 

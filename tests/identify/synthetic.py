@@ -22,7 +22,8 @@ from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
 from identify.scenario import load_scenario
 from identify.setup import Setup
-from identify.trajectory import TrajectorySet, random_trajectory, save_trajectories
+from identify.trajectory import TrajectorySet, random_trajectory
+from tests.identify.run_files import save_trajectories
 
 SIGMA = np.repeat([5e-6, 30e-6], 3)
 

@@ -40,8 +40,9 @@ from identify.loop_parameters import loop_settings
 from identify.model.from_record import identified_model
 from identify.scenario import load_scenario
 from identify.setup import Setup, unseen_errors
-from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
+from identify.trajectory import TrajectorySet, load_trajectories
 from tests.dynamics.test_families import mixed_robot
+from tests.identify.run_files import save_trajectories
 from tests.identify.synthetic import (
     SIGMA,
     build_plant,

@@ -9,17 +9,17 @@ import pytest
 from identify.errors import RecordError
 from identify.estimation.budget import CORRELATED, SOURCES, budget_of
 from identify.estimation.identification import identify
-from identify.files.dataset import read_covariance, read_sources, write_covariance
+from identify.files.dataset import read_covariance, read_sources
 from identify.files.run_folder import RunFolder, load_result
 from identify.model.model_side import model_side
 from identify.progress import SilentProgress
 from identify.record.provenance import RunFiles, store_robot
-from identify.record.recording import write_runs
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting.run_result import parameter_vector
 from identify.stages.run_budget import error_budget, pose_budget
 from identify.validation.pose_prediction import predicted_runs
 from tests.identify.commands import command, one_line
+from tests.identify.run_files import write_covariance, write_runs
 from tests.identify.synthetic import (
     SHORT,
     SIGMA,

@@ -34,9 +34,9 @@ from identify.trajectory import (
     check_travel,
     load_trajectories,
     random_trajectory,
-    save_trajectories,
 )
 from tests.identify.commands import refusal
+from tests.identify.run_files import save_trajectories
 from tests.identify.synthetic import Stages, design_of, rss6
 
 CHART = rss6().geometry.chart

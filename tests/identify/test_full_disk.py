@@ -37,8 +37,8 @@ from identify.experiment import warm_up
 from identify.files import atomic
 from identify.files.atomic import figure_bytes
 from identify.files.run_folder import as_json
-from identify.record.recording import write_runs
 from tests.identify.commands import command, leaves, one_line
+from tests.identify.run_files import write_runs
 from tests.identify.static_poses import drawn, poses_of
 from tests.identify.study_rows import KIND
 from tests.identify.synthetic import quick, rss6, run_plant, truth_of

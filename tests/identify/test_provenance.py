@@ -8,16 +8,16 @@ import pytest
 from identify import pipeline
 from identify.errors import OutputFolderError, RecordError
 from identify.experiment.truth import read_truth
-from identify.files.dataset import write_covariance
 from identify.files.run_folder import load_result, save_result
 from identify.progress import SilentProgress
-from identify.record.model_runs import EXCITATION, read_model_runs, write_model_runs
+from identify.record.model_runs import EXCITATION, read_model_runs
 from identify.record.provenance import ENTRY, RunFiles, array_digest, digest
-from identify.record.recording import read, read_runs, write, write_runs
+from identify.record.recording import read, read_runs, write
 from identify.reporting.report import write_report
 from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
 from tests.identify.commands import command, one_line
+from tests.identify.run_files import write_covariance, write_model_runs, write_runs
 from tests.identify.synthetic import LAYOUT, NAMES, SHORT, rss6, short_run, truth
 
 

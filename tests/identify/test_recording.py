@@ -16,13 +16,13 @@ from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.atomic import write_files, write_text
-from identify.files.dataset import group_names, write_covariance, write_groups
+from identify.files.dataset import group_names, write_groups
 from identify.files.run_folder import load_result, save_result
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
 from identify.record.load import recorded_payload
-from identify.record.model_runs import build_model_run, read_model_runs, write_model_runs
+from identify.record.model_runs import build_model_run, read_model_runs
 from identify.record.provenance import check_robot
 from identify.record.recording import (
     check_record,
@@ -32,11 +32,11 @@ from identify.record.recording import (
     run_name,
     run_names,
     write,
-    write_runs,
 )
 from identify.setup import Setup
 from identify.trajectory import load_trajectories
 from tests.identify import synthetic
+from tests.identify.run_files import write_covariance, write_model_runs, write_runs
 from tests.identify.synthetic import (
     LAYOUT,
     NAMES,

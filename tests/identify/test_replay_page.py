@@ -13,12 +13,13 @@ from cmmsim.geometry.pose import invert
 from dynamics import load_robot
 from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import RunFolder, save_result
-from identify.record.model_runs import build_model_run, write_model_runs
+from identify.record.model_runs import build_model_run
 from identify.record.provenance import store_robot
 from identify.record.recording import write
 from identify.scene import replay, workcell
 from tests.identify.commands import command
 from tests.identify.conftest import make_result
+from tests.identify.run_files import write_model_runs
 from tests.identify.synthetic import build_plant, quick, rss6, run_plant
 
 pytestmark = pytest.mark.slow

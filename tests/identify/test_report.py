@@ -19,7 +19,7 @@ from dynamics.kinematics.platform import Chart
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
-from identify.record.model_runs import build_model_run, write_model_runs
+from identify.record.model_runs import build_model_run
 from identify.record.recording import read, write
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting import paper, parameter_tables, tables
@@ -34,6 +34,7 @@ from identify.reporting.run_data import read_run
 from identify.reporting.verdict import cameras_consistent, key_numbers, verdict
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, random_trajectory
+from tests.identify.run_files import write_model_runs
 from tests.identify.synthetic import short_run, truth_of
 
 FIGURES = {

@@ -15,6 +15,7 @@ from identify.record import recording
 from identify.reporting.variation_tables import PAPER_PERCENT, PAPER_WORST_PERCENT, variation_table
 from identify.validation.variation import variation
 from tests.identify.commands import command, one_line
+from tests.identify.run_files import write_runs
 from tests.identify.synthetic import LAYOUT, quick, run_plant, short_run
 
 IDENTIFIED = {
@@ -68,7 +69,7 @@ def test_the_command_identifies_each_unseen_run(tmp_path, capsys):
     """
     (tmp_path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
     runs = [(run_plant(quick(), seed, trajectory_seed=seed)[0], None) for seed in range(3)]
-    recording.write_runs(tmp_path / "validation.nc", runs)
+    write_runs(tmp_path / "validation.nc", runs)
     assert command("variation", "--out", tmp_path) == 0
     assert "largest:" in capsys.readouterr().out
     entry = json.loads((tmp_path / "variation.json").read_text(encoding="utf-8"))
@@ -92,7 +93,7 @@ def test_a_folder_without_runs_or_with_too_few_is_refused(tmp_path, capsys):
     (tmp_path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
     assert command("variation", "--out", tmp_path) == 1
     assert "cmmsim validate" in one_line(capsys.readouterr().err)
-    recording.write_runs(tmp_path / "validation.nc", 2 * [(short_run()[0], None)])
+    write_runs(tmp_path / "validation.nc", 2 * [(short_run()[0], None)])
     assert command("variation", "--out", tmp_path) == 1
     assert "2 runs show no variation" in one_line(capsys.readouterr().err)
     assert not (tmp_path / "variation.json").exists()
