@@ -32,6 +32,7 @@ LONGEST_NAME = 60
 # Largest number of problems of one file in a message.
 MOST_COMPLAINTS = 8
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+# Pattern of strings and comments of TOML. It never backtracks, so a search takes linear time.
 _TEXTS = re.compile(
     r"""
     \"{3} (?: [^"\\] | \\. | "(?!"") )*+ (?: \"{3} | \Z )  # a text over several lines
@@ -42,7 +43,6 @@ _TEXTS = re.compile(
     """,
     re.DOTALL | re.VERBOSE,
 )
-"""Pattern of strings and comments of TOML. It never backtracks, so a search takes linear time."""
 
 
 def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:

@@ -33,8 +33,8 @@ class Part(NamedTuple):
     last: bool
 
 
+# Row of the base in the form of `rigid_body.jacobians.placements`: origin, axes, spin.
 BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
-"""Row of the base in the form of `rigid_body.jacobians.placements`: origin, axes, spin."""
 
 
 @dataclass(frozen=True)

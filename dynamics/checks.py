@@ -203,8 +203,7 @@ class Within:
         }
 
 
-INERTIA_FORMS = ("centred", "full")
-"""Forms of a body: with four or with ten inertial parameters."""
+INERTIA_FORMS = ("centred", "full")  # forms of a body: with four or with ten inertial parameters
 
 
 def check_inertia_forms(value: object) -> object:
@@ -229,23 +228,22 @@ def within(quantity: Any) -> Within:
     return limits
 
 
+# Range from a grain of silicon to a thousand tonnes.
 Mass = Annotated[float, Within(1e-12, 1e6, "kg", zero=True)]
-"""Range from a grain of silicon to a thousand tonnes."""
 Inertia = Annotated[float, Within(1e-24, 1e9, "kg m^2", zero=True)]
 FirstMoment = Annotated[float, Within(-1e9, 1e9, "kg m")]
 Product = Annotated[float, Within(-1e9, 1e9, "kg m^2")]
 Length = Annotated[float, Within(1e-6, 1e3, "m")]
-Place = Annotated[float, Within(-1e3, 1e3, "m or rad")]
-"""Coordinate of a point, or an angle."""
+Place = Annotated[float, Within(-1e3, 1e3, "m or rad")]  # coordinate of a point, or an angle
 Travel = Annotated[float, Within(1e-9, 1e3, "rad or m")]
+# Margin, step or error of a coordinate.
 Margin = Annotated[float, Within(1e-12, 1e3, "rad or m", zero=True)]
-"""Margin, step or error of a coordinate."""
 Speed = Annotated[float, Within(1e-9, 1e6, "rad/s or m/s")]
 Acceleration = Annotated[float, Within(-1e3, 1e3, "m/s^2")]
 Force = Annotated[float, Within(1e-12, 1e9, "N m or N", zero=True)]
 Damping = Annotated[float, Within(1e-12, 1e9, "N m s/rad or N s/m", zero=True)]
 Gain = Annotated[float, Within(1e-9, 1e12, "", zero=True)]
+# Number without a unit: a fraction, a tolerance or a count.
 Ratio = Annotated[float, Within(1e-16, 1e12, "", zero=True)]
-"""Number without a unit: a fraction, a tolerance or a count."""
 Frequency = Annotated[float, Within(1e-6, 1e6, "Hz or rad/s")]
 Duration = Annotated[float, Within(1e-9, 1e6, "s", zero=True)]

@@ -3,8 +3,7 @@
 Every message states the value, the limit, and the leg or name.
 """
 
-LONGEST = 4000
-"""Largest number of characters of a message."""
+LONGEST = 4000  # largest number of characters of a message
 
 
 class DynamicsError(Exception):

@@ -17,29 +17,19 @@ from xml.etree import ElementTree as Xml
 import yaml
 from pydantic import AfterValidator, WithJsonSchema
 
-LARGEST = 500_000
-"""Largest size of a file of settings, in bytes."""
-
-LARGEST_XML = 1_000_000
-"""Largest size of an XML file, in bytes."""
-
-DEEPEST = 16
-"""Largest depth of tables and lists, and largest number of parts of a dotted key."""
-
-DEEPEST_ELEMENT = 150
-"""Largest depth of XML elements."""
-
-LARGEST_YAML = 100_000
-"""Largest size of a YAML file, in bytes."""
-
+LARGEST = 500_000  # largest size of a file of settings, in bytes
+LARGEST_XML = 1_000_000  # largest size of an XML file, in bytes
+DEEPEST = 16  # largest depth of tables and lists, and largest number of parts of a dotted key
+DEEPEST_ELEMENT = 150  # largest depth of XML elements
+LARGEST_YAML = 100_000  # largest size of a YAML file, in bytes
+# Pattern of the names of robots, sensors, scenarios and studies, which are used as file names.
 NAME = r"^\w[\w .+-]*$"
-"""Pattern of the names of robots, sensors, scenarios and studies, which are used as file names."""
-
+# Largest number of characters of these names. The file name then has at most 255 bytes.
 LONGEST_NAME = 60
-"""Largest number of characters of these names. The file name then has at most 255 bytes."""
 
 _YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+# Strings and comments in TOML. Matches do not backtrack, so that a search takes linear time.
 _TEXTS = re.compile(
     r"""
     \"{3} (?: [^"\\] | \\. | "(?!"") )*+ (?: \"{3} | \Z )  # a text over several lines
@@ -50,7 +40,6 @@ _TEXTS = re.compile(
     """,
     re.DOTALL | re.VERBOSE,
 )
-"""Strings and comments in TOML. Matches do not backtrack, so that a search takes linear time."""
 
 
 def is_name(name: str) -> bool:
@@ -68,12 +57,12 @@ def check_name(name: str) -> str:
     )
 
 
+# Name that is used as a file name.
 Name = Annotated[
     str,
     AfterValidator(check_name),
     WithJsonSchema({"type": "string", "pattern": NAME, "maxLength": LONGEST_NAME}),
 ]
-"""Name that is used as a file name."""
 
 
 def is_file(path: str | PathLike[str]) -> bool:

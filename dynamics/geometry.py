@@ -19,8 +19,7 @@ from dynamics.legs.leg import Leg
 from dynamics.parameter_set import EXACT, Unstated
 from dynamics.parameters import ParameterLayout, parameter_layout
 
-SAME_PLACE = 1e-6
-"""Distance, m, below which joints of two legs coincide."""
+SAME_PLACE = 1e-6  # distance, m, below which joints of two legs coincide
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,8 +368,8 @@ class MovableGeometry:
         return self.nominal.characteristic_length
 
 
+# Geometry for which kinematics and dynamics are built as expressions.
 AnyGeometry = RobotGeometry | MovableGeometry
-"""Geometry for which kinematics and dynamics are built as expressions."""
 
 
 def _plain(value: object) -> object:

@@ -141,14 +141,10 @@ def _difference(before: np.ndarray, after: np.ndarray) -> str:
     return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
 
 
-STATES = 300
-"""Number of random states at which accelerations are compared."""
-
-TRAVEL_RATE = 1.0
-"""Standard deviation of joint rates, in travel limits per second."""
-
+STATES = 300  # number of random states at which accelerations are compared
+TRAVEL_RATE = 1.0  # standard deviation of joint rates, in travel limits per second
+# Standard deviation of joint accelerations, in travel limits per second squared.
 TRAVEL_ACCELERATION = 10.0
-"""Standard deviation of joint accelerations, in travel limits per second squared."""
 
 
 def acceleration_changes(

@@ -139,8 +139,8 @@ class Unstated(Strict):
     )
 
 
+# Bodies and joints that are exactly as modelled.
 EXACT = Unstated(centre_std=0.0, product_std=0.0, passive_viscous_std=0.0)
-"""Bodies and joints that are exactly as modelled."""
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,10 @@ import re
 
 from dynamics.spatial_inertia import FIRST_MOMENTS, MOMENTS, PRODUCTS
 
+# Name of a passive joint: link_joint is the joint between the link and the body before it. This
+# name is for the joints of all legs. The name for a single leg has the number of the leg, such as
+# link3_joint.
 PASSIVE_JOINT = "{}_joint"
-"""Name of a passive joint: link_joint is the joint between the link and the body before it.
-
-This name is for the joints of all legs. The name for a single leg has the number of the leg, such
-as link3_joint.
-"""
 
 UNITS = (
     {"mass": "kg"}

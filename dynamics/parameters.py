@@ -17,23 +17,14 @@ from dynamics.parameter_units import PASSIVE_JOINT, of_all_legs, unit_of
 from dynamics.spatial_inertia import FIRST_MOMENTS, FULL_INERTIAL, INERTIAL, MOMENTS, PRODUCTS
 
 PLATFORM = Body("platform", MOMENTS)
-JOINT_PID = ("lp", "li", "ld")
-"""Gains of the joint PID (eq. 31)."""
-
-SIGNED = (*FIRST_MOMENTS, *PRODUCTS)
-"""Inertial parameters that may be negative."""
-
-ALL_TEN = list(range(len(FULL_INERTIAL)))
-"""Indices of all parameters of a full body."""
-
+JOINT_PID = ("lp", "li", "ld")  # gains of the joint PID (eq. 31).
+SIGNED = (*FIRST_MOMENTS, *PRODUCTS)  # inertial parameters that may be negative
+ALL_TEN = list(range(len(FULL_INERTIAL)))  # indices of all parameters of a full body
+# Indices of the parameters of a centred body among those of a full body.
 CENTRED = [FULL_INERTIAL.index(name) for name in INERTIAL]
-"""Indices of the parameters of a centred body among those of a full body."""
-
+# Kinds of friction of a passive joint, each with one parameter.
 PASSIVE_LAWS = ("coulomb", "viscous")
-"""Kinds of friction of a passive joint, each with one parameter."""
-
-LANES = 8
-"""Number of derivatives, or of runs, that are computed at once."""
+LANES = 8  # number of derivatives, or of runs, that are computed at once
 
 
 def room_for_derivatives(rigid: int, joints: int, coordinates: int) -> int:

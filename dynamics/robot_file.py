@@ -18,11 +18,8 @@ from dynamics.kinematics.platform import FREEDOMS, Chart
 from dynamics.legs import KINDS, AnyLeg
 from dynamics.parameter_set import Parameters, ParameterSet, Strict, Unstated, parameter_set
 
-MOST_MESHES = 100
-"""Largest number of meshes of a robot."""
-
-MOST_FAULTS = 24
-"""Largest number of faults in a message: four for each of six legs."""
+MOST_MESHES = 100  # largest number of meshes of a robot
+MOST_FAULTS = 24  # largest number of faults in a message: four for each of six legs
 
 
 class Family(NamedTuple):

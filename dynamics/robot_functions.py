@@ -10,6 +10,7 @@ from dynamics.geometry import MovableGeometry, RobotGeometry
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 
+# Names of the functions that inner loops evaluate, and that are therefore optimised.
 HOT = (
     "equation_of_motion",
     "free_acceleration",
@@ -24,8 +25,8 @@ HOT = (
     "acceleration_in_lanes",
     "servo_jacobian",
 )
-"""Names of the functions that inner loops evaluate, and that are therefore optimised."""
 
+# Names of the inputs and of the outputs of the functions that `Robot.casadi` returns.
 CASADI = {
     "inverse_kinematics": ("pose", "theta reach_margin"),
     "joint_jacobian": ("pose", "jacobian"),
@@ -38,7 +39,6 @@ CASADI = {
     "inverse_dynamics": ("pose twist twist_dot parameters", "torque"),
     "forward_dynamics": ("pose twist torque parameters", "twist_dot"),
 }
-"""Names of the inputs and of the outputs of the functions that `Robot.casadi` returns."""
 
 
 @lru_cache(maxsize=16)

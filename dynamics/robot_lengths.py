@@ -30,6 +30,7 @@ from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
 from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
 
+# Name of each length, and the field of a leg that it sets.
 LENGTH_FIELDS = {
     "crank": "crank_length",
     "link": "link_length",
@@ -38,30 +39,19 @@ LENGTH_FIELDS = {
     "cylinder": "cylinder_length",
     "rod": "rod_length",
 }
-"""Name of each length, and the field of a leg that it sets."""
 
+# Distances, seen from above, of the base joints from the middle of the base, and of the platform
+# joints from the middle of the platform.
 RADII = ("base_radius", "platform_radius")
-"""Distances, seen from above, of the base joints from the middle of the base, and of the platform
-joints from the middle of the platform.
-"""
-
+# Moment of inertia of each body of a leg about the axis along its length.
 MOMENT_ABOUT_LENGTH = {"crank": "Ixx", "link": "Izz", "cylinder": "Izz", "rod": "Izz"}
-"""Moment of inertia of each body of a leg about the axis along its length."""
-
+# Number of digits of joint coordinates, from the first digit of the radius of their circle on.
 DIGITS = 9
-"""Number of digits of joint coordinates, from the first digit of the radius of their circle on."""
-
-SAMPLES = 2000
-"""Number of random positions of the joints within the travel limit."""
-
+SAMPLES = 2000  # number of random positions of the joints within the travel limit
+# Factor by which the travel limit is reduced until no pose within it is near a singularity.
 TRAVEL_FACTOR = 0.95
-"""Factor by which the travel limit is reduced until no pose within it is near a singularity."""
-
-LEAST_TRAVEL = 0.1
-"""Smallest ratio of the reduced travel limit to the original one."""
-
-VERTICAL_TOLERANCE = 1e-9
-"""Largest difference from 1 of the vertical component of a vertical axis."""
+LEAST_TRAVEL = 0.1  # smallest ratio of the reduced travel limit to the original one
+VERTICAL_TOLERANCE = 1e-9  # largest difference from 1 of the vertical component of a vertical axis
 
 
 def lengths_of(geometry: RobotGeometry) -> dict[str, float]:

@@ -20,14 +20,11 @@ from dynamics.parameter_set import ParameterSet
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_functions import nearby_functions, own_functions
 
+# Condition number beyond which a Jacobian counts as singular. Usual robots have about 1e2.
 CONDITION_LIMIT = 1e10
-"""Condition number beyond which a Jacobian counts as singular. Usual robots have about 1e2."""
-
+# Largest deviation of a pose or twist from the allowed ones that counts as rounding. It is in m,
+# rad, m/s or rad/s.
 CHART_TOLERANCE = 1e-9
-"""Largest deviation of a pose or twist from the allowed ones that counts as rounding.
-
-It is in m, rad, m/s or rad/s.
-"""
 
 
 class RobotPlatform:

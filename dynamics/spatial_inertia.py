@@ -17,18 +17,15 @@ from dataclasses import dataclass
 import casadi as ca
 
 MOMENTS = ("Ixx", "Iyy", "Izz")
+# Inertial parameters of a centred body: mass, kg, and moments about its own axes, kg m^2.
 INERTIAL = ("mass", *MOMENTS)
-"""Inertial parameters of a centred body: mass, kg, and moments about its own axes, kg m^2."""
 
 FIRST_MOMENTS = ("mcx", "mcy", "mcz")
 PRODUCTS = ("Ixy", "Ixz", "Iyz")
+# Inertial parameters of a full body: kg, kg m and kg m^2, in its own axes. The first moment of the
+# mass is the mass times the vector from the reference point to the centre of mass. Moments and
+# products of inertia are about the reference point, and Ixy is minus the integral of x y dm.
 FULL_INERTIAL = ("mass", *FIRST_MOMENTS, *MOMENTS, *PRODUCTS)
-"""Inertial parameters of a full body: kg, kg m and kg m^2, in its own axes.
-
-The first moment of the mass is the mass times the vector from the reference point to the centre of
-mass. Moments and products of inertia are about the reference point, and Ixy is minus the integral
-of x y dm.
-"""
 
 
 @dataclass(frozen=True)

@@ -43,11 +43,9 @@ Below it, the force along the leg is more than 20 times the force of the actuato
 0.09 within its travel.
 """
 
+# Largest condition number for `check_motion`. Within the travel of rss6, it is below 5 for J_a2,
+# and below 10 for J_ad.
 MOST_CONDITION = 20.0
-"""Largest condition number for `check_motion`.
-
-Within the travel of rss6, it is below 5 for J_a2, and below 10 for J_ad.
-"""
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+# Number of rows that are factored at once. A block with one column per parameter fits into the
+# cache of a processor.
 BLOCK = 600
-"""Number of rows that are factored at once.
-
-A block with one column per parameter fits into the cache of a processor.
-"""
 
 
 def triangular_factor(*parts: Array) -> Array:

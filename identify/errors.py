@@ -1,7 +1,6 @@
 """Errors that a user can cause or meet. Messages have the value, the limit and the valid names."""
 
-LONGEST = 4000
-"""Largest number of characters of a message."""
+LONGEST = 4000  # largest number of characters of a message
 
 
 class IdentifyError(Exception):

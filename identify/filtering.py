@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from identify.arrays import Array
 from identify.errors import FilterError
 
-SPLINE_DEGREE = 5
-"""Degree of the spline; its second derivative is still three times differentiable."""
+SPLINE_DEGREE = 5  # degree of the spline; its second derivative is still three times differentiable
 
 
 def zero_phase_filter(

@@ -33,8 +33,7 @@ from identify.scenario.payload import Payload
 from identify.scenario.plant_sections import FILTERED
 from identify.scenario.section import ACTUATOR_KEYS, Section
 
-NOMINAL = "guess"
-"""Default parameter set."""
+NOMINAL = "guess"  # default parameter set
 
 
 def loop_settings(
@@ -60,8 +59,8 @@ def loop_settings(
     )
 
 
+# Longest integration step of a model, as a multiple of the time constant of its fastest motion.
 LONGEST_STEP = 0.3
-"""Longest integration step of a model, as a multiple of the time constant of its fastest motion."""
 
 
 def _steps_per_frame(robot: Robot, side: Plant | Model, period: float) -> int:

@@ -15,12 +15,14 @@ from cmmsim.allowed_plugins import is_plugin_name as is_plugin_name
 from cmmsim.errors import CmmError
 from identify.errors import IdentifyError, ScenarioError
 
+# Criteria of exciting trajectories, see `identify.excitation.criteria`.
 CRITERIA = {
     "observability": "identify.excitation.criteria:observability",
     "information": "identify.excitation.information:information",
 }
-"""Criteria of exciting trajectories, see `identify.excitation.criteria`."""
 
+# Estimators that `cmmsim estimators` compares, in the order of its table. See
+# `identify.estimators.estimator`.
 ESTIMATORS = {
     "closed_loop": "identify.estimators.output_error_routes:closed_loop",
     "command_driven": "identify.estimators.output_error_routes:command_driven",
@@ -33,18 +35,14 @@ ESTIMATORS = {
     "torque_tls": "identify.estimators.errors_in_variables:total_least_squares",
     "encoders": "identify.estimators.least_squares:encoder_route",
 }
-"""Estimators that `cmmsim estimators` compares, in the order of its table.
-
-See `identify.estimators.estimator`.
-"""
 
 
+# Laws that make a robot follow a motion, see `dynamics.control.law_interface`.
 LAWS = {
     "pid": "dynamics.control.law_interface:pid",
     "feedforward": "dynamics.control.feedforward:feedforward",
     "computed_torque": "dynamics.control.computed_torque:computed_torque",
 }
-"""Laws that make a robot follow a motion, see `dynamics.control.law_interface`."""
 
 
 def check_choice(

@@ -22,8 +22,8 @@ from rich.progress import Progress as RichBars
 from rich.table import Table as RichTable
 from rich.text import Text
 
+# Function ``advance(n=1)`` that reports n more steps of the stage as done.
 Advance = Callable[..., None]
-"""Function ``advance(n=1)`` that reports n more steps of the stage as done."""
 
 
 class Progress(Protocol):
@@ -43,8 +43,7 @@ class SilentProgress:
         yield lambda n=1: None
 
 
-LINE_S = 60.0
-"""Interval between the lines of a stage if the output is not a terminal, seconds."""
+LINE_S = 60.0  # interval between the lines of a stage if the output is not a terminal, seconds
 
 
 class RichProgress:

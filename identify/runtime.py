@@ -57,8 +57,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-STOPPED = 130
-"""Exit status of a command after Ctrl-C."""
+STOPPED = 130  # exit status of a command after Ctrl-C
 
 
 class InterruptHandler:

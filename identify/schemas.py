@@ -17,6 +17,7 @@ from identify.studies.study_file import study_schema
 
 ROOT = Path(__file__).parents[1]
 
+# File of each schema, and the function that makes the schema from the models of such files.
 SCHEMAS: dict[Path, Callable[[], dict[str, Any]]] = {
     ROOT / "dynamics/robots/robot.schema.json": robot_schema,
     ROOT / "cmmsim/files/sensors/sensor.schema.json": sensor_schema,
@@ -24,7 +25,6 @@ SCHEMAS: dict[Path, Callable[[], dict[str, Any]]] = {
     ROOT / "identify/studies/built_in/study.schema.json": study_schema,
     ROOT / "identify/record/record.schema.json": record_schema,
 }
-"""File of each schema, and the function that makes the schema from the models of such files."""
 
 
 if __name__ == "__main__":

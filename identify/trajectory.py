@@ -221,11 +221,8 @@ def _without(rows: Array, direction: Array) -> Array:
     return rows - np.outer(rows @ unit, unit)
 
 
-FREE = "free"
-"""Chart for files without an entry for it."""
-
-HOME = (0.0,) * 6
-"""Home for files without an entry for it. The chart "free" does not use it."""
+FREE = "free"  # chart for files without an entry for it
+HOME = (0.0,) * 6  # home for files without an entry for it. The chart "free" does not use it.
 
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = (

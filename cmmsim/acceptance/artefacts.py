@@ -39,12 +39,10 @@ HALF_WIDTH = HALF_RIDGE + SIDE_WIDTH
 # True transform from the frame of the second end to the frame of the first end.
 FIRST_FROM_SECOND = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
+# Places of the stickers of one side: along (n,) and across (n,) the artefact, m. Along is counted
+# from the middle of the artefact. Across is counted from the middle line on side A, and from the
+# edge that is shared with side A on sides B and C.
 StickerRow = tuple[ArrayLike, ArrayLike]
-"""Places of the stickers of one side: along (n,) and across (n,) the artefact, m.
-
-Along is counted from the middle of the artefact. Across is counted from the middle line on side A,
-and from the edge that is shared with side A on sides B and C.
-"""
 
 
 def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-Level = Annotated[int, Field(ge=0, le=255)]
-"""Grey level of an 8-bit image."""
+Level = Annotated[int, Field(ge=0, le=255)]  # grey level of an 8-bit image
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,12 @@ class Bounds:
         }
 
 
-Length = Annotated[float, Bounds(1e-6, 1e3, "m")]
-"""Length that cannot be zero."""
-Distance = Annotated[float, Bounds(1e-9, 1e3, "m", zero=True)]
-"""Length that can be zero."""
-Place = Annotated[float, Bounds(-1e3, 1e3, "m")]
-"""Coordinate of a point."""
+Length = Annotated[float, Bounds(1e-6, 1e3, "m")]  # length that cannot be zero
+Distance = Annotated[float, Bounds(1e-9, 1e3, "m", zero=True)]  # length that can be zero
+Place = Annotated[float, Bounds(-1e3, 1e3, "m")]  # coordinate of a point
 Angle = Annotated[float, Bounds(-1e2, 1e2, "rad")]
+# Component of a direction. The length of the direction has no meaning.
 Component = Annotated[float, Bounds(-1e6, 1e6)]
-"""Component of a direction. The length of the direction has no meaning."""
 Pixels = Annotated[float, Bounds(1.0, 1e7, "px")]
 ImagePlace = Annotated[float, Bounds(-1e6, 1e6, "px")]
 Distortion = Annotated[float, Bounds(-1e4, 1e4)]

@@ -160,6 +160,5 @@ def outline_modes(angle: Array) -> Array:
 
 
 _ANGLES = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
-"""Points (2, RIM_POINTS) of the unit circle."""
+CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])  # points (2, RIM_POINTS) of the unit circle
 CIRCLE.setflags(write=False)

@@ -103,8 +103,7 @@ class Mesh:
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
-Patch = DiscStack | Mesh
-"""Piece of a body that is drawn by one call."""
+Patch = DiscStack | Mesh  # piece of a body that is drawn by one call
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ LARGEST_STEP_PX = 0.3
 MOST_SUB_FRAMES = 500
 SUPERSAMPLING = 9
 
+# Transforms camera_from_body (b, 4, 4) of all bodies for both cameras, at each sub-frame.
 Moments = Sequence[Sequence[Array]]
-"""Transforms camera_from_body (b, 4, 4) of all bodies for both cameras, at each sub-frame."""
 
 
 def sub_frame_poses(

@@ -69,8 +69,7 @@ class Candidates:
     alone: NDArray[np.bool_]
 
 
-Spots = tuple[EllipseFits, EllipseFits]
-"""Ellipses of the spots in the left and in the right image."""
+Spots = tuple[EllipseFits, EllipseFits]  # ellipses of the spots in the left and in the right image
 
 
 def spots_in(images: StereoFrame | StereoImages | StickerExposure, observer: Observer) -> Spots:

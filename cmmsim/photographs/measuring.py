@@ -24,6 +24,7 @@ from cmmsim.tracker import Tracker
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
 ENTRIES = [(row, column) for row in range(6) for column in range(row, 6)]
+# Columns of the table; ``covariance`` is for noise, ``common`` for errors shared by all pairs.
 COLUMNS = (
     "pair",
     "time_s",
@@ -34,7 +35,6 @@ COLUMNS = (
     "ok",
     "why",
 )
-"""Columns of the table; ``covariance`` is for noise, ``common`` for errors shared by all pairs."""
 # A hint is given if each image of a lost pair shows this share of the platform's stickers.
 SHOWN_SHARE = 0.5
 # Radius of a circle around a found sticker in a picture, px.

@@ -22,11 +22,9 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.radiometry.noise import CameraNoise, GreyImage
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages
 
+# Ways to convert colours: weighted sum, or one channel in OpenCV's order.
 COLOURS = {"grey": None, "blue": 0, "green": 1, "red": 2}
-"""Ways to convert colours: weighted sum, or one channel in OpenCV's order."""
-
-Source = str | Path | Iterable[NDArray]
-"""A folder of images, a video, or arrays (height, width)."""
+Source = str | Path | Iterable[NDArray]  # a folder of images, a video, or arrays (height, width)
 
 
 @dataclass(frozen=True)

@@ -44,16 +44,14 @@ from cmmsim.measuring.taught import Taught
 from cmmsim.teaching import teaching_path
 from cmmsim.uncertainty.print_errors import PRINT_NAMES, PrintErrors
 
+# Names of all common errors. Errors of the rig are true minus known parameters. Errors of taught
+# frames are small movements from the true to the taught frame, in the axes of base and platform.
 NAMES = (
     *PARAMETER_NAMES,
     *(f"taught.{body}.{name}" for body in ("base", "platform") for name in PLACE_NAMES),
     *PRINT_NAMES,
     "exposure.right_later_s",
 )
-"""Names of all common errors.
-
-Errors of the rig are true minus known parameters. Errors of taught frames are small movements from
-the true to the taught frame, in the axes of base and platform."""
 
 # Number of poses on the teaching path. The path is smooth, so few poses suffice without noise.
 TEACHING_POSES = 8

@@ -21,11 +21,9 @@ from cmmsim.geometry.pose import Array, apply, apply_each, skew, transforms_of
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 
+# Names of the parameters of a common movement of both cameras. The parameters are those of the
+# base's movement in camera axes, with rotations about its origin.
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
-"""Names of the parameters of a common movement of both cameras.
-
-The parameters are those of the base's movement in camera axes, with rotations about its origin.
-"""
 
 # The square of this, px, is added to the stated variance of a centre, which can be too small.
 SMALLEST_STD_PX = 5e-4

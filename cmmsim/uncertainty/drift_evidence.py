@@ -27,16 +27,14 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.drift_blocks import PLACES_OF_RIG, RIG, Rows
 
+# Size of a relevant drift, for each parameter: a tenth of a pixel, 20 um, 20 urad.
 SIZES = np.array(
     [*2 * (*4 * (0.1,), 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *6 * (2e-5,), *len(PLACES_OF_RIG) * (2e-5,)]
 )
-"""Size of a relevant drift, for each parameter: a tenth of a pixel, 20 um, 20 urad."""
 
+# Standard deviations of random walks after WALK_FRAMES frames, in units of SIZES. The rates stand
+# for drifts within hours, minutes and seconds.
 RATES = (0.05, 0.5, 5.0)
-"""Standard deviations of random walks after WALK_FRAMES frames, in units of SIZES.
-
-The rates stand for drifts within hours, minutes and seconds.
-"""
 
 WALK_FRAMES = 1000
 DRIFT_NAMES = (*PARAMETER_NAMES, *PLACES_OF_RIG)

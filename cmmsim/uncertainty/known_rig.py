@@ -17,14 +17,13 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 # symmetry and, per row, to negative eigenvalues.
 ROUNDING = 1e-9
 
+# Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board. With real
+# photographs, the standard deviations were 1 px for focal lengths and 0.5 px for principal points.
+# The other entries are assumed to be consistent with these.
 PHOTOGRAPHED = (
     np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)])
     ** 2
 )
-"""Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board.
-
-With real photographs, the standard deviations were 1 px for focal lengths and 0.5 px for principal
-points. The other entries are assumed to be consistent with these."""
 
 
 @dataclass(frozen=True)

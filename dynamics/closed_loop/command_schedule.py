@@ -15,11 +15,9 @@ import numpy as np
 
 from dynamics.closed_loop.problem import LoopProblem
 
+# Frame, and time since that frame, s. Times are kept in this form so that equal delays give exactly
+# equal spans in all frames.
 Instant = tuple[int, float]
-"""Frame, and time since that frame, s.
-
-Times are kept in this form so that equal delays give exactly equal spans in all frames.
-"""
 
 
 class CommandSchedule(NamedTuple):
@@ -114,8 +112,8 @@ def _schedule(
     )
 
 
+# Difference, s, up to which two instants count as one if the times of frames are given.
 SAME_S = 1e-9
-"""Difference, s, up to which two instants count as one if the times of frames are given."""
 
 
 def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:

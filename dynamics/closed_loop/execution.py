@@ -35,15 +35,16 @@ from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.parameters import LANES
 
+# Names of the robot's functions that kernels call.
 MACHINE_CODE = (
     *("equation_of_motion", "free_acceleration", "response", "rate_map_derivative"),
     *("stage_derivatives", "stop_derivatives", "slope_derivative"),
 )
-"""Names of the robot's functions that kernels call."""
 
+# Kernels that other kernels call by address.
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
-"""Kernels that other kernels call by address."""
 UNSTABLE = " (the loop is unstable)"
+# Reasons why a run ended early, by status. `failure` adds the leg that is out of reach.
 FAILURES = {
     LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
@@ -51,7 +52,6 @@ FAILURES = {
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, and the servo has no command; there",
 }
-"""Reasons why a run ended early, by status. `failure` adds the leg that is out of reach."""
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:

@@ -30,6 +30,7 @@ from dynamics.robot import Robot
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
 
+# Type of a friction law as kernels read it. `law` is the position of its name in `LawName`.
 FRICTION = np.dtype(
     (
         np.record,
@@ -41,7 +42,6 @@ FRICTION = np.dtype(
         ],
     )
 )
-"""Type of a friction law as kernels read it. `law` is the position of its name in `LawName`."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ class FrictionLaw:
         return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
+# Largest product of eigenvalue and step length. The Runge-Kutta method is unstable above 2.8.
 LARGEST_STEP = 1.0
-"""Largest product of eigenvalue and step length. The Runge-Kutta method is unstable above 2.8."""
 
 
 @dataclass(frozen=True)

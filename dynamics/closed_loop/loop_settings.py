@@ -11,10 +11,8 @@ from dynamics.closed_loop.drives import PID, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 
-MAX_DELAY_FRAMES = 60
-"""Largest latency of a command, frames."""
-MAX_STEPS_PER_FRAME = 10_000
-"""Largest number of integration steps in a frame."""
+MAX_DELAY_FRAMES = 60  # largest latency of a command, frames
+MAX_STEPS_PER_FRAME = 10_000  # largest number of integration steps in a frame
 
 Hold = Literal["zero", "linear"]
 

@@ -22,8 +22,7 @@ from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from dynamics.closed_loop.problem import LoopProblem, Sizes
 from dynamics.parameters import LANES, room_for_derivatives
 
-CACHE_LINE = 64
-"""Bytes in a line of the processor's cache."""
+CACHE_LINE = 64  # bytes in a line of the processor's cache
 
 
 class Plan(NamedTuple):
@@ -141,6 +140,7 @@ def record_field(name: str) -> Fields:
     return Fields(name, "record", ())
 
 
+# Fields of each record. `factor` is the L D L^T factorisation of the mass matrix.
 LAYOUT: dict[str, tuple[Fields, ...]] = {
     "task": (
         # addresses of functions of the robot, then of kernels
@@ -277,7 +277,6 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("last_measured integral demand moved", "coordinate", "column"),
     ),
 }
-"""Fields of each record. `factor` is the L D L^T factorisation of the mass matrix."""
 
 
 def _lengths(sizes: Sizes) -> dict[str, int]:

@@ -22,14 +22,9 @@ from dynamics.closed_loop.loop_settings import FrameTiming, LoopSettings, ServoG
 from dynamics.closed_loop.start_state import check_start_pose, checked_loop_parameters
 from dynamics.robot import Robot
 
-SLOWEST_HZ = 0.5
-"""Lowest frame rate, Hz, in the search for the limit of stability."""
-
-MOST_GAIN = 100.0
-"""Largest factor of the gains in the search for the limit of stability."""
-
-SEARCH_RATIO = 1.1
-"""Ratio of consecutive values in both searches, before bisection finds the limit."""
+SLOWEST_HZ = 0.5  # lowest frame rate, Hz, in the search for the limit of stability
+MOST_GAIN = 100.0  # largest factor of the gains in the search for the limit of stability
+SEARCH_RATIO = 1.1  # ratio of consecutive values in both searches, before bisection finds the limit
 
 
 def frame_map(

@@ -32,14 +32,11 @@ NO_MARGIN = 1e-12
 TORQUE_ROUNDING = 1e-13
 
 
+# Purposes of the step that is being tried. TAKEN: the last step was accepted, and no step is being
+# tried. WHOLE: the step may be accepted. HALF: half the step, to see whether modes are broken in
+# between. AGAIN: the whole step again, after half of it broke no mode. BRACKET: a step in search of
+# the beginning of the bracket of an event. CROSSING: a step that ends at the estimated event.
 TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
-"""Purposes of the step that is being tried.
-
-TAKEN: the last step was accepted, and no step is being tried. WHOLE: the step may be accepted.
-HALF: half the step, to see whether modes are broken in between. AGAIN: the whole step again, after
-half of it broke no mode. BRACKET: a step in search of the beginning of the bracket of an event.
-CROSSING: a step that ends at the estimated event.
-"""
 
 
 @kernel

@@ -183,8 +183,7 @@ class _KernelCache:
         return f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.kernel"
 
 
-_at_address: dict[int, Any] = {}
-"""Kernels for which `address` has been called, by address."""
+_at_address: dict[int, Any] = {}  # kernels for which `address` has been called, by address
 
 
 def address(compiled: Any, *arguments: object) -> int:
@@ -242,8 +241,8 @@ def _call_columns(context: Any, address: Any, common: Any, rows: Any, into: Any,
     return types.void(address, common, rows, into, types.int64), code
 
 
+# Calls an entry by its address with four records and a number, and returns its status.
 invoke: Any = intrinsic(_invoke)
-"""Calls an entry by its address with four records and a number, and returns its status."""
 
 
 def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
@@ -274,22 +273,14 @@ def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
     return types.void(types.float64, row, into, types.int64), code
 
 
+# Calls a `MachineFunction` by its address, with the memory of its inputs and outputs.
 call: Any = intrinsic(_call)
-"""Calls a `MachineFunction` by its address, with the memory of its inputs and outputs."""
-
-
+# Calls a `ColumnFunction` by its address. The arguments are the address, the inputs common to all
+# columns, the first row of the other inputs, the first row of outputs, and the number of columns.
 call_columns: Any = intrinsic(_call_columns)
-"""Calls a `ColumnFunction` by its address.
-
-The arguments are the address, the inputs common to all columns, the first row of the other inputs,
-the first row of outputs, and the number of columns.
-"""
-
+# Adds a factor times a row to another row. The number of columns must be a multiple of the vector
+# length.
 add_row: Any = intrinsic(_add_row)
-"""Adds a factor times a row to another row.
-
-The number of columns must be a multiple of the vector length.
-"""
 
 
 def _invoke_plain(address: int, *arguments: Any) -> int:

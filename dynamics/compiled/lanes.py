@@ -17,8 +17,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+# Names of CasADi's operations, by number.
 NAMES = {getattr(ca, name): name.removeprefix("OP_") for name in dir(ca) if name.startswith("OP_")}
-"""Names of CasADi's operations, by number."""
 
 LEAVES = ("CONST", "INPUT")
 
@@ -116,8 +116,8 @@ class Graph:
     outputs: list[list[int]]
 
 
+# Number of a step in the same group, or numbers of values outside it, one for each lane.
 Operand = int | tuple[int, ...]
-"""Number of a step in the same group, or numbers of values outside it, one for each lane."""
 
 
 class Group(NamedTuple):

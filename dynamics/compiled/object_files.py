@@ -16,17 +16,11 @@ import platformdirs
 DIGEST = sha256().digest_size
 
 DAY = 24 * 3600.0  # s
-KEPT = 60 * DAY
-"""Time, s, for which a file is kept after its last use."""
-
+KEPT = 60 * DAY  # time, s, for which a file is kept after its last use
+# Endings of the files in this cache. Files with the last ending are not yet complete.
 KINDS = (".kernel", ".robot", ".half")
-"""Endings of the files in this cache. Files with the last ending are not yet complete."""
-
+# Flags with which files are opened. Without O_NONBLOCK, opening a pipe would wait for a writer.
 OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-"""Flags with which files are opened.
-
-Without O_NONBLOCK, opening a pipe would wait for a writer.
-"""
 
 
 class CacheWarning(UserWarning):

@@ -3,12 +3,12 @@
 import struct
 from functools import cache
 
-MOST_LANES = 8
-"""Number of doubles in the widest register of present processors."""
-
+MOST_LANES = 8  # number of doubles in the widest register of present processors
+# Instruction that makes a number, 0 or 1, from a bit: CasADi's conditions are numbers.
 TRUTH = "uitofp {i1} {last} to {double}"
-"""Instruction that makes a number, 0 or 1, from a bit: CasADi's conditions are numbers."""
 
+# LLVM instructions for each CasADi operation. {last} is the result of the instruction before, and
+# {before} is the result of the one before that.
 MEANING: dict[str, tuple[str, ...]] = {
     "ADD": ("fadd {double} {0}, {1}",),
     "SUB": ("fsub {double} {0}, {1}",),
@@ -34,29 +34,23 @@ MEANING: dict[str, tuple[str, ...]] = {
         "select {i1} {last}, {double} {minus}, {double} {before}",
     ),
 }
-"""LLVM instructions for each CasADi operation.
 
-{last} is the result of the instruction before, and {before} is the result of the one before that.
-"""
-
+# LLVM instructions for operations whose first operand is a bit, {last}.
 OF_TRUTH: dict[str, tuple[str, ...]] = {
     "NOT": ("xor {i1} {last}, {true}", TRUTH),
     "IF_ELSE_ZERO": MEANING["IF_ELSE_ZERO"][1:],
 }
-"""LLVM instructions for operations whose first operand is a bit, {last}."""
 
+# LLVM functions that also exist for vectors. FMA (fused multiply-add) computes a product and a sum
+# with one rounding. CasADi has no such operation.
 OF_VECTORS = {
     **{name: f"llvm.{name.lower()}" for name in ("SQRT", "FABS", "FLOOR", "CEIL")},
     "FMIN": "llvm.minnum",
     "FMAX": "llvm.maxnum",
     "FMA": "llvm.fma",
 }
-"""LLVM functions that also exist for vectors.
 
-FMA (fused multiply-add) computes a product and a sum with one rounding. CasADi has no such
-operation.
-"""
-
+# Functions of LLVM and of the C library, by operation.
 CALLED = {
     **{name: f"{called}.f64" for name, called in OF_VECTORS.items()},
     **{name: f"llvm.{name.lower()}.f64" for name in ("SIN", "COS", "EXP", "LOG", "POW")},
@@ -66,7 +60,6 @@ CALLED = {
     },
     "CONSTPOW": "llvm.pow.f64",
 }
-"""Functions of LLVM and of the C library, by operation."""
 
 
 def type_name(width: int, of: str = "double") -> str:

@@ -20,12 +20,12 @@ import numpy as np
 
 from dynamics.compiled.lanes import Graph, Node, graph_of
 
+# Parts of pi / 2. Integer multiples of the first two parts have no rounding error.
 HALF_PI = (
     2 * 7.85398125648498535156e-1,
     2 * 3.77489470793079817668e-8,
     2 * 2.69515142907905952645e-15,
 )
-"""Parts of pi / 2. Integer multiples of the first two parts have no rounding error."""
 
 SINE = (
     *(-1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4),
@@ -39,15 +39,13 @@ ARCTANGENT = (
     *(-6.485021904942025371773e1, -1.228866684490136173410e2, -7.500855792314704667340e1),
     *(-1.615753718733365076637e1, -8.750608600031904122785e-1),
 )
+# Coefficients of polynomials in the square of the reduced argument, beginning with the constant.
 ARCTANGENT_DIVISOR = (
     *(1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2),
     *(1.650270098316988542046e2, 2.485846490142306297962e1, 1.0),
 )
-"""Coefficients of polynomials in the square of the reduced argument, beginning with the constant.
-"""
 
-LEAST_TURNED = 0.66
-"""Tangent above which pi / 4 is subtracted from the angle."""
+LEAST_TURNED = 0.66  # tangent above which pi / 4 is subtracted from the angle
 
 
 def quickened(graph: Graph) -> Graph:

@@ -30,14 +30,10 @@ from dynamics.control.law_interface import Assignment, Feedback, LawInLoop
 from dynamics.control.observer import Estimate
 from dynamics.kinematics.platform import Chart
 
-INTEGRAL_FACTOR = 0.2
-"""Factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer."""
-
+INTEGRAL_FACTOR = 0.2  # factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer
+# Ratio to the bandwidth of the rate at which the subtracted disturbance follows the estimate. A
+# higher rate would mainly pass noise on to the robot.
 FOLLOWING_RATE = 1.0
-"""Ratio to the bandwidth of the rate at which the subtracted disturbance follows the estimate.
-
-A higher rate would mainly pass noise on to the robot.
-"""
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
 

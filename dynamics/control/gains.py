@@ -21,14 +21,12 @@ from dynamics.control.law_interface import Feedback
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
+# Ratio of the error to the desired motion at the frequency that is the bandwidth.
 HALF_POWER = 2**-0.5
-"""Ratio of the error to the desired motion at the frequency that is the bandwidth."""
-DECAYED = 1e-3
-"""Magnitude of eigenvalues below which a motion has decayed within a frame."""
-SLOWEST = 1e-2
-"""Lowest frequency, rad/s, in the search for a bandwidth."""
+DECAYED = 1e-3  # magnitude of eigenvalues below which a motion has decayed within a frame
+SLOWEST = 1e-2  # lowest frequency, rad/s, in the search for a bandwidth
+# Tolerance of a design, both for the ratio of its error to HALF_POWER and for its damping.
 DESIGN_TOLERANCE = 0.02
-"""Tolerance of a design, both for the ratio of its error to HALF_POWER and for its damping."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +102,13 @@ def design_servo(
     return servo(best.x)
 
 
+# Lowest natural frequencies, rad/s, of designed drives, in the order in which they are tried. The
+# first is that of the built-in robots.
 DRIVE_FREQUENCIES = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
-"""Lowest natural frequencies, rad/s, of designed drives, in the order in which they are tried.
-
-The first is that of the built-in robots.
-"""
+# Damping ratios at the lowest natural frequency of designed drives, in the order of trial.
 DRIVE_DAMPINGS = (0.35, 0.5, 0.7)
-"""Damping ratios at the lowest natural frequency of designed drives, in the order of trial."""
-INTEGRAL_RATE = 1.1
-"""Ratio li / lp of designed drives, 1/s, as in the paper."""
-WANTED_MARGIN = 1.5
-"""Gain margin of the servo at which the search for drives ends."""
+INTEGRAL_RATE = 1.1  # ratio li / lp of designed drives, 1/s, as in the paper
+WANTED_MARGIN = 1.5  # gain margin of the servo at which the search for drives ends
 
 
 @dataclass(frozen=True)

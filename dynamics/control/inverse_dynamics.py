@@ -9,22 +9,15 @@ from dynamics.closed_loop.drives import Drives
 from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
+# Nodes and weights of Gauss-Legendre quadrature over a span. The time of a reversal of friction is
+# resolved to about an eighth of the span.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-"""Nodes and weights of Gauss-Legendre quadrature over a span.
+GUESSED_DOUBT = 0.2  # value of `Model.doubt` for a guessed model, 1/s
 
-The time of a reversal of friction is resolved to about an eighth of the span.
-"""
-
-
-GUESSED_DOUBT = 0.2
-"""Value of `Model.doubt` for a guessed model, 1/s."""
-
+# Value of `Model.doubt` for a model that fits measured data, 1/s. The covariances of identified
+# parameters give 3.3e-4 to 5.4e-4 for three robots, at 29 and 60 Hz, along validation motions
+# without reversals.
 FITTED_DOUBT = 4e-4
-"""Value of `Model.doubt` for a model that fits measured data, 1/s.
-
-The covariances of identified parameters give 3.3e-4 to 5.4e-4 for three robots, at 29 and 60 Hz,
-along validation motions without reversals.
-"""
 
 
 class Motion(Protocol):

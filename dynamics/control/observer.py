@@ -22,38 +22,23 @@ from dynamics.control.inverse_dynamics import Model
 from dynamics.control.prediction import Prediction
 from dynamics.errors import SimulationError
 
+# Longest step of the prediction, s. Dry friction can reverse a joint within milliseconds.
 LONGEST_STEP = 3e-3
-"""Longest step of the prediction, s. Dry friction can reverse a joint within milliseconds."""
-
-PLACE_DOUBT = 1e-4
-"""Standard deviation of the coordinates at the start, m and rad."""
-
-RATE_DOUBT = 1e-5
-"""Standard deviation of the rates of the coordinates at the start, m/s and rad/s."""
-
+PLACE_DOUBT = 1e-4  # standard deviation of the coordinates at the start, m and rad
+RATE_DOUBT = 1e-5  # standard deviation of the rates of the coordinates at the start, m/s and rad/s
+# Standard deviation of the unknown torque at the start, relative to the torque at rest.
 TORQUE_DOUBT = 1e-3
-"""Standard deviation of the unknown torque at the start, relative to the torque at rest."""
-
+# Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s.
 VISCOUS_DOUBT = 5.0
-"""Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s."""
-
+# Ratio of the model error with torque commands to the model error with joint commands. With torque
+# commands, an error of a factor that all parameters share has an effect, too.
 TORQUE_COMMAND_FACTOR = 2.0
-"""Ratio of the model error with torque commands to the model error with joint commands.
-
-With torque commands, an error of a factor that all parameters share has an effect, too.
-"""
-
+# Time constant, s, with which information from earlier innovations about the scales fades. Far from
+# the solution the gradient is different, so that old information slows down convergence.
 MEMORY_TIME = 2.0
-"""Time constant, s, with which information from earlier innovations about the scales fades.
-
-Far from the solution the gradient is different, so that old information slows down convergence.
-"""
-
+# Prior information about the logarithms of the scales of the walk and of the noise.
 PRIOR_INFORMATION = (0.3, 200.0)
-"""Prior information about the logarithms of the scales of the walk and of the noise."""
-
-SAME_TIME = 1e-9
-"""Difference, in frame periods, below which two instants count as the same."""
+SAME_TIME = 1e-9  # difference, in frame periods, below which two instants count as the same
 
 
 @dataclass(frozen=True)

@@ -24,23 +24,16 @@ from scipy.special import ndtr
 from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.inverse_dynamics import Model
 
+# Largest number of iterations of Newton's method for the friction of all joints.
 MOST_ITERATIONS = 12
-"""Largest number of iterations of Newton's method for the friction of all joints."""
-
+# Ratio of a joint's friction error to the largest friction, below which the iterations end.
 FRICTION_TOLERANCE = 1e-6
-"""Ratio of a joint's friction error to the largest friction, below which the iterations end."""
-
+# Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly.
 LEAST_WIDTH = 1e-9
-"""Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly."""
-
-SHORTEST_HALVED = 1.5e-3
-"""Length, s, below which a step in which a joint reverses is not halved."""
-
+SHORTEST_HALVED = 1.5e-3  # length, s, below which a step in which a joint reverses is not halved
+# Smallest ratio of the velocity change by dry friction to the velocity's standard deviation. It is
+# above zero because it is a divisor.
 LEAST_REACH = 1e-3
-"""Smallest ratio of the velocity change by dry friction to the velocity's standard deviation.
-
-It is above zero because it is a divisor.
-"""
 
 
 class StateSlices(NamedTuple):

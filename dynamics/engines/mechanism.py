@@ -13,14 +13,10 @@ import numpy as np
 from dynamics.errors import RobotFileError
 from dynamics.legs.chain import SAME, Chain
 
-BASE = 0
-"""Number of the body that is fixed to the ground."""
-
+BASE = 0  # number of the body that is fixed to the ground
+# Fraction of the total mass below which a body between two hinges counts as part of a joint. Such a
+# body has a small mass only because engines require one.
 HUB_MASS_RATIO = 1e-4
-"""Fraction of the total mass below which a body between two hinges counts as part of a joint.
-
-Such a body has a small mass only because engines require one.
-"""
 
 
 class Shape(NamedTuple):

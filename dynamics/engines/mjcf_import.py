@@ -19,8 +19,7 @@ from dynamics.files import LARGEST_XML, parse_xml, read_bytes
 from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
-MOST_BODIES = 120
-"""Largest number of bodies of a robot."""
+MOST_BODIES = 120  # largest number of bodies of a robot
 
 
 def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:

@@ -37,27 +37,21 @@ from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import MOMENTS
 
+# Fraction of the largest moment below which products of inertia count as rounding errors.
 ROUNDING = 1e-9
-"""Fraction of the largest moment below which products of inertia count as rounding errors."""
 
+# Largest sin(beta) at home. Near 1 the angles are singular, because alpha and gamma turn about the
+# same axis. If the platform is tilted further, its axes are reordered to be nearest to those of the
+# base.
 MOST_TILT = 0.9
-"""Largest sin(beta) at home.
 
-Near 1 the angles are singular, because alpha and gamma turn about the same axis. If the platform is
-tilted further, its axes are reordered to be nearest to those of the base.
-"""
-
+# Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID.
 DEFAULT_FREQUENCY = 2 * np.pi * 3
-"""Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID."""
-
+# Damping ratio of the joint with the least inertia, if a file states no joint PID.
 DEFAULT_DAMPING = 0.7
-"""Damping ratio of the joint with the least inertia, if a file states no joint PID."""
-
-DEFAULT_TRAVEL = 0.5
-"""Travel beyond the home coordinates if a file states no joint ranges, rad."""
-
+DEFAULT_TRAVEL = 0.5  # travel beyond the home coordinates if a file states no joint ranges, rad
+# Ratio of the travel of sliding actuators to the distance from B to A, if a file has no ranges.
 DEFAULT_TRAVEL_RATIO = 0.1
-"""Ratio of the travel of sliding actuators to the distance from B to A, if a file has no ranges."""
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:

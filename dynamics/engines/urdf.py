@@ -18,8 +18,8 @@ from dynamics.kinematics.platform import base_from_platform
 from dynamics.pseudo_inertia import about_centre
 from dynamics.robot import Robot
 
+# Origin (3,), m, and axes (3, 3) of each link, in the axes of the base.
 Places = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Origin (3,), m, and axes (3, 3) of each link, in the axes of the base."""
 
 
 def urdf_texts(

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from dynamics.engines.mechanism import Shape
 from dynamics.errors import RobotFileError
 
-FOLDERS_ABOVE = 4
-"""Number of folders above that of the URDF file that are searched for a package."""
+FOLDERS_ABOVE = 4  # number of folders above that of the URDF file that are searched for a package
 
 
 def mesh_shapes(link: Xml.Element, place: np.ndarray, folder: Path) -> tuple[Shape, ...]:

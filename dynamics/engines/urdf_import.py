@@ -36,21 +36,16 @@ from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+# Largest number of links, and of joints, of a robot. The largest example has about forty.
 MOST = 120
-"""Largest number of links, and of joints, of a robot. The largest example has about forty."""
-
+# Largest number of all joint coordinates. The time to close loops grows with its square.
 MOST_COORDINATES = 90
-"""Largest number of all joint coordinates. The time to close loops grows with its square."""
-
-MOST_ITERATIONS = 60
-"""Largest number of iterations to close the loops. About ten are usual."""
-
-GRAVITY = np.array([0.0, 0.0, -9.81])
-"""Gravity, m/s^2, which URDF does not state."""
-
+MOST_ITERATIONS = 60  # largest number of iterations to close the loops. About ten are usual.
+GRAVITY = np.array([0.0, 0.0, -9.81])  # gravity, m/s^2, which URDF does not state
+# Number of coordinates of each kind of joint.
 COORDINATES = {"hinge": 1, "slide": 1, "ball": 3, "weld": 0, "universal": 2, "floating": 6}
-"""Number of coordinates of each kind of joint."""
 
+# Kind of joint for each joint type of URDF.
 KINDS = {
     "revolute": "hinge",
     "continuous": "hinge",
@@ -58,7 +53,6 @@ KINDS = {
     "fixed": "weld",
     "floating": "floating",
 }
-"""Kind of joint for each joint type of URDF."""
 
 
 @dataclass(frozen=True)

@@ -31,15 +31,11 @@ CLOSED = 1e-14
 SAME = 1e-5
 
 
+# Compiled functions of a robot. `loop_closure` and `inverse_kinematics` are needed.
 Functions = Mapping[str, MachineFunction]
-"""Compiled functions of a robot. `loop_closure` and `inverse_kinematics` are needed."""
-
+# Function of poses (N, 6) and joint coordinates (N, n). It returns the gaps of the loops (N, n, 1),
+# m^2, and their derivatives (N, n, n) with respect to the coordinates of the platform.
 Closure = Callable[[np.ndarray, np.ndarray], Sequence[np.ndarray]]
-"""Function of poses (N, 6) and joint coordinates (N, n).
-
-It returns the gaps of the loops (N, n, 1), m^2, and their derivatives (N, n, n) with respect to the
-coordinates of the platform.
-"""
 
 
 @dataclass(frozen=True)

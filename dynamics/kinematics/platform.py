@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 POSE_NAMES = ("x", "y", "z", "alpha", "beta", "gamma")
 POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+# Entries of the pose that a platform can change, for each name of a chart.
 FREEDOMS = {"free": (0, 1, 2, 3, 4, 5), "translation": (0, 1, 2), "planar": (0, 1, 5)}
-"""Entries of the pose that a platform can change, for each name of a chart."""
 
 
 def rotation_matrix(angles: ca.SX) -> ca.SX:

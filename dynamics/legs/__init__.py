@@ -12,6 +12,7 @@ from dynamics.legs.ups import UpsLeg
 
 AnyLeg = RssLeg | RusLeg | UpsLeg | PssLeg | PusLeg | ParallelogramLeg | RrrLeg
 
+# Kinds of legs by the name that robot files give them.
 KINDS: dict[str, type[Leg]] = {
     "rss": RssLeg,
     "rus": RusLeg,
@@ -21,4 +22,3 @@ KINDS: dict[str, type[Leg]] = {
     "parallelogram": ParallelogramLeg,
     "rrr": RrrLeg,
 }
-"""Kinds of legs by the name that robot files give them."""

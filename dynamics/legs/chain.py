@@ -14,11 +14,9 @@ from dynamics.legs.pss import PssLeg, PusLeg
 from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
+# Difference of angles, rad, and distances, m, below which they count as equal. It allows for
+# numbers that are written with few digits.
 SAME = 1e-6
-"""Difference of angles, rad, and distances, m, below which they count as equal.
-
-It allows for numbers that are written with few digits.
-"""
 
 
 class Chain(NamedTuple):
@@ -212,6 +210,7 @@ def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> 
         )
 
 
+# Kinds of legs by their joints from the base on, each with the function that gives its fields.
 SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
     "hinge* ball ball": (RssLeg, _cranked),
     "hinge* universal ball": (RusLeg, _with_universal_joint),
@@ -222,4 +221,3 @@ SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
     "hinge* hinge hinge": (RrrLeg, _planar),
     "hinge* hinge ball": (RrrLeg, _planar),
 }
-"""Kinds of legs by their joints from the base on, each with the function that gives its fields."""

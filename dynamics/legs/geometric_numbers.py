@@ -20,11 +20,9 @@ from dynamics.kinematics.platform import rotation_matrix
 from dynamics.legs.leg import Leg
 
 AnyKind = TypeVar("AnyKind", bound=Leg)
+# Fields of a leg that are points, whose coordinates are geometric numbers.
 POINTS = ("base_joint", "platform_joint")
-"""Fields of a leg that are points, whose coordinates are geometric numbers."""
-
-MOST_NUMBERS = 11
-"""Largest number of geometric numbers of a leg of any built-in kind."""
+MOST_NUMBERS = 11  # largest number of geometric numbers of a leg of any built-in kind
 
 
 def unit_of(number: str) -> str:

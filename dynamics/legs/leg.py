@@ -43,13 +43,11 @@ def _vector(value: object) -> np.ndarray:
     return array
 
 
+# Largest error of the length of a direction, or of a right angle, in a file. Directions can thus be
+# written with four decimals or more.
 ROUNDED = 1e-4
-"""Largest error of the length of a direction, or of a right angle, in a file.
-
-Directions can thus be written with four decimals or more.
-"""
+# Largest error of a length or of a right angle that counts as rounding and is not corrected.
 EXACT = 1e-12
-"""Largest error of a length or of a right angle that counts as rounding and is not corrected."""
 
 
 def _direction(value: object) -> np.ndarray:
@@ -61,11 +59,9 @@ def _direction(value: object) -> np.ndarray:
     return array if abs(length - 1.0) < EXACT else _vector(array / length)
 
 
+# Largest rotation of a body per motion of A, rad/m. No real machine exceeds it. In a singular pose,
+# rounding gives about 1e15 instead of infinity.
 MOST_TURNING = 1e6
-"""Largest rotation of a body per motion of A, rad/m.
-
-No real machine exceeds it. In a singular pose, rounding gives about 1e15 instead of infinity.
-"""
 
 _NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
 Point = Annotated[np.ndarray, PlainValidator(_vector), WithJsonSchema(_NUMBERS)]

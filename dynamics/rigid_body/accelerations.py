@@ -13,8 +13,7 @@ from dynamics.compiled.lanes import ColumnFunction
 from dynamics.expressions import function
 from dynamics.parameters import LANES, ParameterLayout
 
-STAGES = 4
-"""Number of stages of a step of the integrator."""
+STAGES = 4  # number of stages of a step of the integrator
 
 
 def free_acceleration(size: int, joints: int) -> ca.Function:

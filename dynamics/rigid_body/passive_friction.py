@@ -18,8 +18,7 @@ from dynamics.geometry import AnyGeometry, RobotGeometry
 from dynamics.parameter_units import PASSIVE_JOINT
 from dynamics.rigid_body.jacobians import platform_arms
 
-SLOW = 0.02
-"""Relative angular velocity, rad/s, below which dry friction of a passive joint fades."""
+SLOW = 0.02  # relative angular velocity, rad/s, below which dry friction of a passive joint fades
 
 
 def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:

@@ -23,18 +23,11 @@ if TYPE_CHECKING:
 
 Better = Literal["lower", "higher"]
 BETTER: tuple[str, ...] = get_args(Better)
+# Name of the user properties that carry the figures in the reports of tests.
 PROPERTY = "cmmsim_accuracy"
-"""Name of the user properties that carry the figures in the reports of tests."""
-
-CONFIDENCE = 0.95
-"""Probability with which the interval of a sample contains the true mean."""
-
-
-FIRST = 20
-"""Number of values that `Accuracy.sample_until` draws first."""
-
-MOST = 640
-"""Default of the largest number of values that it draws."""
+CONFIDENCE = 0.95  # probability with which the interval of a sample contains the true mean
+FIRST = 20  # number of values that `Accuracy.sample_until` draws first
+MOST = 640  # default of the largest number of values that it draws
 
 
 class AccuracyError(IdentifyError):

@@ -17,8 +17,7 @@ from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure
 
 Row = tuple[str, ...]
 UNDECIDED = "undecided"
-FOLDER = ".accuracy"
-"""Folder of the saved figures."""
+FOLDER = ".accuracy"  # folder of the saved figures
 HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit", "margin")
 
 
@@ -104,13 +103,13 @@ def _full_name(figure: Figure) -> str:
     return f"{figure.name} [{parameters}" if name and bracket else figure.name
 
 
+# Words for a test that did not measure a saved figure, by its outcome.
 WHY_MISSING = {
     None: "did not run",
     "passed": "passed without",
     "skipped": "was skipped",
     "failed": "failed",
 }
-"""Words for a test that did not measure a saved figure, by its outcome."""
 
 
 class AccuracySession:

@@ -56,8 +56,8 @@ Examples:
   cmmsim COMMAND --help                files and exit status of a command
 """
 
+# Error numbers of a full disk, an exhausted quota, and a file above the size limit.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk, an exhausted quota, and a file above the size limit."""
 
 app = typer.Typer(
     name="cmmsim",

@@ -21,8 +21,8 @@ from identify.progress import print_table, terminal_progress
 if TYPE_CHECKING:
     from identify.verification.finding import Finding
 
+# Options for robots. A record states its own scenario.
 OF_ROBOTS = ("--scenario", "--parameters", "--set")
-"""Options for robots. A record states its own scenario."""
 
 
 def check(

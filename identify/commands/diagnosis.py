@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from identify.diagnosis.diagnosis import Diagnosis
     from identify.estimation.budget import Budget
 
-SHOWN = 12
-"""Number of candidates that the table has."""
+SHOWN = 12  # number of candidates that the table has
 
 HEADER = ("cause or group", "explains\n%", "statistic", "free\nnumbers", "chance", "size", "unit")
 
@@ -131,8 +130,8 @@ def budget(
     tell(found.to_dict(), json, quiet, lambda: _print_budget(found, identified, folder))
 
 
+# First of three entries of a pose whose mean variance is a column of the table.
 GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
-"""First of three entries of a pose whose mean variance is a column of the table."""
 
 
 def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:

@@ -12,6 +12,7 @@ NOT_DONE = 1
 MISUSED = 2
 ROWS_FAILED = 3
 BEYOND_LIMIT = 4
+# Meaning of every exit status, the same in all commands.
 STATUSES = {
     DONE: "The command succeeded.",
     NOT_DONE: "The command failed; one line on standard error says why.",
@@ -22,10 +23,8 @@ STATUSES = {
     "standard error names it.",
     STOPPED: "Ctrl-C stopped the command.",
 }
-"""Meaning of every exit status, the same in all commands."""
 
-OTHERS = "Further commands"
-"""Title of the commands that have no group of their own."""
+OTHERS = "Further commands"  # title of the commands that have no group of their own
 
 
 class Command(TyperCommand):

@@ -48,8 +48,7 @@ def _length(what: str) -> Any:
 
 Length = float | None
 
-PROBABLY_MM = 20.0
-"""Length, m, from which the message about an impossible robot asks for the unit."""
+PROBABLY_MM = 20.0  # length, m, from which the message about an impossible robot asks for the unit
 
 
 @new.command(cls=Command)

@@ -14,16 +14,15 @@ from identify.files.atomic import write_text
 from identify.files.run_folder import as_json
 from identify.scenario import Scenario, load_scenario
 
+# Package and folder of the built-in files of each kind.
 BUILT_IN = {
     "robot": ("dynamics", "robots"),
     "sensor": ("cmmsim", "files/sensors"),
     "scenario": ("identify", "scenario/built_in"),
     "study": ("identify", "studies/built_in"),
 }
-"""Package and folder of the built-in files of each kind."""
 
-STANDARD_OUTPUT = "-"
-"""File name that means standard output."""
+STANDARD_OUTPUT = "-"  # file name that means standard output
 
 
 def built_in_folder(kind: str) -> Path:
@@ -123,8 +122,7 @@ EstimatorSettings = Annotated[
         "the record was made with them.",
     ),
 ]
-MOST_WORKERS = 1000
-"""Largest number of processes that a command starts."""
+MOST_WORKERS = 1000  # largest number of processes that a command starts
 
 Workers = Annotated[
     int | None,
@@ -150,6 +148,7 @@ def _allow(modules: list[str] | None) -> None:
     allow_plugin(*modules or ())
 
 
+# Modules of the user's own parts. They are allowed as soon as the option is read.
 Plugins = Annotated[
     list[str] | None,
     typer.Option(
@@ -162,7 +161,6 @@ Plugins = Annotated[
         f"repeatable. The variable {ALLOWED} names such modules for all commands.",
     ),
 ]
-"""Modules of the user's own parts. They are allowed as soon as the option is read."""
 
 
 def allow_named(names: list[str] | None) -> None:

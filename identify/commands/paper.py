@@ -16,11 +16,9 @@ if TYPE_CHECKING:
     from identify.paper.exhibit import PaperRuns
     from identify.setup import Setup
 
-OURS = "paper"
-"""Scenario with our own search and filter, and the folder of its run."""
-
+OURS = "paper"  # scenario with our own search and filter, and the folder of its run
+# Scenario with the paper's search and filter, and the folder of its run.
 SETTINGS = "paper_settings"
-"""Scenario with the paper's search and filter, and the folder of its run."""
 
 REPLAY = "replay.html"
 

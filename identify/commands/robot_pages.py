@@ -18,14 +18,10 @@ if TYPE_CHECKING:
     from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
-THRESHOLD = 1e-3
-"""Magnitude of an entry of R below which the paper counts it as zero (section 4.2)."""
-
-PAPERS = "rss6"
-"""Robot of the paper. The paper's numbers are printed only with this robot."""
-
+THRESHOLD = 1e-3  # magnitude of an entry of R below which the paper counts it as zero (section 4.2)
+PAPERS = "rss6"  # robot of the paper. The paper's numbers are printed only with this robot.
+# Decimal exponents of the force units in which the paper's threshold is tried: N, kN, MN.
 DECADES = (0, 3, 6)
-"""Decimal exponents of the force units in which the paper's threshold is tried: N, kN, MN."""
 
 
 def base_parameters(

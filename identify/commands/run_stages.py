@@ -37,8 +37,8 @@ from identify.files.run_folder import (
 from identify.progress import print_warnings, terminal_progress
 from identify.runtime import interruptible_imports
 
+# Files that the first two stages write.
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
-"""Files that the first two stages write."""
 
 
 def run(

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from identify.studies.runner import Outcome, Workers
     from identify.studies.study_file import Study
 
-MANY_ROWS = 100_000
-"""Number of rows above which a study must be confirmed."""
+MANY_ROWS = 100_000  # number of rows above which a study must be confirmed
 
 
 def study(

@@ -46,11 +46,8 @@ from identify.estimators.least_squares import (
 )
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
-MAX_ITERATIONS = 10
-"""Largest number of simulated runs."""
-
-STEP_TOLERANCE = 0.05
-"""Largest last step of every parameter, as a share of its standard deviation."""
+MAX_ITERATIONS = 10  # largest number of simulated runs
+STEP_TOLERANCE = 0.05  # largest last step of every parameter, as a share of its standard deviation
 
 
 @estimator("torque, IV", uses="poses, torque")
@@ -116,17 +113,12 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
     ).matrix
 
 
+# Number of disturbed copies of a record. Few are enough, because each has thousands of rows.
 DRAWS = 4
-"""Number of disturbed copies of a record. Few are enough, because each has thousands of rows."""
-
-SHOWN = 3.0
-"""Factor by which the motion must determine a direction better than the prior."""
-
+SHOWN = 3.0  # factor by which the motion must determine a direction better than the prior
+# Smallest last entry of the singular vector, relative to its largest, that gives a solution. The
+# last entry belongs to the right side of the equations.
 NOT_GENERIC = 1e-12
-"""Smallest last entry of the singular vector, relative to its largest, that gives a solution.
-
-The last entry belongs to the right side of the equations.
-"""
 
 
 @estimator("torque, total LS", uses="poses, torque")

@@ -146,8 +146,8 @@ def _check_estimate(part: str, found: object, evidence: Evidence) -> None:
             raise EstimationError(f"{part} must return finite {name} {shape}")
 
 
+# Attributes of joint channels with the standard deviation of a measured torque or force.
 TORQUE_NOISE = ("torque_noise_N_m", "force_noise_N")
-"""Attributes of joint channels with the standard deviation of a measured torque or force."""
 
 
 def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:

@@ -35,11 +35,9 @@ from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
 from identify.model.loop_model import LoopModel
 
+# Prior standard deviation of the torques at the start, N m, so large that it has no effect.
 UNKNOWN_TORQUE = 1e3
-"""Prior standard deviation of the torques at the start, N m, so large that it has no effect."""
-
-UNKNOWN_FORCE = 1e6
-"""Prior standard deviation of the forces at the start, N, of joints that slide."""
+UNKNOWN_FORCE = 1e6  # prior standard deviation of the forces at the start, N, of joints that slide
 
 
 @dataclass(frozen=True)
@@ -141,8 +139,7 @@ def nearest_admissible(
     return np.maximum(solved.x * scale, lower)
 
 
-SMALLEST_NOISE_N_M = 1e-9
-"""Smallest standard deviation of a row, which avoids a division by zero."""
+SMALLEST_NOISE_N_M = 1e-9  # smallest standard deviation of a row, which avoids a division by zero
 
 
 @estimator("torque, LS", uses="poses, torque")

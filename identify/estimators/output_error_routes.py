@@ -18,8 +18,7 @@ from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.progress import SilentProgress
 from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 
-KNOWN = 1e-6
-"""Relative standard deviation of a known gain."""
+KNOWN = 1e-6  # relative standard deviation of a known gain
 
 
 @estimator("output error, unknown PID", uses="poses")

@@ -21,8 +21,8 @@ from identify.random_streams import SEARCH, child
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
+# Factor by which limits are sampled more finely here than during a search.
 COMPARISON_REFINEMENT = 10
-"""Factor by which limits are sampled more finely here than during a search."""
 
 
 @dataclass(frozen=True)

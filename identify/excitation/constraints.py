@@ -38,11 +38,9 @@ from identify.loop_parameters import of_actuators
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of
 
+# Number of stickers per plane that must be visible to both cameras at every pose. If a plane has
+# fewer stickers, all of them must be visible.
 STICKERS_A_PLANE = 4
-"""Number of stickers per plane that must be visible to both cameras at every pose.
-
-If a plane has fewer stickers, all of them must be visible.
-"""
 
 PLANES = "ABC"
 
@@ -141,8 +139,8 @@ def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
     )
 
 
+# Number of squarings of J^T J. The Schatten norm near the 2-norm has p = 2^(SQUARINGS + 1).
 SQUARINGS = 6
-"""Number of squarings of J^T J. The Schatten norm near the 2-norm has p = 2^(SQUARINGS + 1)."""
 
 
 def condition_number(matrix: ca.SX) -> ca.SX:

@@ -43,11 +43,9 @@ from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
 SMOOTHING_RAD_S = 0.02
+# Velocity v_s in tanh(theta_dot / v_s), a differentiable replacement of the sign. A velocity
+# changes by about this amount between two samples.
 SMOOTHING_M_S = 0.002
-"""Velocity v_s in tanh(theta_dot / v_s), a differentiable replacement of the sign.
-
-A velocity changes by about this amount between two samples.
-"""
 
 
 def smoothing_of(robot: Robot) -> float:

@@ -20,11 +20,9 @@ from identify.scenario import Excitation
 from identify.scenario.sections import Validation
 from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
 
-ATTEMPTS = 50
-"""Largest number of random trajectories per admissible trajectory, on average."""
-
+ATTEMPTS = 50  # largest number of random trajectories per admissible trajectory, on average
+# Function that raises TrajectoryError if a trajectory violates a limit at times (N,) [s].
 Check = Callable[[FourierTrajectory, Array], object]
-"""Function that raises TrajectoryError if a trajectory violates a limit at times (N,) [s]."""
 
 
 def drawn_trajectory(
@@ -77,11 +75,9 @@ def admissible_trajectories(
     )
 
 
+# Share by which random trajectories are allowed to exceed a limit. They are scaled to the box at
+# sampled times, and can exceed it slightly between these times.
 RANDOM_TOLERANCE = 1e-3
-"""Share by which random trajectories are allowed to exceed a limit.
-
-They are scaled to the box at sampled times, and can exceed it slightly between these times.
-"""
 
 
 @dataclass(frozen=True)

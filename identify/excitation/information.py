@@ -146,8 +146,7 @@ def log_information(robot: Robot, known: Knowledge, trajectory: FourierTrajector
 
 ComplexArray = NDArray[np.complex128]
 
-STEP = 1e-5
-"""Step [m, rad] of the difference quotient of the holding torque."""
+STEP = 1e-5  # step [m, rad] of the difference quotient of the holding torque
 
 
 def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArray:
@@ -204,8 +203,8 @@ def servo_response(settings: LoopSettings, s: ComplexArray) -> ComplexArray:
     return np.asarray((servo.kp + servo.kd * s + servo.ki / s) * delay)
 
 
+# Multiple of the trajectory's highest harmonic up to which sensitivities are included.
 HARMONICS_SEEN = 8
-"""Multiple of the trajectory's highest harmonic up to which sensitivities are included."""
 
 
 def log_linear_information(

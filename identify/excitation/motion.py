@@ -111,8 +111,8 @@ def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
     return Unknowns(chart, box, settings.fundamental_hz, settings.harmonics)
 
 
+# Number of poses per period of the highest harmonic at which a criterion is evaluated.
 SAMPLES_PER_HARMONIC = 20
-"""Number of poses per period of the highest harmonic at which a criterion is evaluated."""
 
 
 def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> Array:
@@ -155,11 +155,9 @@ def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
+# Number of bits to which the response of a linearised loop is rounded. It is small because the
+# response is computed by difference quotients.
 RESPONSE_BITS = 16
-"""Number of bits to which the response of a linearised loop is rounded.
-
-It is small because the response is computed by difference quotients.
-"""
 
 
 def tracked_motion(

@@ -22,14 +22,11 @@ from identify.runtime import interruptible, one_thread, raise_interrupt
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
 
+# Factor by which constraints are sampled more finely in the final check than during a search.
 CHECK_REFINEMENT = 8
-"""Factor by which constraints are sampled more finely in the final check than during a search."""
-
+# Share of every limit that remains unused. The highest harmonic can rise by this share between the
+# instants of the check.
 CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
-"""Share of every limit that remains unused.
-
-The highest harmonic can rise by this share between the instants of the check.
-"""
 
 
 @dataclass(frozen=True)
@@ -124,23 +121,15 @@ def best_of(
     return SearchResult(best, problem.value(best), count, 0, 0, f"best of {count}")
 
 
+# Relative spread of the population's values at which evolution stops, as in the paper.
 STALLED = 1e-10
-"""Relative spread of the population's values at which evolution stops, as in the paper."""
-
+# Smallest size of the population, because differential evolution combines several members.
 FEWEST_MEMBERS = 5
-"""Smallest size of the population, because differential evolution combines several members."""
-
-MOST_MEMBERS = 32
-"""Largest size of the population. Larger populations converge too slowly."""
-
+MOST_MEMBERS = 32  # largest size of the population. Larger populations converge too slowly.
+# Share of the unknowns that a trial takes from its mutant. It is the best of several values that
+# were tried with MOST_MEMBERS.
 RECOMBINATION = 0.9
-"""Share of the unknowns that a trial takes from its mutant.
-
-It is the best of several values that were tried with MOST_MEMBERS.
-"""
-
-NOT_ADMISSIBLE = 1e6
-"""Cost of a member that violates a limit, larger than any value of a criterion."""
+NOT_ADMISSIBLE = 1e6  # cost of a member that violates a limit, larger than any value of a criterion
 
 
 def evolve(
@@ -222,21 +211,12 @@ class _ScaledPopulation:
 
 MOST_ITERATIONS = 150  # largest number of iterations of IPOPT
 
+# Relative tolerance of IPOPT. A more accurate optimum does not excite noticeably more.
 TOLERANCE = 1e-4
-"""Relative tolerance of IPOPT. A more accurate optimum does not excite noticeably more."""
-
-INTERIOR = 0.98
-"""Factor that moves a start inside the limits, which an interior-point method needs."""
-
-FAR = 0.5
-"""Used share of a limit below which the limit is ignored at first."""
-
-ALWAYS = "box"
-"""Limit that is always included, because a criterion is unbounded without it."""
-
-
-STARTS = 3
-"""Number of candidates from which IPOPT starts."""
+INTERIOR = 0.98  # factor that moves a start inside the limits, which an interior-point method needs
+FAR = 0.5  # used share of a limit below which the limit is ignored at first
+ALWAYS = "box"  # limit that is always included, because a criterion is unbounded without it
+STARTS = 3  # number of candidates from which IPOPT starts
 
 
 @interruptible()
@@ -337,5 +317,5 @@ def _solver(problem: SearchProblem, included: set[str]) -> ca.Function:
     return ca.nlpsol("excitation", "ipopt", nlp, options)
 
 
+# Methods of a scenario, see `excitation.method`.
 SEARCHES: dict[str, Search] = {"random": best_of, "evolutionary": evolve, "gradient": climb}
-"""Methods of a scenario, see `excitation.method`."""

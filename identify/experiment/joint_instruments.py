@@ -38,17 +38,15 @@ VARIABLES: Variables = {
     ),
     "joint_angle": (("time", "joint"), "rad", "joint coordinate read from the encoder"),
 }
+# Names of the instruments' figures, by False for turning and True for sliding actuators.
 ATTRIBUTES = {
     False: ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad"),
     True: ("force_noise_N", "encoder_noise_m", "encoder_resolution_m"),
 }
-"""Names of the instruments' figures, by False for turning and True for sliding actuators."""
 
+# Tolerance, in frames, within which a command counts as arriving at the instant of an exposure. The
+# recorded torque of the plant includes the effect of such a command.
 SAME_INSTANT = 1e-9
-"""Tolerance, in frames, within which a command counts as arriving at the instant of an exposure.
-
-The recorded torque of the plant includes the effect of such a command.
-"""
 
 
 @dataclass(frozen=True)
@@ -84,11 +82,9 @@ class JointInstruments:
 
 
 TURNING = JointInstruments()
+# Instruments of sliding actuators. The force noise is 1 % of a holding force of about 50 N, and the
+# scales have steps of a micrometre.
 SLIDING = JointInstruments(0.5, 1e-6, 1e-6, prismatic=True)
-"""Instruments of sliding actuators.
-
-The force noise is 1 % of a holding force of about 50 N, and the scales have steps of a micrometre.
-"""
 
 
 def instruments_of(

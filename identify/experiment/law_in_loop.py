@@ -21,18 +21,14 @@ from identify.scenario import Timing
 from identify.scenario.loop_sections import Control
 from identify.scenario.plant_sections import FILTERED
 
+# Default bandwidth of computed_torque with an observer, times the frame period. The gains can then
+# double before the loop becomes unstable. With the noise of the built-in sensors, a slower loop has
+# larger tracking errors.
 FASTEST = 1.0
-"""Default bandwidth of computed_torque with an observer, times the frame period.
 
-The gains can then double before the loop becomes unstable. With the noise of the built-in sensors,
-a slower loop has larger tracking errors.
-"""
-
+# Default bandwidth of computed_torque without an observer, times the delay of the torque. The delay
+# is the sum of the latency, half a frame of hold, and one frame of difference quotient.
 FASTEST_UNSEEN = 0.5
-"""Default bandwidth of computed_torque without an observer, times the delay of the torque.
-
-The delay is the sum of the latency, half a frame of hold, and one frame of difference quotient.
-"""
 
 
 @dataclass(frozen=True)

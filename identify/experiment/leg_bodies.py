@@ -18,8 +18,7 @@ from dynamics.errors import RobotFileError
 from dynamics.geometry import RobotGeometry
 from identify.arrays import Array
 
-LARGEST_SIZE_M = 10.0
-"""Length, m, beyond which a mesh probably has a wrong unit."""
+LARGEST_SIZE_M = 10.0  # length, m, beyond which a mesh probably has a wrong unit
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:

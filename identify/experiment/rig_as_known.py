@@ -28,12 +28,11 @@ from identify.errors import ScenarioError
 from identify.progress import Progress, SilentProgress
 from identify.scenario.sections import RIG_KNOWN, Rig
 
+# Largest ratio of focal lengths, or of baselines, at which two rigs count as the same.
 LARGEST_RATIO = 1.5
-"""Largest ratio of focal lengths, or of baselines, at which two rigs count as the same."""
+# Largest angle [rad] of right cameras, or of baselines, at which two rigs count as the same.
 ANGLE = np.deg2rad(10.0)
-"""Largest angle [rad] of right cameras, or of baselines, at which two rigs count as the same."""
-SHARE = 0.1
-"""Largest distance of principal points of such rigs, as a share of the image size."""
+SHARE = 0.1  # largest distance of principal points of such rigs, as a share of the image size
 
 
 def known_rig(

@@ -40,8 +40,7 @@ from identify.scenario.payload import Payload
 from identify.scenario.sections import Rig
 from identify.trajectory import FourierTrajectory, check_travel
 
-PAYLOAD_RUN = 1_000_000
-"""Number of the run under a payload, larger than all other numbers of runs."""
+PAYLOAD_RUN = 1_000_000  # number of the run under a payload, larger than all other numbers of runs
 
 
 @dataclass(frozen=True)

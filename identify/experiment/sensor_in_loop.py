@@ -24,11 +24,10 @@ from identify.progress import Advance, Progress
 from identify.random_streams import CALIBRATION, TEACHING, stream_seed
 from identify.scenario.sections import Rig
 
+# Largest distance, m, from a leg's end to the sensor file's platform, and between both homes.
 OFF_PLATFORM_M = 0.05
-"""Largest distance, m, from a leg's end to the sensor file's platform, and between both homes."""
-
+# Next step if the platform of the sensor is not that of the robot.
 OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE names it"
-"""Next step if the platform of the sensor is not that of the robot."""
 
 
 @dataclass(frozen=True)

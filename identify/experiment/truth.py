@@ -36,6 +36,7 @@ VARIABLES: Variables = {
     ),
 }
 
+# Additional variables of a plant that differs from the nominal robot with rigid joints.
 MISMATCH: Variables = {
     "base_joint_error": (
         ("joint", "axis"),
@@ -54,7 +55,6 @@ MISMATCH: Variables = {
         "motor coordinate of an elastic joint, which the encoder measures",
     ),
 }
-"""Additional variables of a plant that differs from the nominal robot with rigid joints."""
 
 
 def build_truth(

@@ -21,8 +21,7 @@ from identify.experiment.sensor_in_loop import SensorInLoop, SensorPlan
 from identify.progress import Progress, SilentProgress
 from identify.runtime import cores, end_with_parent, shield_children
 
-WARM_UP_FRAMES = 12
-"""Number of frames of the motion on which everything is compiled."""
+WARM_UP_FRAMES = 12  # number of frames of the motion on which everything is compiled
 
 Task = Callable[[], None]
 

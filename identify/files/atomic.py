@@ -22,8 +22,7 @@ from identify.runtime import delay_interrupts
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TEMPORARY = ".cmmsim-"
-"""Prefix of the names of files and folders that are being written."""
+TEMPORARY = ".cmmsim-"  # prefix of the names of files and folders that are being written
 
 
 @contextmanager

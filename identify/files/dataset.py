@@ -92,8 +92,8 @@ def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
     return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
 
 
+# Dimensions, unit and description of each variable.
 Variables = dict[str, tuple[tuple[str, ...], str, str]]
-"""Dimensions, unit and description of each variable."""
 
 AXIS = ["x", "y", "z"]
 ANGLE = ["alpha", "beta", "gamma"]
@@ -116,8 +116,8 @@ LABELS: dict[str, list[str]] = {
 }
 
 
+# Units of joint variables for sliding actuators, by the units for turning actuators.
 SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of joint variables for sliding actuators, by the units for turning actuators."""
 
 
 def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
@@ -234,8 +234,8 @@ def as_number(value: object) -> float:
 VARIABLE = "covariance"
 PARTS = "source_covariance"
 SOURCE = "source"
+# Largest difference of a covariance and the sum of its parts, in standard deviations.
 SUM_TOLERANCE = 1e-9
-"""Largest difference of a covariance and the sum of its parts, in standard deviations."""
 DIMENSIONS = ("parameter", "parameter_2")
 
 

@@ -14,8 +14,7 @@ from typing import Any
 
 from identify.errors import RecordError
 
-KEY = "sha256"
-"""Name of the first entry of a JSON file, which has its digest."""
+KEY = "sha256"  # name of the first entry of a JSON file, which has its digest
 
 _TRAILER = b"\ncmmsim sha256 "
 _HEX = 2 * sha256().digest_size

@@ -15,12 +15,10 @@ from typing import Any
 
 from dynamics.errors import DynamicsError
 
-LIMIT_S = 8
-"""Time limit for reading, s."""
-START_S = 60
-"""Additional time for the process to start on a busy machine, s."""
+LIMIT_S = 8  # time limit for reading, s
+START_S = 60  # additional time for the process to start on a busy machine, s
+# Largest number of bytes that reading may allocate, on systems that can limit it.
 LIMIT_MEMORY = 1_000_000_000
-"""Largest number of bytes that reading may allocate, on systems that can limit it."""
 
 CODE = "from identify.files.limited_process import serve; serve()"
 

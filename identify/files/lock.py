@@ -9,11 +9,9 @@ from filelock import BaseFileLock, FileLock, Timeout
 from identify.errors import IdentifyError, OutputFolderError
 from identify.files.atomic import make_folder, remove_empty_folders, remove_leftovers, writing
 
-LOCK = ".lock"
-"""Name of the locked file. A file that a killed process has left does not block."""
-
+LOCK = ".lock"  # name of the locked file. A file that a killed process has left does not block.
+# Mode of the file. Only its owner can open it, because any process that opens it can lock it.
 PRIVATE = 0o600
-"""Mode of the file. Only its owner can open it, because any process that opens it can lock it."""
 
 
 @contextmanager

@@ -18,9 +18,9 @@ from identify.files.atomic import figure_bytes, write_bytes, write_files
 from identify.files.digest import check_netcdf, check_toml, json_with_digest, json_without_digest
 from identify.files.lock import LOCK, lock_folder
 
-LARGEST_JSON = 100_000_000
-"""Largest size, in bytes, of a result or of measured static poses."""
+LARGEST_JSON = 100_000_000  # largest size, in bytes, of a result or of measured static poses
 
+# The stage of ``cmmsim`` that writes each file.
 WRITTEN_BY = {
     "scenario.toml": "excite",
     "trajectories.json": "excite",
@@ -32,13 +32,11 @@ WRITTEN_BY = {
     "model.nc": "validate",
     "report.html": "report",
 }
-"""The stage of ``cmmsim`` that writes each file."""
 
+# Files that `excite` writes before the scenario. Without the scenario, a plan is not complete.
 UNFINISHED = ("geometry", "trajectories.json")
-"""Files that `excite` writes before the scenario. Without the scenario, a plan is not complete."""
-
+# Files and folders that the folder of an unfinished run may hold.
 BEGUN = ("geometry", "figures", "budget", *WRITTEN_BY)
-"""Files and folders that the folder of an unfinished run may hold."""
 
 
 class RunFolder:
@@ -129,14 +127,14 @@ def _not_empty(folder: Path) -> OutputFolderError:
     )
 
 
+# Order of the RMS figures: three positions in um, three orientations in urad.
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
-"""Order of the RMS figures: three positions in um, three orientations in urad."""
 
+# Entries that the stages write into a result, and that later stages read.
 ENTRIES = {
     "identify": ("identification", "before", "after", "seconds"),
     "validate": ("sensor", "validation"),
 }
-"""Entries that the stages write into a result, and that later stages read."""
 
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:

@@ -11,14 +11,10 @@ from identify.files.limited_process import within_limits
 
 ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
+# Largest size of the numbers in a group. A record of a million frames has this size.
 LIMIT_BYTES = 256_000_000
-"""Largest size of the numbers in a group. A record of a million frames has this size."""
-
+# Names of the groups, and one group. The group is None if it was not requested or does not exist.
 Content = tuple[list[str], xr.Dataset | None]
-"""Names of the groups, and one group.
-
-The group is None if it was not requested or does not exist.
-"""
 
 
 def load(content: bytes, group: str | None, most: float = math.inf) -> Content:

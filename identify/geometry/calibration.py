@@ -31,11 +31,9 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 
+# Largest standard deviation, as a share of the tolerance, with which a number is determined. The
+# prior then has at most a ninth of the information, and hardly affects an interval.
 OBSERVABLE = 1 / 3
-"""Largest standard deviation, as a share of the tolerance, with which a number is determined.
-
-The prior then has at most a ninth of the information, and hardly affects an interval.
-"""
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,9 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.calibration import OBSERVABLE
 
-SMALL = 0.05
-"""Share of the largest coefficient below which a number is left out of a combination."""
-
+SMALL = 0.05  # share of the largest coefficient below which a number is left out of a combination
+# Smallest length of the column of a pivot, as a share of the largest remaining length.
 LONG_ENOUGH = 0.5
-"""Smallest length of the column of a pivot, as a share of the largest remaining length."""
 
 
 def unobservable(covariance: Array, prior_std: Array) -> Array:
@@ -120,12 +118,11 @@ def check_enough(
     )
 
 
+# Number of the best determined, and of the worst determined directions in the first ranking.
 EXTREMES = 24
-"""Number of the best determined, and of the worst determined directions in the first ranking."""
+# Number of best candidates of the first ranking for which the index is computed exactly.
 PROMISING = 16
-"""Number of best candidates of the first ranking for which the index is computed exactly."""
-HARDLY = 10.0
-"""Information about a direction below which the direction counts as hardly determined."""
+HARDLY = 10.0  # information about a direction below which the direction counts as hardly determined
 
 
 class ObservabilityIndex(ABC):

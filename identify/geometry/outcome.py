@@ -22,10 +22,8 @@ from identify.geometry.static_experiment import true_poses
 from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
-CURVE = 12
-"""Number of entries in the list of expected errors by the number of random poses."""
-NOISY = 4.0
-"""Excess of the noise ratio, in standard deviations, at which a warning is given."""
+CURVE = 12  # number of entries in the list of expected errors by the number of random poses
+NOISY = 4.0  # excess of the noise ratio, in standard deviations, at which a warning is given
 
 
 @dataclass(frozen=True)

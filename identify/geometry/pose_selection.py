@@ -22,19 +22,13 @@ from identify.geometry.calibration import PoseModel, whiteners
 from identify.geometry.observability import ObservabilityIndex, chosen_index
 from identify.progress import Advance
 
-STEP = 1e-5
-"""Step of the difference quotients behind the gradient, as a share of the travel."""
-GRADIENT_STEPS = 40
-"""Largest number of steps of one gradient search."""
+STEP = 1e-5  # step of the difference quotients behind the gradient, as a share of the travel
+GRADIENT_STEPS = 40  # largest number of steps of one gradient search
+# Largest number of gradient searches. Poses that violated a limit after a search are fixed in the
+# next search.
 ROUNDS = 4
-"""Largest number of gradient searches.
-
-Poses that violated a limit after a search are fixed in the next search.
-"""
-EXCHANGES = 3
-"""Largest number of exchange passes over all poses."""
-TRIALS = 40
-"""Largest number of random joint coordinates per candidate."""
+EXCHANGES = 3  # largest number of exchange passes over all poses
+TRIALS = 40  # largest number of random joint coordinates per candidate
 
 
 @dataclass(frozen=True)

@@ -29,15 +29,11 @@ from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream
 from identify.record.stored_common_errors import CommonErrors, kind_of
 from identify.scenario.sections import Geometry
 
+# Number of the sensor's run at the first pose, larger than those of an experiment's motions.
 FIRST_POSE_RUN = 2_000_000
-"""Number of the sensor's run at the first pose, larger than those of an experiment's motions."""
-
-
+# Largest difference between commanded and actual joint coordinates, as a share of the travel. It is
+# caused by friction. The encoders read the actual coordinates.
 REST = 1e-3
-"""Largest difference between commanded and actual joint coordinates, as a share of the travel.
-
-It is caused by friction. The encoders read the actual coordinates.
-"""
 
 
 @dataclass(frozen=True)

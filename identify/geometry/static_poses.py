@@ -15,14 +15,11 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.run_folder import load_result
 
+# Standard deviation (6,) of an unknown frame, m and rad. It is larger than realistic errors.
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
-"""Standard deviation (6,) of an unknown frame, m and rad. It is larger than realistic errors."""
-
+# Smallest difference in a joint by which two poses are different, in standard deviations.
 APART = 10.0
-"""Smallest difference in a joint by which two poses are different, in standard deviations."""
-
-ROUNDING = 1e-9
-"""Lower bound of this difference, rad or m."""
+ROUNDING = 1e-9  # lower bound of this difference, rad or m
 
 
 @dataclass(frozen=True)
@@ -189,12 +186,12 @@ def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
         raise RecordError(f"{name}, number {row + 1}, {why}: it is not a covariance")
 
 
+# Largest allowed difference between read and expected motion, as a share of the expected.
 WRONG = 0.2
-"""Largest allowed difference between read and expected motion, as a share of the expected."""
-
+# Smallest expected motion (rms) to which a difference is related, as a share of the travel.
 STILL = 0.1
-"""Smallest expected motion (rms) to which a difference is related, as a share of the travel."""
 
+# Factors of readings in wrong units. The key is True for sliding actuators.
 UNITS = {
     False: {
         "in degrees": 180 / pi,
@@ -204,7 +201,6 @@ UNITS = {
     },
     True: {"in mm": 1e3, "in um": 1e6, "in inches": 1 / 0.0254, "taken for mm": 1e-3},
 }
-"""Factors of readings in wrong units. The key is True for sliding actuators."""
 
 
 def check_encoders(robot: Robot, data: StaticPoses) -> None:

@@ -15,8 +15,7 @@ from identify.paper.exhibit import Exhibit
 from identify.reporting.figures.style import BLUE, GREY, INK, PAPER, WIDTH
 
 HALF_WIDTH = 0.35
-HALF_HEIGHT = 0.3
-"""Half width and half height of a block. Blocks stand on a grid of unit distance."""
+HALF_HEIGHT = 0.3  # half width and half height of a block. Blocks stand on a grid of unit distance.
 
 
 class Block(NamedTuple):

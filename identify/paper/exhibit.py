@@ -41,8 +41,8 @@ class PaperRuns:
         return {"ours": self.ours, "paper's settings": self.settings}
 
 
+# Columns of text and numbers by their headings. All columns have the same length.
 Columns = Mapping[str, Collection[Any]]
-"""Columns of text and numbers by their headings. All columns have the same length."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
 INDEX = "index.html"
-EXHIBITS = "exhibits"
-"""Folder of the files of the exhibits."""
+EXHIBITS = "exhibits"  # folder of the files of the exhibits
 
 
 def exhibit_files(runs: PaperRuns, progress: Progress) -> dict[Path, bytes]:

@@ -17,8 +17,7 @@ from identify.paper.exhibit import Exhibit
 from identify.reporting.figures.style import BLUE, GREEN, INK, RED, WIDTH
 from identify.scene import StereoView, Workcell
 
-COLOURS = (BLUE, RED, GREEN)
-"""Colours of the planes A, B and C."""
+COLOURS = (BLUE, RED, GREEN)  # colours of the planes A, B and C
 
 
 @dataclass(frozen=True)

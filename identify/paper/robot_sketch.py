@@ -13,8 +13,7 @@ from identify.arrays import Array
 from identify.paper.exhibit import Exhibit
 from identify.reporting.figures.style import BLUE, GREEN, GREY, INK, RED, WIDTH
 
-LEG = 3
-"""Index of the leg that is drawn alone."""
+LEG = 3  # index of the leg that is drawn alone
 
 
 def leg_points(robot: Robot) -> Array:

@@ -26,20 +26,14 @@ from identify.record.recording import check_record, is_timed, poses
 from identify.scenario import Excitation, Filter, Timing
 from identify.trajectory import FourierTrajectory
 
-MINIMUM_GOOD_SHARE = 0.5
-"""Smallest share of measured frames."""
-
+MINIMUM_GOOD_SHARE = 0.5  # smallest share of measured frames
+# Largest difference of a reference from the integral of its rate, as a share of its travel.
 REFERENCE_GAP = 0.05
-"""Largest difference of a reference from the integral of its rate, as a share of its travel."""
-
+# Difference, m or rad, that counts as rounding. For frame rates it is a relative difference.
 ROUNDING = 1e-9
-"""Difference, m or rad, that counts as rounding. For frame rates it is a relative difference."""
-
+# Largest difference of two mirrored entries of a covariance that counts as rounding. Its unit is
+# the product of the two standard deviations.
 ASYMMETRY = 1e-6
-"""Largest difference of two mirrored entries of a covariance that counts as rounding.
-
-Its unit is the product of the two standard deviations.
-"""
 
 
 class TooFewFramesError(EstimationError):
@@ -220,33 +214,23 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
     )
 
 
-REST_RATE = 0.05
-"""Largest initial rate of a reference, as a share of its largest rate."""
-
+REST_RATE = 0.05  # largest initial rate of a reference, as a share of its largest rate
+# Largest distance of the first measured pose from the reference. It is a share of the largest
+# travel of the positions, or of the angles.
 REST_POSE = 0.1
-"""Largest distance of the first measured pose from the reference.
-
-It is a share of the largest travel of the positions, or of the angles.
-"""
-
+# Largest distance of a measured pose from the reference, as a multiple of its travel. The same
+# limit holds for commands and the joint coordinates of the reference.
 TRAVELS = 2.0
-"""Largest distance of a measured pose from the reference, as a multiple of its travel.
-
-The same limit holds for commands and the joint coordinates of the reference.
-"""
-
+# Difference of commands from the inverse kinematics that is always allowed. It is a share of the
+# joints' travel limit. The real geometry differs from the robot file.
 BUILT = 0.05
-"""Difference of commands from the inverse kinematics that is always allowed.
 
-It is a share of the joints' travel limit. The real geometry differs from the robot file.
-"""
-
+# Factors of positions and of angles for units that records have by mistake.
 OTHER_UNITS = {
     "mm": (1e-3, 1.0),
     "degrees": (1.0, np.pi / 180),
     "mm and degrees": (1e-3, np.pi / 180),
 }
-"""Factors of positions and of angles for units that records have by mistake."""
 
 
 def check_plausible(
@@ -365,11 +349,9 @@ def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
     return ""
 
 
+# Longest time, s, of consecutive lost frames without a warning. The model runs through these frames
+# without measurements.
 LONG_GAP_S = 0.5
-"""Longest time, s, of consecutive lost frames without a warning.
-
-The model runs through these frames without measurements.
-"""
 
 
 def long_gap_warnings(ok: NDArray[np.bool_], rate_hz: float) -> tuple[str, ...]:

@@ -16,23 +16,15 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from identify.scenario.section import Section, quantity
 
-ASKED = "?"
-"""Value of a key that a proposal leaves to the user."""
-
+ASKED = "?"  # value of a key that a proposal leaves to the user
+# Seconds in each unit of time, as decimal numbers.
 TIMES = {"s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9"}
-"""Seconds in each unit of time, as decimal numbers."""
-
-FRAMES = "frames"
-"""Unit of times that count frames at the rate of the timing."""
-
-LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6}
-"""Metres in each unit of length."""
-
+FRAMES = "frames"  # unit of times that count frames at the rate of the timing
+LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6}  # metres in each unit of length
+# Radians in each unit of angle.
 ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "turn": 6.283185307179586}
-"""Radians in each unit of angle."""
-
+# Number of columns of each convention but the Euler sequences, which have three.
 COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vector": 3}
-"""Number of columns of each convention but the Euler sequences, which have three."""
 
 COVARIANCES = (6, 21, 36)
 COVARIANCES_SAID = "6 standard deviations, 21 of the upper triangle, or 36 row by row"
@@ -41,10 +33,10 @@ EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
 
 EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
 
+# Sequences about three different axes.
 EULER_ORDERS = tuple(
     f"euler_{''.join(letters)}" for axes in ("XYZ", "xyz") for letters in permutations(axes)
 )
-"""Sequences about three different axes."""
 
 CONVENTIONS = (*COUNTS, *EULER_USUAL, "...")
 

@@ -27,11 +27,8 @@ from identify.errors import EstimationError, RecordError
 from identify.files.dataset import Variables, check_variables
 from identify.scenario.timing import Timing
 
-SERVO = "pid"
-"""Name of the visual servo's law."""
-
-TORQUE_UNITS = {"rad": "N m", "m": "N"}
-"""Unit of torque commands, by the unit of joint commands."""
+SERVO = "pid"  # name of the visual servo's law
+TORQUE_UNITS = {"rad": "N m", "m": "N"}  # unit of torque commands, by the unit of joint commands
 
 
 def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
@@ -64,6 +61,7 @@ def takes_torques(record: xr.Dataset) -> bool:
 
 COMMAND_TIME = "command_time"
 
+# Optional variables of a record.
 OPTIONAL: Variables = {
     COMMAND_TIME: (
         ("time",),
@@ -72,13 +70,9 @@ OPTIONAL: Variables = {
         "was written. Without this variable all commands have the latency of the timing",
     )
 }
-"""Optional variables of a record."""
 
-CLOCK_S = 1e-6
-"""Largest difference, s, of two clock readings of the same instant."""
-
-SAME_S = 1e-9
-"""Difference, s, below which latencies are the same."""
+CLOCK_S = 1e-6  # largest difference, s, of two clock readings of the same instant
+SAME_S = 1e-9  # difference, s, below which latencies are the same
 
 
 def check_command_times(record: xr.Dataset, source: str) -> None:
@@ -151,8 +145,7 @@ def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
     return None if np.abs(latencies - timing.latency_s).max() <= SAME_S else latencies
 
 
-DRIFT = "drift_watch"
-"""Name of the attribute of a record, and of the entry of `result.json`."""
+DRIFT = "drift_watch"  # name of the attribute of a record, and of the entry of `result.json`
 
 
 def store_finding(record: xr.Dataset, finding: Mapping[str, Any]) -> None:

@@ -19,6 +19,7 @@ from identify.errors import RecordError
 from identify.files.dataset import POSE
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
+# Rules for records of users.
 RULES = """\
 Units are m, rad and s. A pose is the pose of the platform frame in the base frame of the robot
 file, R = Rx(alpha) Ry(beta) Rz(gamma). The time of a row is the instant at which the sensor saw the
@@ -38,16 +39,12 @@ without a reference, with commands in rows without poses, or with rows missing. 
 estimated, and after missing rows the model starts anew. A clock of the commands that differs from
 that of the poses is estimated with timing.clock_offset_std_s and timing.clock_drift_std.
 """
-"""Rules for records of users."""
 
+# Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes.
 LARGEST = 200_000_000
-"""Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes."""
-
+# Beginnings of the columns that `cmmsim measure` writes in addition to those of a record. These
+# columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
 BESIDE = ("pair", "stickers", "why", "common_")
-"""Beginnings of the columns that `cmmsim measure` writes in addition to those of a record.
-
-These columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
-"""
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 

@@ -20,17 +20,12 @@ from identify.filtering import interpolated
 from identify.record.smoothness import windows_of
 from identify.record.telemetry import Telemetry
 
+# Smallest step, s, of the lags that are tried. The best is then refined by a parabola.
 FINEST_S = 1e-3
-"""Smallest step, s, of the lags that are tried. The best is then refined by a parabola."""
-
+# Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion.
 CLOSE_S = 1.0
-"""Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion."""
-
-ALIKE = 0.02
-"""Difference of correlations below which the smaller lag is taken."""
-
-FEWEST = 8
-"""Smallest number of poses that overlap with commands."""
+ALIKE = 0.02  # difference of correlations below which the smaller lag is taken
+FEWEST = 8  # smallest number of poses that overlap with commands
 
 
 @dataclass(frozen=True)
@@ -101,14 +96,10 @@ def _correlation(time: Array, coordinates: Array, command_time: Array, command: 
     return float(((one * other).sum(axis=0)[moving] / scale[moving]).mean())
 
 
-REACH_S = 0.5
-"""Largest delay, s, of either sign that is tried."""
-
-PARTS = 4
-"""Number of tried delays per time between two poses."""
-
+REACH_S = 0.5  # largest delay, s, of either sign that is tried
+PARTS = 4  # number of tried delays per time between two poses
+# Smallest correlation, in standard deviations of the correlation of independent noises.
 CERTAIN = 6.0
-"""Smallest correlation, in standard deviations of the correlation of independent noises."""
 
 
 @dataclass(frozen=True)

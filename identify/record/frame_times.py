@@ -9,14 +9,10 @@ import numpy as np
 from identify.arrays import Array
 from identify.record.smoothness import local_misfit
 
-GAP = 1.5
-"""Time between two rows, as a multiple of the usual time, above which rows are missing."""
-
+GAP = 1.5  # time between two rows, as a multiple of the usual time, above which rows are missing
+# Largest distance of a stated time from a frame, in periods, at which it can be of that frame.
 FARTHEST = 0.4
-"""Largest distance of a stated time from a frame, in periods, at which it can be of that frame."""
-
-BETTER = 0.97
-"""Largest ratio of two misfits at which the smaller one decides."""
+BETTER = 0.97  # largest ratio of two misfits at which the smaller one decides
 
 
 def mean_rate(times: Array) -> float:

@@ -28,17 +28,12 @@ from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, Refere
 from identify.record.timed_record import build_timed_record
 from identify.scenario import Timing
 
-MOST_GROSS = 0.1
-"""Largest share of poses that can be gross errors."""
-
+MOST_GROSS = 0.1  # largest share of poses that can be gross errors
+# Smallest relative difference of the rate of rows from the frame rate that is an error.
 OTHER_RATE = 0.05
-"""Smallest relative difference of the rate of rows from the frame rate that is an error."""
-
-NAMED = 10
-"""Largest number of gross errors whose times a note names."""
-
+NAMED = 10  # largest number of gross errors whose times a note names
+# Attribute of a record with what was decided when its file was read, as a JSON list.
 NOTES = "notes"
-"""Attribute of a record with what was decided when its file was read, as a JSON list."""
 
 
 def record_of(

@@ -28,14 +28,11 @@ from identify.record.run_error_covariance import covariance_fault, factor, notic
 from identify.runtime import in_threads
 from identify.scenario.sections import Geometry
 
-FOLDER = "geometry"
-"""Folder within a run that holds the calibration of this run."""
-
+FOLDER = "geometry"  # folder within a run that holds the calibration of this run
+# Name of the covariance file beside the file of a calibrated robot.
 COVARIANCE_FILE = "covariance.nc"
-"""Name of the covariance file beside the file of a calibrated robot."""
-
+# Largest difference of a calibrated number from the robot file, in tolerances of the geometry.
 SAME_ROBOT = 20.0
-"""Largest difference of a calibrated number from the robot file, in tolerances of the geometry."""
 
 
 @dataclass(frozen=True)

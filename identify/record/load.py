@@ -20,14 +20,10 @@ from identify.errors import RecordError
 from identify.files.dataset import as_number, shown
 from identify.scenario.payload import FIGURES, check_load_std, check_moments
 
+# Attributes of a record with the figures of a load. The standard deviation of each attribute has
+# the same name with `_std` at the end.
 ADDED = tuple(f"payload_{figure}" for figure in FIGURES)
-"""Attributes of a record with the figures of a load.
-
-The standard deviation of each attribute has the same name with `_std` at the end.
-"""
-
-CENTRE = slice(1, 4)
-"""Places of the centre of mass among the figures."""
+CENTRE = slice(1, 4)  # places of the centre of mass among the figures
 
 
 def load_parameters(layout: ParameterLayout, figures: Array) -> Array:

@@ -45,6 +45,7 @@ MODEL_VARIABLES: Variables = {
     ),
 }
 
+# Additional variables of runs of validation trajectories.
 PREDICTED: Variables = {
     "std_position": (
         ("time", "axis"),
@@ -57,7 +58,6 @@ PREDICTED: Variables = {
         "predicted standard deviation of the plant's orientation from the identified model",
     ),
 }
-"""Additional variables of runs of validation trajectories."""
 
 
 def build_model_run(

@@ -44,17 +44,11 @@ from identify.scenario.section import Section, quantity
 from identify.scenario.sections import Excitation, Identification, Validation
 from identify.scenario.settings_file import one_line
 
-DESCRIPTION = "record"
-"""Name of the table of a log's TOML file with further measurements."""
-
-COLUMNS = "columns"
-"""Name of the table of a log's TOML file with the columns of the log."""
-
+DESCRIPTION = "record"  # name of the table of a log's TOML file with further measurements
+COLUMNS = "columns"  # name of the table of a log's TOML file with the columns of the log
+# Frame rate, Hz, that no record has. A scenario refuses rates above its own, lower limit.
 MOST_HZ = 1e6
-"""Frame rate, Hz, that no record has. A scenario refuses rates above its own, lower limit."""
-
-TABLES = (".csv", ".tsv", ".txt")
-"""Endings of the names of tables."""
+TABLES = (".csv", ".tsv", ".txt")  # endings of the names of tables
 
 
 class Measured(Section):

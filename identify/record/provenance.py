@@ -26,18 +26,14 @@ from identify.record.model_runs import read_model_runs
 from identify.record.recording import read, read_runs, variables_of
 from identify.scenario import Scenario, scenario_from_toml
 
+# Attribute with the geometry of the robot file. The name of a robot alone does not identify the
+# file.
 ROBOT = "robot_geometry"
-"""Attribute with the geometry of the robot file.
-
-The name of a robot alone does not identify the file.
-"""
-
-ROUNDING = 1e-9
-"""Largest difference of a geometric number, SI units, that counts as rounding."""
-
+ROUNDING = 1e-9  # largest difference of a geometric number, SI units, that counts as rounding
+# Numbers of a geometry that do not depend on the kind of its legs.
 SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
-"""Numbers of a geometry that do not depend on the kind of its legs."""
 
+# Attributes that an identification reads, in addition to the scenario's timing and servo.
 STATED = (
     "robot",
     ROBOT,
@@ -49,19 +45,13 @@ STATED = (
     *ADDED,
     *(f"{name}_std" for name in ADDED),
 )
-"""Attributes that an identification reads, in addition to the scenario's timing and servo."""
 
+# Entry of a result with the digest of each file, by file name. Results of older versions do not
+# have this entry, and are not checked.
 ENTRY = "made_of"
-"""Entry of a result with the digest of each file, by file name.
-
-Results of older versions do not have this entry, and are not checked.
-"""
-
-RECORDS = ("experiment.nc", "payload.nc")
-"""Files with records for an identification."""
-
+RECORDS = ("experiment.nc", "payload.nc")  # files with records for an identification
+# Stage that must be repeated after a change of a file. For other files it is `identify`.
 _AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
-"""Stage that must be repeated after a change of a file. For other files it is `identify`."""
 
 
 def recorded_scenario(record: xr.Dataset) -> Scenario:

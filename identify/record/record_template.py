@@ -21,8 +21,8 @@ SCHEMA = Path(__file__).parent / "record.schema.json"
 
 SHOWN_ROWS = 2
 WIDTH = 96
+# Sections of a scenario that describe the recorded experiment or that an identification reads.
 SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
-"""Sections of a scenario that describe the recorded experiment or that an identification reads."""
 
 # Example values in the template, for the user to replace.
 FRAME_RATE_HZ = 60.0

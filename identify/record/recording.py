@@ -69,9 +69,9 @@ VARIABLES: Variables = {
     "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
 }
 
-STRETCH = "stretch"
-"""Variable of a record with the number of the stretch that each pose belongs to."""
+STRETCH = "stretch"  # variable of a record with the number of the stretch that each pose belongs to
 
+# Variables of a record whose commands have times of their own. It needs no reference.
 TIMED: Variables = {
     STRETCH: (
         ("time",),
@@ -81,10 +81,9 @@ TIMED: Variables = {
     **{name: own for name, own in VARIABLES.items() if name.startswith("measured")},
     "command": (("acting", "joint"), "rad", "joint command from this time on"),
 }
-"""Variables of a record whose commands have times of their own. It needs no reference."""
 
+# Variables that are NaN in frames in which the pose was lost.
 MAY_BE_LOST = ("measured_position", "measured_orientation", "measured_covariance")
-"""Variables that are NaN in frames in which the pose was lost."""
 
 
 def build_record(

@@ -8,13 +8,10 @@ import numpy as np
 
 from identify.arrays import Array
 
+# Effect below which a direction of the errors is omitted. The effect is the norm over all frames,
+# in standard deviations of the noise.
 NOTICED = 0.1
-"""Effect below which a direction of the errors is omitted.
-
-The effect is the norm over all frames, in standard deviations of the noise.
-"""
-ROUNDING = 1e-9
-"""Asymmetry or negative eigenvalue of a correlation matrix that counts as rounding."""
+ROUNDING = 1e-9  # asymmetry or negative eigenvalue of a correlation matrix that counts as rounding
 
 
 def covariance_fault(covariance: Array) -> str:

@@ -14,32 +14,16 @@ from identify.arrays import Array
 from identify.filtering import interpolated
 from identify.record.telemetry import PoseLog
 
-NEIGHBOURS = 12
-"""Number of poses near a pose, through which polynomials go."""
-
-TRUSTED = 9
-"""Number of these neighbours that must be right."""
-
-SUBSETS = 30
-"""Number of polynomials that are tried for each pose."""
-
-DEGREE = 6
-"""Degree of the polynomial. It follows motions up to a tenth of the frame rate."""
-
-LONGEST = 2.5
-"""Longest time between two poses of a polynomial, as a multiple of the usual time."""
-
+NEIGHBOURS = 12  # number of poses near a pose, through which polynomials go
+TRUSTED = 9  # number of these neighbours that must be right
+SUBSETS = 30  # number of polynomials that are tried for each pose
+DEGREE = 6  # degree of the polynomial. It follows motions up to a tenth of the frame rate.
+LONGEST = 2.5  # longest time between two poses of a polynomial, as a multiple of the usual time
+# Squared distance from the prediction above which a pose is a gross error. It is in units of its
+# variance. For noise alone, its mean is six.
 GROSS = 100.0
-"""Squared distance from the prediction above which a pose is a gross error.
-
-It is in units of its variance. For noise alone, its mean is six.
-"""
-
-MEDIAN = float(chdtri(6, 0.5))
-"""Median of this squared distance for noise alone."""
-
-FEWEST = 30
-"""Smallest number of poses in which wrong ones are searched."""
+MEDIAN = float(chdtri(6, 0.5))  # median of this squared distance for noise alone
+FEWEST = 30  # smallest number of poses in which wrong ones are searched
 
 
 @dataclass(frozen=True)
@@ -235,20 +219,11 @@ def _weights(powers: Array) -> tuple[Array, Array]:
     return base, np.linalg.solve(triangle.transpose(0, 2, 1), at_row)[:, :, 0]
 
 
-NORMAL = 1.4826
-"""Ratio of the standard deviation of normal numbers to their median magnitude."""
-
-MOVING = 0.99
-"""Share of the power of a motion that lies below its highest frequency."""
-
-MOVES = 2.0
-"""Smallest standard deviation of a moving component, as a multiple of that of its noise."""
-
-SEGMENTS = 4
-"""Number of segments of the spectrum, not counting those that overlap two others."""
-
-SHORTEST = 128
-"""Smallest number of frames of a segment, if the record has that many."""
+NORMAL = 1.4826  # ratio of the standard deviation of normal numbers to their median magnitude
+MOVING = 0.99  # share of the power of a motion that lies below its highest frequency
+MOVES = 2.0  # smallest standard deviation of a moving component, as a multiple of that of its noise
+SEGMENTS = 4  # number of segments of the spectrum, not counting those that overlap two others
+SHORTEST = 128  # smallest number of frames of a segment, if the record has that many
 
 
 def pose_noise(time: Array, poses: Array) -> Array:

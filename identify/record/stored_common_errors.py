@@ -42,11 +42,10 @@ CLOCK_OFFSET = "clock.offset_s"
 CLOCK_DRIFT = "clock.drift_s/s"
 START = "start"
 
+# Kinds of errors that differ from record to record. Records share all other kinds.
 OF_RECORD = ("clock", START)
-"""Kinds of errors that differ from record to record. Records share all other kinds."""
-
+# Kinds of errors of a model with simplified bodies and passive joints.
 ASSUMPTIONS = ("centres", "products", "passive_friction")
-"""Kinds of errors of a model with simplified bodies and passive joints."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +155,8 @@ class CommonErrors:
         return np.asarray(self.changes @ self.factor)
 
 
+# Common errors of a record without common errors.
 NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
-"""Common errors of a record without common errors."""
 
 
 @dataclass(frozen=True)

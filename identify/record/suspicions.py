@@ -19,62 +19,45 @@ from identify.filtering import interpolated
 from identify.record.delays import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 
-TRIED = 200
-"""Number of poses with which other units and axes are tried."""
-
+TRIED = 200  # number of poses with which other units and axes are tried
+# Lags, s, of the motion behind the commands that are tried with other units and axes.
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
-"""Lags, s, of the motion behind the commands that are tried with other units and axes."""
-
+# Times, s, of the taps of the filter by which a joint follows its command.
 FILTER_S = (-0.1, -0.05, 0.0, 0.05, 0.1)
-"""Times, s, of the taps of the filter by which a joint follows its command."""
-
+# Share of the motion left unexplained by the commands below which no other order is tried.
 EXPLAINED = 0.02
-"""Share of the motion left unexplained by the commands below which no other order is tried."""
-
+# Largest ratio of the unexplained shares of two orders at which the other one counts as right.
 BETTER = 0.25
-"""Largest ratio of the unexplained shares of two orders at which the other one counts as right."""
-
+# Largest ratio of the unexplained shares of two orders between which the motion cannot choose.
 EQUAL = 1.5
-"""Largest ratio of the unexplained shares of two orders between which the motion cannot choose."""
-
+# Smallest share of poses in reach. With a smaller share, other units and axes are tried.
 IN_REACH = 0.5
-"""Smallest share of poses in reach. With a smaller share, other units and axes are tried."""
-
+# Smallest correlation of a joint with its command that counts as the same motion. It is also the
+# smallest share of poses in reach with units and axes that fit.
 FITS = 0.9
-"""Smallest correlation of a joint with its command that counts as the same motion.
-
-It is also the smallest share of poses in reach with units and axes that fit.
-"""
-
+# Largest correlation of a joint with its command that counts as the opposite direction.
 OPPOSES = -0.8
-"""Largest correlation of a joint with its command that counts as the opposite direction."""
-
+# Largest difference, rad, of a joint's zero from a whole turn that counts as that turn.
 NEAR_TURN = 0.3
-"""Largest difference, rad, of a joint's zero from a whole turn that counts as that turn."""
-
+# Largest difference of a joint's zero, as a share of its travel limit. Drives without an integral
+# hold a joint away from its command.
 ZERO = 0.5
-"""Largest difference of a joint's zero, as a share of its travel limit.
+SCALE = 2.0  # largest factor between two units that count as the same one. Loops overshoot and lag.
 
-Drives without an integral hold a joint away from its command.
-"""
-
-SCALE = 2.0
-"""Largest factor between two units that count as the same one. Loops overshoot and lag."""
-
+# Factors of positions that are tried.
 LENGTHS_TRIED = {
     1.0: "",
     1e-3: "positions in mm and not m",
     1e-2: "positions in cm and not m",
     1e3: "positions in m and not mm",
 }
-"""Factors of positions that are tried."""
 
+# Factors of angles that are tried.
 ANGLES_TRIED = {
     1.0: "",
     np.pi / 180: "angles in degrees and not rad",
     180 / np.pi: "angles in rad and not degrees",
 }
-"""Factors of angles that are tried."""
 
 NAMES = ("x", "y", "z")
 

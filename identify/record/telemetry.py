@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from identify.arrays import Array
 from identify.errors import RecordError
 
-TIME_ROUNDING = 1e-3
-"""Largest error of the time between two frames, as a share of the frame period."""
+TIME_ROUNDING = 1e-3  # largest error of the time between two frames, as a share of the frame period
 
 
 @dataclass(frozen=True)

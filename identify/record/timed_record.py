@@ -15,8 +15,7 @@ from identify.errors import RecordError
 from identify.files.dataset import described_dataset, joint_numbers, pose_parts, with_joint_units
 from identify.record.recording import STRETCH, TIMED, check_record, described_attributes
 
-FEWEST = 6
-"""Smallest number of measured poses of a stretch."""
+FEWEST = 6  # smallest number of measured poses of a stretch
 
 
 def build_timed_record(

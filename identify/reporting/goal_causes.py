@@ -18,20 +18,14 @@ from identify.reporting import goals
 from identify.reporting.goals import Goal, explanation_goals, far_off, unseen
 from identify.reporting.number_format import number
 
-STDS = 3.0
-"""Number of stated standard deviations within which an error counts as stated."""
-
+STDS = 3.0  # number of stated standard deviations within which an error counts as stated
+# Largest share of the true error at which measured poses count as agreeing with the model.
 AGREES = 0.5
-"""Largest share of the true error at which measured poses count as agreeing with the model."""
-
+# Share of an estimate's variance from which on it rests mainly on the initial guess.
 MOSTLY_GUESS = 0.5
-"""Share of an estimate's variance from which on it rests mainly on the initial guess."""
-
-ALIKE = 0.99
-"""Correlation from which on two parameters act almost alike."""
-
+ALIKE = 0.99  # correlation from which on two parameters act almost alike
+# Beginning of the reason why a search stopped before it had converged.
 STOPPED = "stopped after max_iterations"
-"""Beginning of the reason why a search stopped before it had converged."""
 
 
 @dataclass(frozen=True)
@@ -285,6 +279,7 @@ _OF_THE_MODEL = (_moved_cameras, _unfinished_search, _unsure_drive, _known_cause
 _OF_CAMERAS = (_moved_cameras, _noise, _unstated_error)
 _OF_PREDICTIONS = (*_OF_THE_MODEL, _held_gains, _unstable, _in_common, _stated, _intervals_fail)
 
+# Rules of each goal, in the order in which they are asked. The last one always finds a cause.
 _RULES: dict[str, tuple[Callable[[_Run], Advice | None], ...]] = {
     goals.RESIDUALS: _OF_THE_MODEL,
     goals.CHANCE: _OF_THE_MODEL,
@@ -295,4 +290,3 @@ _RULES: dict[str, tuple[Callable[[_Run], Advice | None], ...]] = {
     goals.LOST: (_moved_cameras, _lost),
     goals.FAR_OFF: (*_OF_THE_MODEL, _wrong_guess, _alike, _intervals_fail),
 }
-"""Rules of each goal, in the order in which they are asked. The last one always finds a cause."""

@@ -24,14 +24,11 @@ SENSOR_UM = 20.0
 SENSOR_URAD = 100.0
 PARAMETER_FRACTION = 0.05
 PARAMETER_STDS = 3.0
+# Number of standard deviations of a declared error that do not count as a missed goal.
 DECLARED_STDS = 3.0
-"""Number of standard deviations of a declared error that do not count as a missed goal."""
-
+# Kinds of common errors that the cameras declare, beside those of teaching.
 OF_CAMERAS = ("rig", "exposure")
-"""Kinds of common errors that the cameras declare, beside those of teaching."""
-
-TEACHING = "teaching"
-"""Kind of the errors of teaching, which are there in each run and small."""
+TEACHING = "teaching"  # kind of the errors of teaching, which are there in each run and small
 
 COMMON_ERRORS = "the estimated errors that all frames share"
 

@@ -7,11 +7,8 @@ written as zero.
 import math
 import re
 
-ROUNDING = 1e-9
-"""A sum that is smaller than this share of its terms counts as a rounding error."""
-
-LONG = 6
-"""Numbers from this power of ten on are written with a power of ten."""
+ROUNDING = 1e-9  # a sum that is smaller than this share of its terms counts as a rounding error
+LONG = 6  # numbers from this power of ten on are written with a power of ten
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

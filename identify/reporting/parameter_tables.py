@@ -12,8 +12,8 @@ from identify.loop_parameters import is_gain
 from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
+# Remark on an estimate that depends on the initial guess of other parameters.
 ON_GUESS = "rests on initial guess"
-"""Remark on an estimate that depends on the initial guess of other parameters."""
 
 Entry = dict[str, Any]
 
@@ -82,16 +82,16 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     )
 
 
+# Gain whose variance shows whether the scale is fixed, if joints share gains, or if not.
 GAINS = ("joint_pid.lp", "joint1.lp")
-"""Gain whose variance shows whether the scale is fixed, if joints share gains, or if not."""
 
+# Descriptions of the scale anchors.
 ANCHORS = {
     "platform_mass": "the weighed mass of the platform",
     "joint_gain": "a known gain of the joint controller",
     "payload": "a second run under a known load",
     "prior": "the initial guess alone: all parameters may be off by one common factor",
 }
-"""Descriptions of the scale anchors."""
 
 
 def group_table(result: dict[str, Any]) -> Table:
@@ -145,6 +145,7 @@ def correlation_table(result: dict[str, Any]) -> Table:
     )
 
 
+# Descriptions of the control laws of the drives.
 DRIVES = {
     "pid": "a PID",
     "pd": "a PD: no integral",
@@ -152,7 +153,6 @@ DRIVES = {
     "cascade": "a P-PI cascade, position around velocity",
     "pid_filtered": "a PID whose rate is filtered",
 }
-"""Descriptions of the control laws of the drives."""
 
 
 def drive_sentence(identification: Mapping[str, Any]) -> str:

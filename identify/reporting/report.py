@@ -29,14 +29,10 @@ from identify.reporting.verdict import key_numbers, verdict
 
 TEMPLATES = Path(__file__).parent / "templates"
 
-FIRST_LOOK = ("scene", "errors")
-"""Names of the pictures beside the verdict."""
-
+FIRST_LOOK = ("scene", "errors")  # names of the pictures beside the verdict
+# Largest width and height of an image on the page. The separate PNG file has all pixels.
 WIDEST_PX = 1500
-"""Largest width and height of an image on the page. The separate PNG file has all pixels."""
-
-QUALITY = 85
-"""Quality of an image on the page, on the scale of WebP."""
+QUALITY = 85  # quality of an image on the page, on the scale of WebP
 
 # Figures are drawn in the colours of the palette. The page replaces these by CSS variables.
 _NAMES = {code: name for name, code in PALETTE.items()}

@@ -10,8 +10,7 @@ from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
-CAUSES = 12
-"""Largest number of causes in the table of a diagnosis."""
+CAUSES = 12  # largest number of causes in the table of a diagnosis
 
 
 @dataclass(frozen=True)
@@ -172,6 +171,7 @@ def provenance_section(data: RunData) -> Section:
     )
 
 
+# Functions that build the sections, in the order of the report.
 SECTIONS: tuple[Callable[[RunData], Section], ...] = (
     sensor_section,
     excitation_section,
@@ -180,7 +180,6 @@ SECTIONS: tuple[Callable[[RunData], Section], ...] = (
     validation_section,
     provenance_section,
 )
-"""Functions that build the sections, in the order of the report."""
 
 
 def _steps(found: Mapping[str, Any]) -> str:

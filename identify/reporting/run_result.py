@@ -16,8 +16,8 @@ from identify.record import recording
 from identify.record.stored_common_errors import read_common_errors
 from identify.validation.pose_prediction import PosePrediction
 
+# Kinds of errors that all poses of a sensor have in common.
 SENSOR_KINDS = ("rig", "exposure", "teaching")
-"""Kinds of errors that all poses of a sensor have in common."""
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:

@@ -6,11 +6,9 @@ from typing import Any, NamedTuple
 
 from identify.scenario import load_scenario, scenario_names
 
+# Name of the built-in scenario with the settings of the paper. Scenarios without a built-in name
+# are compared with it.
 BUILT_IN_PAPER = "paper"
-"""Name of the built-in scenario with the settings of the paper.
-
-Scenarios without a built-in name are compared with it.
-"""
 
 
 class Setting(NamedTuple):

@@ -140,6 +140,7 @@ def common_error_table(result: dict[str, Any]) -> Table:
     return Table("Errors common to all frames", header, rows, note, folded=True)
 
 
+# Words for kinds of common errors whose names need an explanation.
 KINDS = {
     "rig": "cameras",
     "teaching": "taught frames",
@@ -148,7 +149,6 @@ KINDS = {
     "products": "products of inertia",
     "passive_friction": "friction of passive joints",
 }
-"""Words for kinds of common errors whose names need an explanation."""
 
 
 def _shares(found: dict[str, Any]) -> str:

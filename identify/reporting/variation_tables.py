@@ -11,18 +11,15 @@ from matplotlib.figure import Figure
 from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
-GOAL_PERCENT = 5.0
-"""Goal for the largest variation of an identified parameter."""
-
-PAPER_WORST_PERCENT = 24.9
-"""Largest variation in table 5 of the paper."""
-
+GOAL_PERCENT = 5.0  # goal for the largest variation of an identified parameter
+PAPER_WORST_PERCENT = 24.9  # largest variation in table 5 of the paper
+# Left end of the figure's axis. The platform is weighed once for all runs, and its mass therefore
+# hardly varies.
 SMALLEST_PERCENT = 0.1
-"""Left end of the figure's axis.
 
-The platform is weighed once for all runs, and its mass therefore hardly varies.
-"""
-
+# Variation of the parameters of the paper's robot (table 5). Only parameters that can be identified
+# are included. Rows that cannot be assigned are omitted, because our copy lacks a cell in the left
+# column.
 PAPER_PERCENT = {
     "platform.mass": 0.48,
     "platform.Ixx": 5.0,
@@ -41,11 +38,6 @@ PAPER_PERCENT = {
     },
     **dict(zip(("joint_pid.lp", "joint_pid.li", "joint_pid.ld"), (2.82, 0.44, 3.7), strict=True)),
 }
-"""Variation of the parameters of the paper's robot (table 5).
-
-Only parameters that can be identified are included. Rows that cannot be assigned are omitted,
-because our copy lacks a cell in the left column.
-"""
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:

@@ -25,11 +25,9 @@ from identify.reporting.goals import check_goals, explanation_goals
 from identify.reporting.number_format import number, share
 from identify.reporting.run_result import common_modes
 
+# Limit of the mean squared error of the measured poses, relative to the stated covariance. Beyond
+# the limit, the cameras can be the cause of the model's residuals.
 CAMERAS_MISS = 1.5
-"""Limit of the mean squared error of the measured poses, relative to the stated covariance.
-
-Beyond the limit, the cameras can be the cause of the model's residuals.
-"""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from pydantic import model_validator
 
 from identify.scenario.section import Section, quantity
 
+# Figures of a load, with their units: mass, centre of mass, and moments about it.
 FIGURES = {
     "mass": "kg",
     "x": "m",
@@ -15,12 +16,9 @@ FIGURES = {
     "Iyy": "kg m2",
     "Izz": "kg m2",
 }
-"""Figures of a load, with their units: mass, centre of mass, and moments about it."""
 
+# Relative tolerance for the moments of a flat body, whose largest moment is the sum of the others.
 ROUNDING = 1e-9
-"""Relative tolerance for the moments of a flat body, whose largest moment is the sum of the
-others.
-"""
 
 
 def check_moments(moments: Mapping[str, float]) -> None:

@@ -7,23 +7,17 @@ from pydantic import Field, field_validator, model_validator
 from dynamics.checks import Gain, check_inertia_forms, within
 from identify.scenario.section import Section, quantity
 
+# Friction laws of the joints. ``coulomb_viscous`` is the exact law with stick and slip (eq. 24),
+# ``smoothed`` has tanh(theta_dot / v_s) instead of the sign, and ``stribeck`` is exact with a
+# breakaway torque above the Coulomb torque.
 FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
-"""Friction laws of the joints.
 
-``coulomb_viscous`` is the exact law with stick and slip (eq. 24), ``smoothed`` has tanh(theta_dot /
-v_s) instead of the sign, and ``stribeck`` is exact with a breakaway torque above the Coulomb
-torque.
-"""
-
+# Constants that each friction law needs, each with its possible keys. A law has no other constants.
 FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
     "coulomb_viscous": (),
     "smoothed": (("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),),
     "stribeck": (("static_ratio",), ("stribeck_velocity_rad_s", "stribeck_velocity_m_s")),
 }
-"""Constants that each friction law needs, each with its possible keys.
-
-A law has no other constants.
-"""
 
 InertiaForm = Literal["centred", "full"]
 
@@ -35,11 +29,8 @@ They are the paper's PID, parts of it, a P-PI cascade, and a PID with a filtered
 
 FILTERED: DriveName = "pid_filtered"
 
-LARGEST_ZERO = 0.1
-"""Largest error of the zero of a joint, rad or m."""
-
-AUTO = "auto"
-"""Drive of a model whose law is determined from the record."""
+LARGEST_ZERO = 0.1  # largest error of the zero of a joint, rad or m
+AUTO = "auto"  # drive of a model whose law is determined from the record
 
 
 def check_filter(drive: str, seconds: float | None) -> None:
@@ -54,6 +45,7 @@ def check_filter(drive: str, seconds: float | None) -> None:
         )
 
 
+# Gains that each law of the drives uses.
 DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "pid": ("lp", "li", "ld"),
     "pd": ("lp", "ld"),
@@ -61,7 +53,6 @@ DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "cascade": ("lp", "li", "ld"),
     "pid_filtered": ("lp", "li", "ld"),
 }
-"""Gains that each law of the drives uses."""
 
 
 class _Side(Section):

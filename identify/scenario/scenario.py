@@ -34,17 +34,12 @@ from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, 
 if TYPE_CHECKING:
     from cmmsim.files import SensorFile
 
+# Sections of a scenario that only the estimator reads. A user can change them after the record was
+# made, but no other sections.
 ESTIMATOR_SECTIONS = ("identification", "model", "filter")
-"""Sections of a scenario that only the estimator reads.
-
-A user can change them after the record was made, but no other sections.
-"""
-
+# Settings in these sections on which the record depends. The record includes what its scale anchor
+# measured.
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
-"""Settings in these sections on which the record depends.
-
-The record includes what its scale anchor measured.
-"""
 
 
 class Scenario(Section):

@@ -18,6 +18,7 @@ from dynamics.checks import (
     within,
 )
 
+# Keys of the joint settings, for turning and for sliding actuators.
 ACTUATOR_KEYS = {
     "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
     "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
@@ -38,9 +39,9 @@ ACTUATOR_KEYS = {
     "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
-"""Keys of the joint settings, for turning and for sliding actuators."""
 
 
+# Range of values for each unit.
 RANGES = {
     "Hz": within(Frequency),
     "rad/s": within(Speed),
@@ -59,7 +60,6 @@ RANGES = {
     "1/s": within(Gain),
     "1": within(Ratio),
 }
-"""Range of values for each unit."""
 
 
 def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:

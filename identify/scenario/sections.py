@@ -98,11 +98,10 @@ class PriorValue(Section):
     std: float = quantity(..., "SI", "standard deviation of the value", ge=1e-24, le=1e12)
 
 
+# Range of the error or the drift of one parameter of a camera.
 CAMERA_CHANGE = Within(-1e3, 1e3, "in the unit of the parameter")
-"""Range of the error or the drift of one parameter of a camera."""
-
+# Ways in which a rig can be known, besides the path of a calibration result.
 RIG_KNOWN = ["exact", "calibrated", "photographs"]
-"""Ways in which a rig can be known, besides the path of a calibration result."""
 
 
 class Rig(Section):
@@ -167,10 +166,11 @@ class Rig(Section):
         return self.known == "exact" and self.right_later_std_s == 0.0
 
 
+# Ways in which a geometry can be known, besides the path of a calibrated robot.
 GEOMETRY_KNOWN = ["exact", "calibrated"]
-"""Ways in which a geometry can be known, besides the path of a calibrated robot."""
 
 
+# Kinds of errors that all poses of a record have in common.
 Nuisance = Literal[
     "rig",
     "teaching",
@@ -186,7 +186,6 @@ Nuisance = Literal[
     "products",
     "passive_friction",
 ]
-"""Kinds of errors that all poses of a record have in common."""
 
 
 class Identification(Section):

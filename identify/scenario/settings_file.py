@@ -164,8 +164,8 @@ def _text(
     return "\n".join(lines + sections) + "\n"
 
 
+# Number of errors of one file that are listed. Further errors are only counted.
 MOST_COMPLAINTS = 8
-"""Number of errors of one file that are listed. Further errors are only counted."""
 
 DOTTED = (
     "; a name with a dot must be in double quotes, and in a shell within single quotes: "

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from cmmsim.files import SensorFile
     from cmmsim.files import Timing as SensorTiming
 
+# Number of standard deviations by which the mean latency can exceed the stated one.
 LATENCY_STDS = 5.0
-"""Number of standard deviations by which the mean latency can exceed the stated one."""
 
+# Keys in the file of the sensor, by the keys in ``[timing]`` of a scenario.
 IN_FILE = {
     "frame_rate_hz": "frame_rate",
     "exposure_s": "exposure",
@@ -29,7 +30,6 @@ IN_FILE = {
     "latency_jitter_s": "latency_jitter",
     "dropout": "dropout",
 }
-"""Keys in the file of the sensor, by the keys in ``[timing]`` of a scenario."""
 
 
 class Timing(Section):

@@ -12,8 +12,7 @@ from cmmsim.radiometry.stereo_images import StereoFrame
 from identify.arrays import Array
 from identify.scene.workcell import Workcell
 
-MARGIN_PX = 24.0
-"""Margin around bodies and stickers in the shown part of the images, px."""
+MARGIN_PX = 24.0  # margin around bodies and stickers in the shown part of the images, px
 
 
 @dataclass(frozen=True)

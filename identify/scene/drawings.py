@@ -30,14 +30,10 @@ FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
 
 SIDES = ("left", "right")
 
-ARROWS = 3000.0
-"""Factor that enlarges errors of a hundredth of a pixel, so that they can be seen."""
-
+ARROWS = 3000.0  # factor that enlarges errors of a hundredth of a pixel, so that they can be seen
+# Half width, half height and length of the box that represents a camera, in m.
 CAMERA_M = np.array([0.05, 0.04, 0.12])
-"""Half width, half height and length of the box that represents a camera, in m."""
-
-FRUSTUM_M = 0.30
-"""Distance in front of a camera up to which its field of view is drawn, in m."""
+FRUSTUM_M = 0.30  # distance in front of a camera up to which its field of view is drawn, in m
 
 
 def scene_figure(

@@ -17,14 +17,10 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
 
-PIECE = 1 / 60
-"""Longest edge of a piece, as a share of the size of the scene."""
-
+PIECE = 1 / 60  # longest edge of a piece, as a share of the size of the scene
+# Direction from the scene to the light, in the base frame. Its length does not matter.
 LIGHT = np.array([0.35, -0.55, 0.76])
-"""Direction from the scene to the light, in the base frame. Its length does not matter."""
-
-SHADE = 0.62
-"""Brightness of a face without light. A face towards the light has the brightness one."""
+SHADE = 0.62  # brightness of a face without light. A face towards the light has the brightness one.
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ from identify.scene.drawings import (
 from identify.scene.replayed_motion import TRUE, Motion
 from identify.scene.workcell import Solid, Workcell
 
+# Height of a drawn sticker above its plane, in m, so that the plane does not show through.
 ABOVE_M = 0.0004
-"""Height of a drawn sticker above its plane, in m, so that the plane does not show through."""
 
 
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
@@ -118,20 +118,14 @@ def _add(
 PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
 
-KEY_FRAMES = 24
-"""Number of frames with images. Images need most of the time and half of the file."""
-
+KEY_FRAMES = 24  # number of frames with images. Images need most of the time and half of the file.
+# JPEG quality of the images. An image has about 30 kB. WebP would be half as large, but writing it
+# would take as long as rendering the image.
 IMAGE_QUALITY = 45
-"""JPEG quality of the images. An image has about 30 kB.
-
-WebP would be half as large, but writing it would take as long as rendering the image.
-"""
-
+# Radius of the ball with 95 % of a normal distribution in space, in standard deviations.
 CONFIDENCE = 2.7955
-"""Radius of the ball with 95 % of a normal distribution in space, in standard deviations."""
-
+# End of the libraries in the page that trimesh writes. The viewer of trimesh follows them.
 LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
-"""End of the libraries in the page that trimesh writes. The viewer of trimesh follows them."""
 
 
 def write_page(path: Path | str, motion: Motion, progress: Progress | None = None) -> None:

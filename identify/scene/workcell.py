@@ -27,8 +27,7 @@ from identify.errors import ScenarioError
 from identify.experiment.leg_bodies import meshed_parts, robot_meshes, robot_transforms
 from identify.experiment.sensor_in_loop import check_platform
 
-PLATE_M = 0.012
-"""Half the thickness, in m, of the plate drawn for a platform without a given shape."""
+PLATE_M = 0.012  # half the thickness, in m, of the plate drawn for a platform without a given shape
 
 
 @dataclass(frozen=True)

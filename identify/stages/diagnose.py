@@ -18,8 +18,7 @@ from identify.reporting.run_result import parameter_vector
 from identify.scenario import load_scenario
 from identify.stages.plan import identified_files
 
-ENTRY = "diagnosis"
-"""Name of the entry of result.json that holds the diagnosis."""
+ENTRY = "diagnosis"  # name of the entry of result.json that holds the diagnosis
 
 
 def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:

@@ -123,12 +123,10 @@ def identify_own(
     write_files(files | found, parents=True)
 
 
+# Largest excess of the residual, as a share of the noise, for which no diagnosis is made. The
+# residual is that of the model under the logged commands. Errors of the teaching can cause such an
+# excess if the teaching counts as exact.
 LITTLE = 0.1
-"""Largest excess of the residual, as a share of the noise, for which no diagnosis is made.
-
-The residual is that of the model under the logged commands. Errors of the teaching can cause such
-an excess if the teaching counts as exact.
-"""
 
 
 def _is_missed(result: IdentificationResult) -> bool:

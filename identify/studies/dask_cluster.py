@@ -32,11 +32,9 @@ from identify.files.versions import product_version, require_product, same_versi
 from identify.studies.runner import Batches, Suspects, compute
 from identify.studies.study_design import Case, Finished, Shared
 
+# Longest allowed time without workers, s. On a busy machine workers start slowly.
 WORKERLESS_SECONDS = 180
-"""Longest allowed time without workers, s. On a busy machine workers start slowly."""
-
-ANSWER_SECONDS = 30
-"""Longest allowed time for an answer of a scheduler, s."""
+ANSWER_SECONDS = 30  # longest allowed time for an answer of a scheduler, s
 
 SCHEDULER_LOST = (
     "the Dask scheduler is gone; the same command with another scheduler continues the study"
@@ -44,8 +42,8 @@ SCHEDULER_LOST = (
 
 REMEDY = "install the same version on all machines"
 
+# Number of submitted batches per worker: one being computed, and the next batches waiting.
 BATCHES_A_WORKER = 3
-"""Number of submitted batches per worker: one being computed, and the next batches waiting."""
 
 
 class DaskExecutor:
@@ -174,11 +172,9 @@ def scheduler_lost(error: OSError) -> StudyError:
     return StudyError(f"{SCHEDULER_LOST}: {' '.join(str(error).split())}")
 
 
+# Longest allowed time for the first answer of a scheduler, s. TLS takes seconds if it is busy.
 CONNECT_SECONDS = 20
-"""Longest allowed time for the first answer of a scheduler, s. TLS takes seconds if it is busy."""
-
-ENCRYPTED = ("tls", "wss")
-"""Kinds of address for which both sides present a certificate."""
+ENCRYPTED = ("tls", "wss")  # kinds of address for which both sides present a certificate
 
 
 @contextmanager

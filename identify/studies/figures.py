@@ -27,8 +27,7 @@ from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, rows_with_figures
 from identify.studies.uniformity import Uniformity, uniformity_figure
 
-PANEL = (3.4, 2.8)
-"""Width and height of a panel, inches. The width fits a column of a journal."""
+PANEL = (3.4, 2.8)  # width and height of a panel, inches. The width fits a column of a journal.
 STYLE: Any = {
     "font.size": 8,
     "axes.spines.top": False,
@@ -41,23 +40,18 @@ STYLE: Any = {
 MARKERS = "osD^vPX<>*hpd"
 LINES = ("-", "--", "-.", ":")
 FORMATS = ("png", "pdf", "svg")
+# Smallest ratio of the ends of a logarithmic axis. With it, small differences look small.
 LEAST_SPAN = 2.0
-"""Smallest ratio of the ends of a logarithmic axis. With it, small differences look small."""
+# Largest factor by which bands extend a logarithmic axis beyond the curves. Wider bands are cut.
 WIDEST_BAND = 3.0
-"""Largest factor by which bands extend a logarithmic axis beyond the curves. Wider bands are cut.
-"""
-LETTERS_PER_INCH = 14.0
-"""Letters of a title per inch, a little fewer than fit."""
-BESIDE = 1.02
-"""Ratio between the abscissae of two neighbouring curves with the same levels."""
+LETTERS_PER_INCH = 14.0  # letters of a title per inch, a little fewer than fit
+BESIDE = 1.02  # ratio between the abscissae of two neighbouring curves with the same levels
+# Largest number of separate curves. If the other factors have more settings, all rows form one
+# curve.
 MOST_CURVES = 6
-"""Largest number of separate curves. If the other factors have more settings, all rows form one
-curve.
-"""
-NEAREST_TICKS = 0.09
-"""Smallest distance of two ticks of a vertical axis, as a share of the axis."""
-LETTER = 0.034
-"""Width of a letter of a tick label, as a share of the axis."""
+NEAREST_TICKS = 0.09  # smallest distance of two ticks of a vertical axis, as a share of the axis
+LETTER = 0.034  # width of a letter of a tick label, as a share of the axis
+# Choices of ticks within a decade of a logarithmic axis. The first choice that fits is used.
 TICKS: list[list[float]] = [
     [1 + k / 10 for k in range(90)],
     [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8],
@@ -66,11 +60,9 @@ TICKS: list[list[float]] = [
     [1, 3],
     [1],
 ]
-"""Choices of ticks within a decade of a logarithmic axis. The first choice that fits is used."""
 MOST_TICKS = 7
 
-Others = Sequence[tuple[str, pd.DataFrame]]
-"""Names and finished rows of other studies."""
+Others = Sequence[tuple[str, pd.DataFrame]]  # names and finished rows of other studies
 
 
 def draw(

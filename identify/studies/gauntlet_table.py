@@ -16,14 +16,9 @@ from identify.studies.rows.gauntlet.drawn_troubles import TROUBLES
 from identify.studies.rows.gauntlet.verdict import GROUPS
 from identify.studies.study_file import Study
 
-STEM = "gauntlet"
-"""Name of the files, before their suffix."""
-
-DOUBLED = 2.0
-"""Smallest misfit with which a case counts in the shares of one and two causes."""
-
-LEVEL = 0.95
-"""Probability of the intervals of shares."""
+STEM = "gauntlet"  # name of the files, before their suffix
+DOUBLED = 2.0  # smallest misfit with which a case counts in the shares of one and two causes
+LEVEL = 0.95  # probability of the intervals of shares
 
 
 @dataclass(frozen=True)

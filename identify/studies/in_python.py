@@ -20,8 +20,8 @@ from identify.studies.runner import in_this_process, run_study
 from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile
 
+# Columns that are dropped from the table: neither factors nor figures. `repeat` is kept.
 BOOKKEEPING = ("row", "seed_entropy", "seed_spawn_key", "seconds", "error")
-"""Columns that are dropped from the table: neither factors nor figures. `repeat` is kept."""
 
 
 @dataclass(frozen=True)

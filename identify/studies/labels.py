@@ -7,9 +7,9 @@ from identify.studies.rows import KINDS
 from identify.studies.study_design import field_of, valid_keys
 from identify.studies.study_file import Study
 
-PRINTED = {"um": "µm", "urad": "µrad"}
-"""Units as plots show them."""
+PRINTED = {"um": "µm", "urad": "µrad"}  # units as plots show them
 
+# Units by the ends of names. Users' own kinds of row state units only in names.
 SUFFIXES = {
     "_um": "um",
     "_urad": "urad",
@@ -20,10 +20,8 @@ SUFFIXES = {
     "_rad": "rad",
     "_percent": "%",
 }
-"""Units by the ends of names. Users' own kinds of row state units only in names."""
 
-WIDEST = 28
-"""Largest number of letters in a line of a label."""
+WIDEST = 28  # largest number of letters in a line of a label
 
 
 def factor_unit(path: str) -> str:

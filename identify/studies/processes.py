@@ -28,11 +28,9 @@ from identify.studies.study_design import Case, Finished, Shared
 from identify.studies.study_file import Range, Study
 from identify.studies.worker import work
 
+# Factors that determine the length of a record or of a stretch of a path.
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
-"""Factors that determine the length of a record or of a stretch of a path."""
-
-PROCESS = 0.5e9
-"""Memory of a process before its first row, bytes."""
+PROCESS = 0.5e9  # memory of a process before its first row, bytes
 
 GB = 1e9
 
@@ -61,26 +59,16 @@ def _largest(values: list[float] | Range) -> float:
     return values.high if isinstance(values, Range) else max(values)
 
 
+# Start method of the processes, by which they inherit neither threads nor locks.
 SPAWN = get_context("spawn")
-"""Start method of the processes, by which they inherit neither threads nor locks."""
-
+# Variables that limit a process to one thread, because there are as many processes as cores. They
+# are set before a process loads its libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Variables that limit a process to one thread, because there are as many processes as cores.
-
-They are set before a process loads its libraries.
-"""
-
-MEMORY_SHARE = 0.95
-"""Share of the machine's memory that all processes together are allowed to use."""
-
-LOOK_S = 1.0
-"""Interval at which the memory of the processes is checked, s."""
-
+MEMORY_SHARE = 0.95  # share of the machine's memory that all processes together are allowed to use
+LOOK_S = 1.0  # interval at which the memory of the processes is checked, s
+# The study fails after this number of consecutive processes that die before they are ready.
 MOST_FAILED_STARTS = 3
-"""The study fails after this number of consecutive processes that die before they are ready."""
-
-END_S = 10.0
-"""Longest time to wait for the end of a killed process, s."""
+END_S = 10.0  # longest time to wait for the end of a killed process, s
 
 
 class ProcessExecutor:

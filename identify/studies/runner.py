@@ -51,11 +51,10 @@ class Outcome:
         return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
+# Function that computes all batches, and yields their rows in the order in which they finish.
 Executor = Callable[[Shared, "Batches"], Iterator[list[Finished]]]
-"""Function that computes all batches, and yields their rows in the order in which they finish."""
-
+# Function that returns an executor as a context. The workers live as long as the context.
 Workers = Callable[[], AbstractContextManager[Executor]]
-"""Function that returns an executor as a context. The workers live as long as the context."""
 
 
 @contextmanager
@@ -71,13 +70,10 @@ def _serial(shared: Shared, batches: "Batches") -> Iterator[list[Finished]]:
         yield finished
 
 
-SoFar = Callable[[pd.DataFrame], object]
-"""Function that gets the table of the rows finished so far."""
-
+SoFar = Callable[[pd.DataFrame], object]  # function that gets the table of the rows finished so far
+# Shortest interval between tables of finished rows, seconds, and the largest share of the time that
+# these tables take.
 SO_FAR_S, SO_FAR_SHARE = 30.0, 0.02
-"""Shortest interval between tables of finished rows, seconds, and the largest share of the time
-that these tables take.
-"""
 
 
 def run_study(
@@ -163,12 +159,9 @@ def _compute_pending(
             shown()
 
 
+# Duration of a batch, s. It is long enough that sending costs little. If all processes are killed,
+# each loses at most this much work.
 BATCH_SECONDS = 0.25
-"""Duration of a batch, s.
-
-It is long enough that sending costs little. If all processes are killed, each loses at most this
-much work.
-"""
 
 LARGEST_BATCH = 500
 

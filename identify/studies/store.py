@@ -37,6 +37,9 @@ JOURNAL = "rows.jsonl"
 VIEW = "study.nc"
 VERSIONS = "versions"
 
+# Entries that are allowed to change in a continued study, because finished rows do not depend on
+# them. Rows of further repeats come after all other rows. With fewer repeats, the further rows stay
+# in the journal and are ignored.
 MAY_CHANGE = (
     "study.title",
     "study.theory",
@@ -44,12 +47,6 @@ MAY_CHANGE = (
     "study.repeats",
     "scenario.description",
 )
-"""Entries that are allowed to change in a continued study, because finished rows do not depend on
-them.
-
-Rows of further repeats come after all other rows. With fewer repeats, the further rows stay in the
-journal and are ignored.
-"""
 
 REMEDY = "continue with that version, or name another folder with --out"
 

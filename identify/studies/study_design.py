@@ -31,14 +31,10 @@ from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
 
+# Prefixes of the names of factors. No figure has such a prefix.
 ROOTS = ("scenario.", "sensor.", "options.")
-"""Prefixes of the names of factors. No figure has such a prefix."""
-
-SENSOR_CHANGES = "sensor_changes"
-"""Table of a scenario that holds the keys ``sensor.`` of a study."""
-
-NEAREST = 4
-"""Number of suggested names in an error message."""
+SENSOR_CHANGES = "sensor_changes"  # table of a scenario that holds the keys ``sensor.`` of a study
+NEAREST = 4  # number of suggested names in an error message
 
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 

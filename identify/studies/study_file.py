@@ -226,8 +226,7 @@ STUDIES = SettingsFiles(
 )
 
 
-STARTING = Path(__file__).parent / "starting.toml"
-"""Template of a study file, with all keys."""
+STARTING = Path(__file__).parent / "starting.toml"  # template of a study file, with all keys
 
 
 def load_study(name_or_path: str | Path) -> Study:

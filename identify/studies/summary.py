@@ -25,13 +25,10 @@ from identify.studies.uniformity import Uniformity
 
 JSON = "summary.json"
 MARKDOWN = "summary.md"
-NAMED = 20
-"""Largest number of failed rows, and of reasons, that the summary names."""
+NAMED = 20  # largest number of failed rows, and of reasons, that the summary names
+# Largest number of points in the table of `summary.md`. `summary.json` has all points.
 LONGEST = 60
-"""Largest number of points in the table of `summary.md`. `summary.json` has all points."""
-
-Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
-"""Factors and statistics of points."""
+Points = list[tuple[dict[str, Any], dict[str, Statistics]]]  # factors and statistics of points
 
 
 def write(

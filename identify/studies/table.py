@@ -35,8 +35,8 @@ from identify.studies.study_design import Design, Finished
 from identify.studies.study_file import Study
 
 FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
+# Columns of a study's table after its figures. The columns `FIRST` come before its factors.
 LAST = ("seconds", "error")
-"""Columns of a study's table after its figures. The columns `FIRST` come before its factors."""
 
 TABLE = "study.parquet"
 STUDY_KEY = b"cmmsim.study"

@@ -33,8 +33,7 @@ from identify.studies.study_file import Law, Study
 
 ITERATIONS = 100
 STEP_TOLERANCE = 1e-10
-SMALLEST = 1e-12
-"""Smallest square at the start of the fit, as a share of the largest one."""
+SMALLEST = 1e-12  # smallest square at the start of the fit, as a share of the largest one
 
 
 @dataclass(frozen=True)
@@ -157,11 +156,9 @@ def point_statistics(values: Array) -> Statistics:
 
 
 CONFIDENCE = 0.99
+# Largest half-width of an interval with which a law passes. The interval is of an exponent, or of
+# the logarithm of a ratio.
 RESOLUTION = 0.2
-"""Largest half-width of an interval with which a law passes.
-
-The interval is of an exponent, or of the logarithm of a ratio.
-"""
 
 
 @dataclass(frozen=True)

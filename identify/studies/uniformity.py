@@ -24,20 +24,11 @@ from scipy.stats import binom, kstest
 from identify.arrays import Array
 from identify.studies.rows.kind import PROBABILITY
 
-FEWEST = 20
-"""Smallest number of rows with a figure for which it is tested."""
-
-LEVEL = 0.01
-"""Corrected p value below which a figure counts as not uniform."""
-
-BAND = 0.95
-"""Probability that the whole curve of a right distribution is in the band."""
-
-POINTS = 200
-"""Number of points at which the band is computed."""
-
-SIMULATED = 4000
-"""Number of simulated curves, which determine the probability of the band to 0.4 %."""
+FEWEST = 20  # smallest number of rows with a figure for which it is tested
+LEVEL = 0.01  # corrected p value below which a figure counts as not uniform
+BAND = 0.95  # probability that the whole curve of a right distribution is in the band
+POINTS = 200  # number of points at which the band is computed
+SIMULATED = 4000  # number of simulated curves, which determine the probability of the band to 0.4 %
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,9 @@ from identify.experiment.run import Latencies
 
 USUAL = Latencies()
 
+# Factor of the stated covariance for exact poses. It is not zero, because an observer needs a
+# positive definite covariance.
 NEARLY_EXACT = 1e-3
-"""Factor of the stated covariance for exact poses.
-
-It is not zero, because an observer needs a positive definite covariance.
-"""
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,11 @@ from identify.experiment.law_in_loop import NamedMotion
 from identify.loop_parameters import of_actuators
 from identify.trajectory import box_of
 
-LARGEST_MOTION = 100_000_000
-"""Largest number of bytes of a file of poses: an hour at 200 Hz."""
+LARGEST_MOTION = 100_000_000  # largest number of bytes of a file of poses: an hour at 200 Hz
 
 COLUMNS = ("t", *POSE_NAMES)
 
-FEWEST_ROWS = 6
-"""Number of rows that a spline of fifth degree needs."""
+FEWEST_ROWS = 6  # number of rows that a spline of fifth degree needs
 
 
 @dataclass(frozen=True)

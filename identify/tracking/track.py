@@ -36,17 +36,13 @@ from identify.setup import Setup
 from identify.tracking.following import TrackingRun, by_drawing, follow
 from identify.tracking.motions import motions
 
+# Names of the models: the scenario's initial guess, the identified model, and the true plant.
 MODELS = ("initial", "identified", "true")
-"""Names of the models: the scenario's initial guess, the identified model, and the true plant."""
-
+# Number of the first run. The runs of an identification have smaller numbers, so the random streams
+# are separate.
 FIRST_RUN = 2_000_000
-"""Number of the first run.
-
-The runs of an identification have smaller numbers, so the random streams are separate.
-"""
-
+# Parts that are made exact, one at a time, to determine their share of the error.
 EXACT = ("sensor", "model", "latency")
-"""Parts that are made exact, one at a time, to determine their share of the error."""
 
 PARTS = ("position", "orientation")
 

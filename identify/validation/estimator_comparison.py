@@ -56,8 +56,7 @@ from identify.validation.unseen import model_on_record
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-START = "starting guess"
-"""Key of the initial guess in the results."""
+START = "starting guess"  # key of the initial guess in the results
 
 
 @dataclass(frozen=True)

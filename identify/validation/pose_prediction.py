@@ -23,23 +23,15 @@ from identify.progress import Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 
+# Source of uncertainty of a prediction: the sensor's noise moves the plant through the servo.
 MOTION = "motion"
-"""Source of uncertainty of a prediction: the sensor's noise moves the plant through the servo."""
-
+# Number of repeated experiments per motion. With NEIGHBOURS, they determine the standard deviation
+# due to noise in a frame to about 6 %.
 REPETITIONS = 48
-"""Number of repeated experiments per motion.
-
-With NEIGHBOURS, they determine the standard deviation due to noise in a frame to about 6 %.
-"""
-
-NEIGHBOURS = 5
-"""Number of frames over which the covariance due to noise is averaged."""
-
+NEIGHBOURS = 5  # number of frames over which the covariance due to noise is averaged
+# Weight of the mean over the motion in a frame's covariance due to noise. Without it, the
+# covariance would be zero while the platform still rests at the start.
 SHRINKAGE = 0.02
-"""Weight of the mean over the motion in a frame's covariance due to noise.
-
-Without it, the covariance would be zero while the platform still rests at the start.
-"""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from identify.progress import Progress
 if TYPE_CHECKING:
     import pandas as pd
 
-FEWEST_RUNS = 3
-"""Smallest number of runs for a meaningful standard deviation."""
+FEWEST_RUNS = 3  # smallest number of runs for a meaningful standard deviation
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,9 @@ from identify.progress import Progress
 from identify.random_streams import RESAMPLING, mixed_generator
 from identify.reporting.goal_causes import Advice
 
+# Number of standard deviations that the largest of 35 errors exceeds by chance in one of 60 tests.
 STDS = 3.5
-"""Number of standard deviations that the largest of 35 errors exceeds by chance in one of 60 tests.
-"""
-
-BLOCK = 10
-"""Number of neighbouring frames of the bar that are resampled together."""
+BLOCK = 10  # number of neighbouring frames of the bar that are resampled together
 
 
 @dataclass
@@ -318,6 +315,7 @@ def _circle_steps(volume: MeasuringVolume) -> int:
     return FRAMES
 
 
+# Tests by the names that the command line knows.
 STANDARDS = {
     "vdi": Standard(
         "lengths (VDI/VDE 2634-1)",
@@ -335,4 +333,3 @@ STANDARDS = {
     ),
     "e3124": Standard("latency (ASTM E3124)", "astm_e3124", _circle_steps, latency_test, _latency),
 }
-"""Tests by the names that the command line knows."""

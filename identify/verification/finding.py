@@ -4,8 +4,7 @@ from dataclasses import asdict, dataclass, field
 from textwrap import shorten
 from typing import Any
 
-LONGEST = 160
-"""Largest number of characters of a finding in a message, unless it holds a remedy."""
+LONGEST = 160  # largest number of characters of a finding in a message, unless it holds a remedy
 
 
 @dataclass(frozen=True)

@@ -39,11 +39,9 @@ from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification
 
+# Largest ratio of the rows of commands to those of poses, if each command is logged once.
 ONCE = 1.5
-"""Largest ratio of the rows of commands to those of poses, if each command is logged once."""
-
-MOST_FRAMES = 10_000
-"""Largest number of frames for which the model runs."""
+MOST_FRAMES = 10_000  # largest number of frames for which the model runs
 
 
 @dataclass(frozen=True)

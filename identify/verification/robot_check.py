@@ -28,14 +28,10 @@ from identify.setup import Setup
 from identify.verification.finding import Finding
 from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
 
-SAMPLES = 2000
-"""Number of random joint coordinates over the travel."""
-
+SAMPLES = 2000  # number of random joint coordinates over the travel
+# Largest ratio between the length of a mesh and the reach of its body, in either direction.
 MOST_MESH_RATIO = 20.0
-"""Largest ratio between the length of a mesh and the reach of its body, in either direction."""
-
-NEGLIGIBLE_CHANGE = 1e-9
-"""Largest relative change of an acceleration that counts as zero."""
+NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that counts as zero
 
 
 def check_robot(

@@ -32,11 +32,9 @@ from identify.verification.acceptance import AcceptanceRun
 # Two corners of a box are connected by an edge if they differ in one coordinate.
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
 
+# Length of an arrow for a residual of three sigma, as a share of the image width.
 ARROW_SHARE = 0.06
-"""Length of an arrow for a residual of three sigma, as a share of the image width."""
-
-GRID = 25
-"""Number of points along the width of the image in drawings of the distortion."""
+GRID = 25  # number of points along the width of the image in drawings of the distortion
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:

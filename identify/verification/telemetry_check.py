@@ -22,41 +22,19 @@ from identify.record.suspicions import joint_motion
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
-RATE = 0.01
-"""Largest relative difference of a frame rate from the stated one."""
-
-NOISE = 2.0
-"""Largest factor between the noise of the poses and the stated one."""
-
-FROZEN = 0.01
-"""Largest share of poses that are equal to the pose before in all digits."""
-
-FRAMES_A_PERIOD = 6.0
-"""Smallest number of frames in a period of the highest frequency of a motion."""
-
+RATE = 0.01  # largest relative difference of a frame rate from the stated one
+NOISE = 2.0  # largest factor between the noise of the poses and the stated one
+FROZEN = 0.01  # largest share of poses that are equal to the pose before in all digits
+FRAMES_A_PERIOD = 6.0  # smallest number of frames in a period of the highest frequency of a motion
+# Largest share of commands that stay at the end of their range while the robot moves.
 SATURATED = 0.01
-"""Largest share of commands that stay at the end of their range while the robot moves."""
-
-STUCK = 3
-"""Smallest number of equal commands in a row that count as staying."""
-
-FOLLOWS = 0.8
-"""Smallest mean correlation of the joints with their commands."""
-
-BEFORE_S = 0.1
-"""Largest time, s, by which a motion can seem to be before its commands."""
-
-CLOCK = 0.05
-"""Largest offset of the clocks, in frames, beside what is stated of them."""
-
-STDS = 3.0
-"""Largest offset or drift in stated standard deviations."""
-
-SHOWN_GROUPS = 0.5
-"""Smallest share of the groups of parameters that the motion can show."""
-
-LISTED = 5
-"""Largest number of names or times in a finding."""
+STUCK = 3  # smallest number of equal commands in a row that count as staying
+FOLLOWS = 0.8  # smallest mean correlation of the joints with their commands
+BEFORE_S = 0.1  # largest time, s, by which a motion can seem to be before its commands
+CLOCK = 0.05  # largest offset of the clocks, in frames, beside what is stated of them
+STDS = 3.0  # largest offset or drift in stated standard deviations
+SHOWN_GROUPS = 0.5  # smallest share of the groups of parameters that the motion can show
+LISTED = 5  # largest number of names or times in a finding
 
 
 def check_telemetry(logged: LoggedRun, progress: Progress | None = None) -> list[Finding]:

@@ -10,8 +10,8 @@ from identify.reporting.tables import Table, number
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
+# Word in the table for a finding that fails. The style of the page highlights this word.
 MISSED = "MISSED"
-"""Word in the table for a finding that fails. The style of the page highlights this word."""
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:

@@ -17,14 +17,9 @@ from identify.arrays import Array
 from identify.progress import Progress, SilentProgress
 from identify.reporting.figures import COMPONENTS
 
-POINTS = 101
-"""Number of grid points along each side of a map."""
-
-JOINT_SAMPLES = 20_000
-"""Number of random joint vectors for the extremes over the travel."""
-
-COLUMNS = 3
-"""Number of columns of maps in a figure."""
+POINTS = 101  # number of grid points along each side of a map
+JOINT_SAMPLES = 20_000  # number of random joint vectors for the extremes over the travel
+COLUMNS = 3  # number of columns of maps in a figure
 
 AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 

@@ -11,23 +11,14 @@ from typing import Any
 
 LOG_TIME = "log_time"
 
-LISTED = 8
-"""Number of messages of a topic that are searched for the names of its entries."""
-
-MOST = 500
-"""Largest number of columns of a topic."""
-
-NAMES = ("name", "joint_names")
-"""Entries of a message that name those of its arrays."""
-
-CHILD = "child_frame_id"
-"""Entry that names a transform among several."""
-
+LISTED = 8  # number of messages of a topic that are searched for the names of its entries
+MOST = 500  # largest number of columns of a topic
+NAMES = ("name", "joint_names")  # entries of a message that name those of its arrays
+CHILD = "child_frame_id"  # entry that names a transform among several
+# Name of an entry of a message, and number or name in its brackets, or None.
 Step = tuple[str, str | None]
-"""Name of an entry of a message, and number or name in its brackets, or None."""
-
+# Number of a message, time as text, or None where a message has no such entry.
 Entry = str | float | None
-"""Number of a message, time as text, or None where a message has no such entry."""
 
 
 def list_topics(path: Path) -> dict[str, tuple[str, tuple[str, ...]]]:

@@ -20,14 +20,9 @@ from identify.record.telemetry import Rows
 
 SUFFIXES = (".mcap", ".db3")
 
-METADATA = "metadata.yaml"
-"""File in the folder of a bag that lists its other files."""
-
-LARGEST_METADATA = 1_000_000
-"""Largest size of that file, bytes."""
-
-LIMIT_S = 120
-"""Time limit for reading a topic, s. Bags with images are large."""
+METADATA = "metadata.yaml"  # file in the folder of a bag that lists its other files
+LARGEST_METADATA = 1_000_000  # largest size of that file, bytes
+LIMIT_S = 120  # time limit for reading a topic, s. Bags with images are large.
 
 
 def is_bag(path: Path) -> bool:

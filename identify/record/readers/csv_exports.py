@@ -15,14 +15,10 @@ from identify.record.csv_record import lines_of
 from identify.record.readers.streams import Header, Stream, check_columns
 from identify.record.telemetry import Rows
 
-MOTIVE = "Format Version"
-"""First cell of an export of Motive."""
-
+MOTIVE = "Format Version"  # first cell of an export of Motive
+# Titles of the sections of an export of Vicon.
 VICON = ("Segments", "Objects", "Joints", "Model Outputs", "Trajectories", "Devices")
-"""Titles of the sections of an export of Vicon."""
-
-FRAME = "Frame"
-"""First column of both exports."""
+FRAME = "Frame"  # first column of both exports
 
 SEPARATORS = ",;\t"
 
@@ -113,8 +109,7 @@ def _motive(path: Path, lines: Sequence[Line]) -> Part:
     return Part(header, lines[last + 1 :])
 
 
-POSITION = "Position"
-"""Word above the columns of a position in an export of Motive."""
+POSITION = "Position"  # word above the columns of a position in an export of Motive
 
 
 def _vicon(path: Path, lines: Sequence[Line]) -> dict[str, Part]:

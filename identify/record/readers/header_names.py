@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from dynamics import Robot
 from identify.record.readers.streams import Header, LoggedFile
 
+# Units by their spellings at the end of a name, and in headers.
 UNITS = {
     "mm": "mm",
     "millimeters": "mm",
@@ -28,28 +29,22 @@ UNITS = {
     "us": "us",
     "ns": "ns",
 }
-"""Units by their spellings at the end of a name, and in headers."""
 
+# Words before x, y and z of a position.
 PLACED = ("position", "pos", "translation", "pose", "p", "t")
-"""Words before x, y and z of a position."""
-
+# Words before x, y, z and w of a rotation.
 TURNED = ("rotation", "orientation", "quaternion", "quat", "rot", "q")
-"""Words before x, y, z and w of a rotation."""
-
+# Names of three angles.
 ANGLES = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"))
-"""Names of three angles."""
-
+# Words for desired poses.
 WANTED = ("reference", "ref", "desired", "des", "target", "goal", "setpoint", "sp")
-"""Words for desired poses."""
+COMMANDED = ("command", "commands", "cmd", "commanded", *WANTED)  # words for commands of joints
 
-COMMANDED = ("command", "commands", "cmd", "commanded", *WANTED)
-"""Words for commands of joints."""
-
+# Words for what is neither a pose nor a command.
 OTHERWISE = (
     *("velocity", "vel", "effort", "torque", "current", "rate", "acc", "covariance", "error"),
     "common",  # covariance of common errors, in tables of cmmsim measure
 )
-"""Words for what is neither a pose nor a command."""
 
 
 @dataclass(frozen=True)
@@ -188,8 +183,8 @@ def has_word(text: str, words: Sequence[str]) -> bool:
     return bool(set(re.split(r"[^a-z]+", text.lower())) & set(words))
 
 
+# Name with a unit at its end, after a separator or in brackets.
 UNIT = re.compile(r"^(.*?)[\s_]*[\[(/_ ]\s*(" + "|".join(UNITS) + r")\s*[\])]?$", re.IGNORECASE)
-"""Name with a unit at its end, after a separator or in brackets."""
 
 
 def without_unit(name: str) -> str:

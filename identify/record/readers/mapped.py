@@ -34,11 +34,10 @@ from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
+# Largest deviation of a quaternion's length from one, and of a matrix from a rotation.
 UNIT_LENGTH = 0.01
-"""Largest deviation of a quaternion's length from one, and of a matrix from a rotation."""
-
+# Largest plausible Euler angle, rad. Larger angles are probably degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
-"""Largest plausible Euler angle, rad. Larger angles are probably degrees."""
 
 
 def open_log(path: Path) -> LoggedFile:

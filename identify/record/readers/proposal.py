@@ -35,13 +35,12 @@ from identify.record.readers.header_names import (
 )
 from identify.record.readers.streams import Header, LoggedFile, Stream
 
-TIMES = ("time", "t", "timestamp", "stamp", "secs")
-"""Words for times."""
+TIMES = ("time", "t", "timestamp", "stamp", "secs")  # words for times
 
 LOG_TIME = "log_time"
 
+# Conventions of three angles whose names tell no axes.
 EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz about fixed axes"
-"""Conventions of three angles whose names tell no axes."""
 
 
 @dataclass

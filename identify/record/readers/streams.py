@@ -13,11 +13,9 @@ from identify.errors import RecordError
 from identify.record.columns import FRAMES, TIMES
 from identify.record.telemetry import Rows
 
-SHOWN = 40
-"""Largest number of names that a message lists."""
-
+SHOWN = 40  # largest number of names that a message lists
+# Text of a table, or number of a message, which is None where the message has no such entry.
 Cell = str | float | int | None
-"""Text of a table, or number of a message, which is None where the message has no such entry."""
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 
 from identify.reporting.figures.style import BLUE, GREY, LINE, RED, WIDTH
 
-SHOWN = 10
-"""Number of candidates that are drawn."""
+SHOWN = 10  # number of candidates that are drawn
 
 
 def diagnosis_figure(entry: dict[str, Any]) -> Figure:

@@ -176,11 +176,8 @@ def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence
         axes.scatter(places[:, 1], places[:, 0], **_dots(sign * values[seen], sign), zorder=3)
 
 
-SMALLEST = 0.004
-"""Size of a value below which its dot would not be visible."""
-
-LARGEST = 58.0
-"""Area of the dot for a value of one, in square points."""
+SMALLEST = 0.004  # size of a value below which its dot would not be visible
+LARGEST = 58.0  # area of the dot for a value of one, in square points
 
 
 def _dots(sizes: Array | float, sign: float) -> dict[str, Any]:
@@ -208,8 +205,8 @@ def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> Non
     )
 
 
+# Hatches of the sources of a budget, which differ also without colour.
 HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
-"""Hatches of the sources of a budget, which differ also without colour."""
 
 
 def budget_figure(budget: Budget) -> Figure:

@@ -37,16 +37,14 @@ from identify.reporting.goals import (
 )
 from identify.reporting.number_format import number
 
+# Half width of the predicted band around an error of zero, in standard deviations. It contains 95 %
+# of the true errors.
 BAND = 2.0
-"""Half width of the predicted band around an error of zero, in standard deviations.
-
-It contains 95 % of the true errors.
-"""
 
 BAND_NAME = f"predicted ± {BAND:g} standard deviations"
 
+# Number of measured poses that are drawn. The errors below them are drawn for every frame.
 MARKS = 40
-"""Number of measured poses that are drawn. The errors below them are drawn for every frame."""
 
 
 class Curve(NamedTuple):
@@ -261,8 +259,7 @@ def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
     )
 
 
-HATCHES = ("", "////", "xxxx")
-"""Patterns of the three bars of a run, which differ without colour."""
+HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, which differ without colour
 
 
 def validation_figure(result: dict[str, Any]) -> Figure:

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 
 from identify.reporting.figures.style import BLUE, GREY, RED, WIDTH
 
-ROOM = 20.0
-"""Ratio of the upper end of an axis to its highest curve. The space is for the legend."""
+ROOM = 20.0  # ratio of the upper end of an axis to its highest curve. The space is for the legend.
 
 
 def geometry_figure(entry: Mapping[str, Any]) -> Figure:

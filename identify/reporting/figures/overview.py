@@ -13,11 +13,8 @@ from identify.reporting.figures.style import WIDTH
 from identify.scene import StereoView, Viewpoint, Workcell, stereo_figure
 from identify.scene.drawings import FOUND, SIDES, draw_scene, show_image
 
-OVERVIEW = (4.8, 4.9)
-"""Width and height of the overview, in inches."""
-
-BENEATH = 0.4
-"""Share of the overview's height for the images."""
+OVERVIEW = (4.8, 4.9)  # width and height of the overview, in inches
+BENEATH = 0.4  # share of the overview's height for the images
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
@@ -48,8 +45,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     return figure
 
 
-ARROW = 0.12
-"""Largest length of an arrow, as a share of the image's width."""
+ARROW = 0.12  # largest length of an arrow, as a share of the image's width
 
 
 def residual_figure(view: StereoView) -> Figure:

@@ -30,8 +30,8 @@ from identify.reporting.figures.style import (
     moving,
 )
 
+# Parts of a pose: name, first component, unit of its motion and unit of its errors.
 PARTS = (("position", 0, "mm", "µm"), ("orientation", 3, "mrad", "µrad"))
-"""Parts of a pose: name, first component, unit of its motion and unit of its errors."""
 
 
 def excitation_figure(time: Array, poses: Array) -> Figure:
@@ -52,8 +52,7 @@ def excitation_figure(time: Array, poses: Array) -> Figure:
     return figure
 
 
-MARKED = 10
-"""Largest number of times that are marked along a path."""
+MARKED = 10  # largest number of times that are marked along a path
 
 
 def path_figure(time: Array, poses: Array) -> Figure:
@@ -116,11 +115,9 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_]) -> None:
     axes.plot(*path[:1].T, linestyle="none", marker="s", color=RED, markersize=6)
 
 
-LABEL = 6.5
-"""Size of a label of a time, points."""
-
+LABEL = 6.5  # size of a label of a time, points
+# Directions from a mark in which its label is tried.
 AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
-"""Directions from a mark in which its label is tried."""
 
 
 def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
@@ -166,14 +163,9 @@ def _plain_box(axes: Axes3D) -> None:
     axes.tick_params(labelsize=6.5, pad=0)
 
 
-COVERED = 0.95
-"""Probability that an ellipse covers the true pose."""
-
-ELLIPSES = 12
-"""Number of poses whose ellipses are drawn."""
-
-SHARE = 0.15
-"""Largest half axis of a drawn ellipse, as a share of the size of the path."""
+COVERED = 0.95  # probability that an ellipse covers the true pose
+ELLIPSES = 12  # number of poses whose ellipses are drawn
+SHARE = 0.15  # largest half axis of a drawn ellipse, as a share of the size of the path
 
 
 def ellipse_figure(
@@ -249,8 +241,8 @@ def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float
     axes.plot(*centres.T, linestyle="none", marker="+", color=BLUE, label="measured pose")
 
 
+# Squared Mahalanobis distance within which `COVERED` of the poses lie.
 REACH = float(chdtri(2, 1 - COVERED))
-"""Squared Mahalanobis distance within which `COVERED` of the poses lie."""
 
 RING = f"contains {100 * COVERED:g} % of true poses"
 

@@ -17,11 +17,8 @@ from matplotlib.figure import Figure
 
 from identify.arrays import Array
 
-WIDTH = 7.1
-"""Width of both columns of a journal's page, in inches."""
-
-COLUMN = 3.5
-"""Width of one column, in inches."""
+WIDTH = 7.1  # width of both columns of a journal's page, in inches
+COLUMN = 3.5  # width of one column, in inches
 
 PALETTE = {
     "ink": "#000000",
@@ -69,6 +66,7 @@ STYLE: Any = {
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
+# Line styles of the components of a pose.
 LINES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-"},
     {"color": RED, "linestyle": "--"},
@@ -77,10 +75,8 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": AMBER, "linestyle": "--"},
     {"color": INDIGO, "linestyle": "-."},
 )
-"""Line styles of the components of a pose."""
 
-STILL = 1e-9
-"""Range, m or rad, below which a component counts as not moving."""
+STILL = 1e-9  # range, m or rad, below which a component counts as not moving
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
