@@ -25,8 +25,8 @@ SOFTWARE_WEBGL = (
     "--ignore-gpu-blocklist",
 )
 NO_WEBGL = ("--disable-3d-apis",)
+# Addresses of a page itself, and of the browser's own empty one.
 OWN = ("file:", "data:", "blob:", "about:", "chrome:", "chrome-untrusted:")
-"""Addresses of a page itself, and of the browser's own empty one."""
 
 
 class Browser:

@@ -15,8 +15,8 @@ import pinocchio as pin
 from tests.dynamics.conftest import base_from_platform
 
 SETTINGS = pin.ProximalSettings(1e-14, 0.0, 20)
+# Of `lcaba`, which needs some regularisation: with so little it is done after two iterations.
 RECURSIVE = pin.ProximalSettings(1e-10, 1e-8, 20)
-"""Of `lcaba`, which needs some regularisation: with so little it is done after two iterations."""
 
 NONE, SAME = np.zeros(3), np.eye(3)
 X, Y, Z = SAME
@@ -27,8 +27,8 @@ JOINTS = {
     "ball": [pin.JointModelSpherical],
     "universal": [pin.JointModelRZ, pin.JointModelRX],
 }
+# Axes of a planar link in those of its crank, when both are in line: y is along the hinges.
 LINK_HINGE = np.column_stack([Y, Z, X])
-"""Axes of a planar link in those of its crank, when both are in line: y is along the hinges."""
 
 
 class ChainState(NamedTuple):

@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 from scipy.optimize import brentq
 
-STEPS = 8
-"""Runge-Kutta steps of a frame."""
+STEPS = 8  # Runge-Kutta steps of a frame
 
 
 def changed(text, bodies, ball_damping):

@@ -31,8 +31,7 @@ from tests.benchmarks.test_sensor_speed import GOALS
 from tests.identify.synthetic import SIGMA, quick, run_plant, truth
 from tests.identify.test_interval_coverage import CHANGES, EXPERIMENTS
 
-DEFAULT = "pyrender"
-"""Renderer of a run where it can draw."""
+DEFAULT = "pyrender"  # renderer of a run where it can draw
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -13,16 +13,17 @@ import pytest
 ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "docs" / "tutorials"
 COMMANDS = ",".join(["time_s", *(f"command_joint{leg}_rad" for leg in range(1, 7))])
+# What the page before left in the folder, or what the reader has: commands of a robot.
 AFTER = {
     "own_record": "cmmsim run quick",
     "real_photographs": f"(echo {COMMANDS}; seq 0 23 | awk '{{print $1 / 60 \",0,0,0,0,0,0\"}}') "
     ">commands.csv",
 }
-"""What the page before left in the folder, or what the reader has: commands of a robot."""
 
+# Lines that make the environment in which this test runs.
 SETTING_UP = ("sh .ci/setup", ". .venv/bin/activate")
-"""Lines that make the environment in which this test runs."""
 
+# What the code of a page takes from its reader, as the page says: arrays of a camera's driver.
 GIVEN = {
     "real_photographs": """
 import cv2
@@ -34,7 +35,6 @@ lefts, rights = (
 )
 """
 }
-"""What the code of a page takes from its reader, as the page says: arrays of a camera's driver."""
 
 
 class Step(NamedTuple):

@@ -16,11 +16,9 @@ from mujoco.sysid import Parameter, ParameterDict, SignalType, TimeSeries
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from tests.benchmarks import servo_experiment as servo
 
-BOUNDS = 0.05, 5.0
-"""Of each parameter, as shares of the truth; the optimizer wants finite ones."""
-
+BOUNDS = 0.05, 5.0  # of each parameter, as shares of the truth; the optimizer wants finite ones
+# Position and quaternion of the platform in MuJoCo's state, which begins with the time.
 PLATFORM = slice(1, 8)
-"""Position and quaternion of the platform in MuJoCo's state, which begins with the time."""
 
 
 def model_spec(integrator="implicitfast"):

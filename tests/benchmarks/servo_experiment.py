@@ -41,13 +41,11 @@ RATE_HZ, SECONDS = 1000.0, 5.0
 TIMES = np.arange(round(RATE_HZ * SECONDS) + 1) / RATE_HZ
 POSITION_STD, QUATERNION_STD = 30e-6, 6e-5
 
+# Mass of the platform, scale of its inertia, Coulomb friction (6) and viscous friction (6) of the
+# joints.
 UNKNOWNS = 14
-"""Mass of the platform, scale of its inertia, Coulomb friction (6) and viscous friction (6) of the
-joints.
-"""
-
+# Integral gain of the joint PID, which must not be zero: 1e-9 N m in the whole run.
 NO_INTEGRAL = 1e-9
-"""Integral gain of the joint PID, which must not be zero: 1e-9 N m in the whole run."""
 
 # Half the angle of a small turn is the vector part of its quaternion.
 POSE_STD = np.repeat([POSITION_STD, 2 * QUATERNION_STD], 3)

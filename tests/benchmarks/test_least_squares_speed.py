@@ -35,16 +35,14 @@ pytestmark = pytest.mark.thorough
 
 RATIO = 3.0
 CLOSE = 1e-3
-MOST_TIMES = 8.0
-"""Times our own that scipy's solver may take."""
-
+MOST_TIMES = 8.0  # times our own that scipy's solver may take
+# Pieces of `plain_work`, in CPU time, that an identification of the paper's record took before legs
+# and derivatives were computed in vectors (100c7df), and how many times faster it has to be.
 BEFORE, TIMES_FASTER = 303.0, 4.0
-"""Pieces of `plain_work`, in CPU time, that an identification of the paper's record took before
-legs and derivatives were computed in vectors (100c7df), and how many times faster it has to be."""
 
 INSIDE = 1e-3
+# Residual, in standard deviations, where the model cannot run; scipy's solver needs a number.
 UNSTABLE = 1e3
-"""Residual, in standard deviations, where the model cannot run; scipy's solver needs a number."""
 
 
 @dataclass(frozen=True)

@@ -34,10 +34,9 @@ OVERHEAD = 0.4  # of the time of `plain_work`
 SENSOR_ROWS = 10_000
 IDENTIFICATIONS = 30
 
+# Of sensor rows fewer will do: one that kept its pictures, or its sensor, would keep a megabyte or
+# more.
 FLAT_EMPTY_ROWS, FLAT_SENSOR_ROWS, FLAT_MB = 10_000, 600, 20.0
-"""Of sensor rows fewer will do: one that kept its pictures, or its sensor, would keep a megabyte or
-more.
-"""
 
 
 @pytest.fixture(scope="module")

@@ -17,11 +17,9 @@ import numpy as np
 import psutil
 import pytest
 
-FREE = 0.25
-"""Cores that others may take on a free machine; half of it where all cores are timed."""
-
+FREE = 0.25  # cores that others may take on a free machine; half of it where all cores are timed
+# Least gain of a loop from the second core; two threads of one physical core stay far below.
 WHOLE_SECOND_CORE = 1.9
-"""Least gain of a loop from the second core; two threads of one physical core stay far below."""
 
 
 def seconds(function: Callable[[], object]) -> float:

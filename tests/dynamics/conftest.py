@@ -17,6 +17,7 @@ from dynamics.closed_loop.drives import PID
 from dynamics.geometry import RobotGeometry
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
+# Of a robot, which take rows or batches of them.
 METHODS = (
     *(
         "inverse_kinematics",
@@ -37,7 +38,6 @@ METHODS = (
     ),
     *("inverse_dynamics", "forward_dynamics"),
 )
-"""Of a robot, which take rows or batches of them."""
 
 
 @pytest.fixture(scope="session")
@@ -77,11 +77,11 @@ class States:
 
 
 OFTEN = {"ups6": (), "delta3": (), "rss6_coplanar": (pytest.mark.thorough,)}
+# Every built-in robot, two of them among the quick tests, and the second RSS among the thorough.
 SLOW_ROBOTS = [
     pytest.param(name, marks=OFTEN.get(name, (pytest.mark.slow,)))
     for name in dynamics.built_in_robots()
 ]
-"""Every built-in robot, two of them among the quick tests, and the second RSS among the thorough."""
 
 
 def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:

@@ -32,10 +32,9 @@ from dynamics.errors import SimulationError
 
 SERVO = ServoGains(0.3, 0.001, 2.4)
 FAST, SLOW = FrameTiming(60.0), FrameTiming(29.0, 1 / 29)
+# Doubt of a model with the plant's parameters: what is left are the steps in which the observer
+# follows.
 EXACT = 0.6 * FITTED_DOUBT
-"""Doubt of a model with the plant's parameters: what is left are the steps in which the observer
-follows.
-"""
 NOISE = np.diag(np.repeat([5e-6, 30e-6], 3) ** 2)
 
 

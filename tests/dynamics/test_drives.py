@@ -24,10 +24,10 @@ from tests.dynamics.test_sensitivities import _assert_derivative
 LIMIT = 3.3  # N m: the robot needs some 2 to 3 to hold itself
 
 
+# All; loops with filters are kernels of their own, which take long to compile.
 LAWS = [
     pytest.param(law, marks=[pytest.mark.thorough] if law == FILTERED else []) for law in DRIVES
 ]
-"""All; loops with filters are kernels of their own, which take long to compile."""
 
 
 def drives_of(law):

@@ -30,12 +30,10 @@ from tests.dynamics.conftest import SLOW_ROBOTS, Loop, States, derivative
 
 BOX = np.repeat([0.010, 0.040], 3)
 FULL_BOX = np.repeat([0.015, 0.050], 3)
-SCALES = BOX, np.repeat([0.1, 0.5], 3), np.repeat([1.0, 5.0], 3)
-"""Of pose, twist and twist rate."""
+SCALES = BOX, np.repeat([0.1, 0.5], 3), np.repeat([1.0, 5.0], 3)  # of pose, twist and twist rate
 
 MIXED = "mixed"
-SERVO = ServoGains(0.3, 0.001, 2.4)
-"""Of the paper."""
+SERVO = ServoGains(0.3, 0.001, 2.4)  # of the paper
 
 
 @lru_cache(maxsize=1)

@@ -260,8 +260,8 @@ def test_the_law_of_one_set_of_gains_is_that_of_all_joints_with_it():
     np.testing.assert_array_equal(each.lx_by, np.tile(one.lx_by, (3, 1)))
 
 
+# Line of the set `guess` in the file of the reference robot.
 SHARED = "joint_pid = { lp = 10.0, li = 12.0, ld = 0.1 }"
-"""Line of the set `guess` in the file of the reference robot."""
 
 
 def test_a_robot_file_states_one_value_a_leg_and_is_written_again(load_changed):

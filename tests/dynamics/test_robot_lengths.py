@@ -11,11 +11,11 @@ from dynamics.robot_file import built_in_robots, parsed_robot, read_robot_file
 from dynamics.robot_lengths import _at_rest_at_home, _scaled, lengths_of, robot_of_lengths
 from dynamics.robot_text import robot_text
 
+# The paper's servo.
 LOOPS = [
     LoopSettings(ServoGains(0.3, 0.001, 2.4), FrameTiming(rate, latency))
     for rate, latency in ((60.0, 0.0), (29.0, 1 / 29))
 ]
-"""The paper's servo."""
 
 
 def geometry_of(name, **lengths):

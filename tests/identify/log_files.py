@@ -8,11 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from identify.record.recording import poses
 
-Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""Turns z up into y up."""
-
-FIRST_FRAME = 100
-"""Number of the first frame of an export of Vicon."""
+Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # turns z up into y up
+FIRST_FRAME = 100  # number of the first frame of an export of Vicon
 
 
 def matrices(record):

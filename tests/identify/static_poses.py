@@ -14,12 +14,11 @@ from identify.geometry.static_experiment import encoders_of, true_poses
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.scenario import load_scenario
 
-POSE_STD = np.repeat([3e-6, 11e-6], 3)
-"""Of one frame, as ctrack780 states it at home."""
+POSE_STD = np.repeat([3e-6, 11e-6], 3)  # of one frame, as ctrack780 states it at home
+# As its teaching says.
 FRAMES = FrameKnowledge(
     np.diag(np.repeat([0.4e-6, 0.7e-6], 3) ** 2), np.diag(np.repeat([0.3e-6, 1.1e-6], 3) ** 2)
 )
-"""As its teaching says."""
 TOLERANCE = Tolerance(1e-3, 1e-2)
 
 

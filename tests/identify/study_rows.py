@@ -21,8 +21,7 @@ from identify.studies.study_file import Study
 KIND = "tests.identify.study_rows:row"
 ROOT = Path(__file__).parents[2]
 LEVELS = [13.0, 26.0, 52.0]
-PATIENCE = 120
-"""Seconds for what takes a few on a free machine."""
+PATIENCE = 120  # seconds for what takes a few on a free machine
 DARK, METHOD = "sensor.camera.dark_noise", "scenario.pose_method"
 
 

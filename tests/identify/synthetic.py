@@ -195,8 +195,8 @@ class Stages:
         yield lambda n=1: steps.append(n)
 
 
+# Two seconds, and one iteration: enough for what is written and refused.
 SHORT = quick(**{"excitation.duration_s": 2.0, "identification.max_iterations": 1})
-"""Two seconds, and one iteration: enough for what is written and refused."""
 
 
 @cache

@@ -36,8 +36,7 @@ from tests.identify.record_forms import (
 )
 from tests.identify.synthetic import SIGMA, quick, run_plant, side_of, truth
 
-CHANCE = 4.0
-"""Standard deviations that a figure may be off by chance."""
+CHANCE = 4.0  # standard deviations that a figure may be off by chance
 
 
 @pytest.mark.slow

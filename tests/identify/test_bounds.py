@@ -32,8 +32,8 @@ from tests.identify.synthetic import (
 
 CRITERIA = StopCriteria(cost_tolerance=1e-12, parameter_tolerance=1e-9, max_iterations=200)
 DRAWS = 500
+# What chance makes of 95 % in so many draws, in one of a thousand tests.
 LOWEST = 0.95 - 3 * np.sqrt(0.95 * 0.05 / DRAWS)
-"""What chance makes of 95 % in so many draws, in one of a thousand tests."""
 
 
 class FromFunctions:

@@ -82,8 +82,8 @@ def test_study_can_be_run_and_says_why_its_laws_hold(name):
     assert all(law.order in (None, study.factors.get(law.factor)) for law in study.theory)
 
 
+# Of the error under the law pid, %, that a law with the identified model may leave.
 LARGEST_SHARE = {"feedforward": 25.0, "computed_torque": 12.5}
-"""Of the error under the law pid, %, that a law with the identified model may leave."""
 
 
 def kept_content(name):

@@ -101,6 +101,7 @@ def elastic(monkeypatch):
     return record_of(16, scenario=quick(**{"plant.joint_stiffness_N_m_rad": 1.5e4}))
 
 
+# Records whose residual an injected cause doubles, and the true size of the cause.
 CASES = {
     "zero of joint 2": (zero, 3e-4),
     "scale of the commands": (scale, 1.7e-3),
@@ -109,7 +110,6 @@ CASES = {
     "crank length of leg 3": (crank_length, 1.3e-4),
     "elasticity of the joints": (elastic, 1 / 1.5e4),
 }
-"""Records whose residual an injected cause doubles, and the true size of the cause."""
 
 
 @pytest.mark.slow

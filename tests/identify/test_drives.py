@@ -31,8 +31,7 @@ from tests.identify.synthetic import (
 
 GAINS = {"lp": 10.5, "li": 11.4, "ld": 0.164}
 CASCADE = {"lp": 10.5, "li": 30.0, "ld": 0.3}
-LAWS = ("pid", "pd", "pi", "cascade")
-"""Those whose loops are the same kernels."""
+LAWS = ("pid", "pd", "pi", "cascade")  # those whose loops are the same kernels
 
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
 

@@ -16,8 +16,8 @@ from identify.scenario import load_scenario
 from identify.setup import Setup
 from tests.dynamics.test_families import mixed_robot
 
+# Limits of the error of the identified model on unseen trajectories, of the worst axis and run.
 MOST_UM, MOST_URAD = 5.0, 25.0
-"""Limits of the error of the identified model on unseen trajectories, of the worst axis and run."""
 
 
 def check_unseen(result) -> tuple[float, float]:

@@ -52,22 +52,18 @@ SMALL = (
 )
 BOARD = 'kind = "dots"\ncolumns = 7\nrows = 6\nspacing = 0.07\nradius = 0.0175\n'
 QUICK = quick()
+# Modules that know the function that draws a figure into bytes.
 DRAWING = (
     "identify.files.atomic",
     "identify.files.run_folder",
     "identify.reporting.report",
     "identify.studies.figures",
 )
-"""Modules that know the function that draws a figure into bytes."""
-PAGE = os.sysconf("SC_PAGE_SIZE")
-"""Bytes in which a file system in memory gives room."""
+PAGE = os.sysconf("SC_PAGE_SIZE")  # bytes in which a file system in memory gives room
 NO_ROOM = os.strerror(errno.ENOSPC)
-TIMED = ("seconds", "sha256")
-"""Entries of a result that differ where a run has been broken off."""
-SIZES = 10
-"""How many sizes each command is tried at."""
-LARGE = "size=64m,nr_inodes=10000"
-"""Of a file system on which everything finds room."""
+TIMED = ("seconds", "sha256")  # entries of a result that differ where a run has been broken off
+SIZES = 10  # how many sizes each command is tried at
+LARGE = "size=64m,nr_inodes=10000"  # of a file system on which everything finds room
 SHORT = (
     "quick --set renderer=analytic --set excitation.duration_s=2.0 --set excitation.candidates=2"
     " --set identification.max_iterations=1 --set validation.duration_s=1.0"
@@ -260,8 +256,8 @@ CASES = {
     "new record": Case("new record {place}/new/mine.csv rss6"),
 }
 OFTEN = ("identify", "study", "calibrate", "import mjcf", "measure", "export")
+# One case for each way of writing: all commands are for the long proof.
 ONE_EACH = [name for name, case in CASES.items() if name == case.words and name in OFTEN]
-"""One case for each way of writing: all commands are for the long proof."""
 
 
 @cache

@@ -15,8 +15,7 @@ from tests.identify.test_real_bodies import CENTRE, PRODUCTS, uneven
 
 pytest.importorskip("mujoco")
 
-DAMPING = 0.005
-"""Friction of the balls between cranks and links, N m s/rad."""
+DAMPING = 0.005  # friction of the balls between cranks and links, N m s/rad
 
 MODEL = {
     "model.inertia": {"platform": "full"},

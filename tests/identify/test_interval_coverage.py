@@ -34,16 +34,13 @@ pytestmark = [
     pytest.mark.xdist_group("coverage"),
 ]  # whose experiments are made once
 
-EXPERIMENTS = 200
-"""Experiments of the proof at full count."""
+EXPERIMENTS = 200  # experiments of the proof at full count
+BLOCK = 10  # experiments with one teaching
 
-BLOCK = 10
-"""Experiments with one teaching."""
-
+# What fixes the scale of every robot. Weighing the platform does only where other masses beside it
+# are small: else the scale rests on the starting guess, which is the same in all experiments and
+# says nothing of how often intervals hold.
 KNOWN_GAIN = {"identification.scale_anchor": "joint_gain"}
-"""What fixes the scale of every robot. Weighing the platform does only where other masses beside it
-are small: else the scale rests on the starting guess, which is the same in all experiments and says
-nothing of how often intervals hold."""
 
 CHANGES = {"renderer": "analytic", "excitation.method": "gradient", "excitation.duration_s": 10.0}
 LOWEST, HIGHEST = 0.93, 0.97

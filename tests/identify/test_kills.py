@@ -44,6 +44,7 @@ from tests.identify.test_study_processes import in_session
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
+# The quick scenario with little to do: what is tried is the files, not the figures.
 SHORT = {
     "renderer": "analytic",
     "excitation.duration_s": 2,
@@ -51,16 +52,10 @@ SHORT = {
     "validation.duration_s": 1,
     "validation.count": 2,
 }
-"""The quick scenario with little to do: what is tried is the files, not the figures."""
 
-ONE = {"validation.count": 1}
-"""Makes it shorter still."""
-
-CALL_S = 600.0
-"""Seconds after which a call that takes some ten is given up."""
-
-START_S = 4.0
-"""Seconds in which a command does a part of its work, on a free machine."""
+ONE = {"validation.count": 1}  # makes it shorter still
+CALL_S = 600.0  # seconds after which a call that takes some ten is given up
+START_S = 4.0  # seconds in which a command does a part of its work, on a free machine
 
 SETTINGS = [word for item in SHORT.items() for word in ("--set", "{}={}".format(*item))]
 
@@ -73,14 +68,15 @@ RECORDED = (*PLAN, "experiment.nc")
 IDENTIFIED = (*RECORDED, "covariance.nc", "result.json")
 VALIDATED = (*IDENTIFIED, "validation.nc", "model.nc")
 
+# What a stage reads and does not write.
 BEFORE = {
     "record": PLAN,
     "identify": RECORDED,
     "validate": (*RECORDED, "covariance.nc"),
     "report": (*RECORDED, "covariance.nc", "validation.nc", "model.nc"),
 }
-"""What a stage reads and does not write."""
 
+# What differs between two runs that are the same.
 TIMES = (
     "seconds",
     "date",
@@ -89,7 +85,6 @@ TIMES = (
     "sensor_seconds",
     "stereo_frames_per_second",
 )
-"""What differs between two runs that are the same."""
 
 FIRST, LAST = {".png": b"\x89PNG", ".pdf": b"%PDF"}, {".html": b"</html>", ".svg": b"</svg>"}
 LAST |= {".png": b"IEND\xaeB`\x82", ".pdf": b"%%EOF"}

@@ -40,8 +40,7 @@ from tests.identify.synthetic import (
     truth,
 )
 
-SENSOR = np.repeat([3e-6, 11e-6], 3)
-"""As ctrack780 states it at home."""
+SENSOR = np.repeat([3e-6, 11e-6], 3)  # as ctrack780 states it at home
 
 
 @cache

@@ -38,8 +38,7 @@ from tests.identify.synthetic import (
 
 MASS, GAIN = index_of("platform.mass"), index_of("joint_pid.lp")
 JOINTS = [place for place, name in enumerate(NAMES) if name.startswith("joint")]
-SHARE = 0.005
-"""Relative standard deviation of the load's mass."""
+SHARE = 0.005  # relative standard deviation of the load's mass
 
 
 SCENARIO = quick(**{
@@ -49,8 +48,8 @@ SCENARIO = quick(**{
     "payload.mass_std_kg": SHARE * 8.0,
 })  # fmt: skip
 DRAWN = drawn_load(LAYOUT, SCENARIO.payload, np.random.default_rng(0))
+# What the scenario's load adds to the parameters (67,), and its standard deviations (67,).
 LOAD, STD = DRAWN.stated, DRAWN.std
-"""What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
 
 
 @pytest.fixture(scope="module")

@@ -55,8 +55,7 @@ for name in ("paper", "quick", "geometry"):
     for one in (designed.excitation, *designed.validation):
         print(json.dumps([*one.sine.ravel(), *one.cosine.ravel(), *one.offset]))
 """
-KEPT = Path(__file__).parent / "trajectories.json"
-"""What FOUND prints on Haswell."""
+KEPT = Path(__file__).parent / "trajectories.json"  # what FOUND prints on Haswell
 RUN = """
 import json
 from pathlib import Path
@@ -75,11 +74,10 @@ with TemporaryDirectory() as name:
     pipeline.validate(folder, progress, taught=taught)
     print(json.dumps(load_result(folder / "result.json")))
 """
+# Entries of a result that say when and how fast, and digests of files.
 NO_FIGURES = {"sha256", "made_of", "date", "seconds", "stereo_frames_per_second"}
-"""Entries of a result that say when and how fast, and digests of files."""
-
+# Condition numbers. Their smallest singular value is a difference of far larger numbers.
 ROUNDING = {"with_guess", "poses_alone"}
-"""Condition numbers. Their smallest singular value is a difference of far larger numbers."""
 
 
 def has_avx512():

@@ -25,8 +25,7 @@ from tests.identify.synthetic import build_plant, quick, rss6, run_plant
 pytestmark = pytest.mark.slow
 
 LOST = 7
-SMALL = (700, 500)
-"""px: the software that draws in tests takes its time for larger ones."""
+SMALL = (700, 500)  # px: the software that draws in tests takes its time for larger ones
 READY = "window.replay && window.replay.ready"
 
 

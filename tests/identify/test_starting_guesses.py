@@ -63,10 +63,9 @@ from tests.identify.synthetic import (
 
 SMALLEST_FACTOR = 0.2
 
+# How far the same optimum may be away: in cost, and in standard deviations of any identified
+# parameter.
 SAME_COST, SAME_PARAMETERS = 0.1, 0.5
-"""How far the same optimum may be away: in cost, and in standard deviations of any identified
-parameter.
-"""
 
 
 def drawn_guess(spread, seed):

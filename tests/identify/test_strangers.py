@@ -513,12 +513,12 @@ def test_two_hundred_changed_mechanisms_are_read_or_refused_in_a_line(tmp_path):
     assert check_imports(200, tmp_path) > 0
 
 
+# What a small file holds of which MuJoCo makes a huge model, and what is said of it.
 HUGE_MODELS = {
     '<sensor><user dim="2000000000"/></sensor>': "Could not allocate memory",
     '<size nuser_body="2000000000"/>': "unknown exception",
     f"<worldbody>{'<site/>' * 142_000}</worldbody>": "cannot be read within 8 s",
 }
-"""What a small file holds of which MuJoCo makes a huge model, and what is said of it."""
 
 IMPORT_AND_MEASURE = """
 import resource

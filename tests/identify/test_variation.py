@@ -18,13 +18,13 @@ from tests.identify.commands import command, one_line
 from tests.identify.run_files import write_runs
 from tests.identify.synthetic import LAYOUT, quick, run_plant, short_run
 
+# What every run of the reference robot with an exciting trajectory identifies.
 IDENTIFIED = {
     *(f"platform.{name}" for name in ("mass", "Ixx", "Iyy", "Izz")),
     *(f"joint_pid.{name}" for name in ("lp", "li", "ld")),
     *(f"link{leg}.mass" for leg in range(1, 7)),
     *(f"joint{leg}.{law}" for leg in range(1, 7) for law in ("coulomb", "viscous")),
 }
-"""What every run of the reference robot with an exciting trajectory identifies."""
 
 
 def result(estimate, std, identifiable):
