@@ -40,11 +40,6 @@ def agreed(values: ArrayLike, bits: int = 27) -> Array:
     the same steps on all processors. The spacing of the grid is a power of two, so that rounding is
     exact. Two processors disagree only if their values lie on both sides of the middle between two
     grid points. This is very rare if the grid is much coarser than the differences.
-
-    Examples
-    --------
-    >>> agreed([1.0, 0.1 + 1e-12], bits=20) == agreed([1.0, 0.1], bits=20)
-    array([ True,  True])
     """
     array = np.asarray(values, dtype=float)
     largest = float(np.abs(array).max(initial=0.0))

@@ -52,22 +52,8 @@ RESAMPLING = 301  # with a sensor's seed: resampled frames of the moving bar
 def child(seed: int | np.random.SeedSequence, *stream: int) -> np.random.SeedSequence:
     """Return the sequence of a stream, independent of all other streams of the seed.
 
-    Parameters
-    ----------
-    seed : int or numpy.random.SeedSequence
-        Seed of an experiment, or sequence of a study's row. The sequence is not changed.
-    *stream : int
-        Number of the stream, and further numbers such as the number of the run.
-
-    Returns
-    -------
-    numpy.random.SeedSequence
-        The child of the seed with these numbers.
-
-    Examples
-    --------
-    >>> child(0, NOISE, 1).spawn_key
-    (4, 1)
+    seed     Seed of an experiment, or sequence of a study's row. The sequence is not changed.
+    *stream  Number of the stream, and further numbers such as the number of the run.
     """
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     return np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, *stream))
@@ -79,13 +65,7 @@ def stream_seed(seed: int | np.random.SeedSequence, *stream: int) -> int:
 
 
 def integer_seed(seed: int | np.random.SeedSequence) -> int:
-    """Return the integer seed of an experiment, also from the sequence of a study's row.
-
-    Examples
-    --------
-    >>> integer_seed(7), integer_seed(np.random.SeedSequence(7))
-    (7, 2083679832)
-    """
+    """Return the integer seed of an experiment, also from the sequence of a study's row."""
     if isinstance(seed, np.random.SeedSequence):
         return int(seed.generate_state(1)[0])
     return seed

@@ -124,37 +124,15 @@ def random_trajectory(
     Normally distributed coefficients are projected onto the conditions of a smooth start. Then each
     coordinate is scaled so that it reaches the edge of the box.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of the coefficients.
-    chart : Chart
-        Coordinates of the platform.
-    fundamental_hz : float
-        Frequency of the first harmonic.
-    harmonics : int
-        Number of harmonics, at least two.
-    position_amplitude_m, orientation_amplitude_rad : float
-        Largest distance of each coordinate from home.
+    rng                             Source of the coefficients.
+    chart                           Coordinates of the platform.
+    fundamental_hz                  Frequency of the first harmonic.
+    harmonics                       Number of harmonics, at least two.
+    position_amplitude_m, orientation_amplitude_rad
+                                    Largest distance of each coordinate from home.
 
-    Returns
-    -------
-    FourierTrajectory
-        The trajectory, which begins at home.
-
-    Raises
-    ------
-    TrajectoryError
-        There are fewer than two harmonics, which leave no freedom for a smooth start.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from dynamics import load_robot
-    >>> chart = load_robot("rss6").geometry.chart
-    >>> path = random_trajectory(np.random.default_rng(0), chart, 0.1, 5, 0.02, 0.05)
-    >>> bool(np.allclose(path.pose(0.0), chart.home))
-    True
+    Returns a trajectory that begins at home. Raises TrajectoryError if there are fewer than two
+    harmonics, which leave no freedom for a smooth start.
     """
     if harmonics < 2:
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")

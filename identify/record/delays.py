@@ -46,13 +46,6 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
 
     The lag is at most half the duration. The correlation is zero if there is no motion, or times do
     not overlap.
-
-    Examples
-    --------
-    >>> t = np.arange(0, 10, 1 / 60)
-    >>> found = motion_lag(t, np.sin(3 * (t - 0.05))[:, None], t, np.sin(3 * t)[:, None])
-    >>> round(found.seconds, 4)
-    0.05
     """
     if min(len(time), len(command_time)) < FEWEST:
         return MotionLag(0.0, 0.0)

@@ -50,18 +50,6 @@ def likelier_times(times: Array, poses: Array, covariance: Array, rate_hz: float
     poses (N, 6)       Measured poses, without lost ones.
     covariance (6, 6)  Covariance of a pose.
     rate_hz            Frame rate.
-
-    Examples
-    --------
-    A platform moves at 60 frames a second, and times are rounded to milliseconds:
-
-    >>> import numpy as np
-    >>> frames = np.arange(300) / 60
-    >>> poses = np.outer(0.01 * np.sin(5 * frames), [1, 0, 0, 0, 0, 0])
-    >>> poses += 1e-6 * np.random.default_rng(0).standard_normal(poses.shape)
-    >>> found = likelier_times(np.round(frames, 3), poses, 1e-12 * np.eye(6), 60.0)
-    >>> bool(np.abs(np.diff(found) - 1 / 60).max() < 1e-6)
-    True
     """
     grid = frame_grid(times, rate_hz)
     if grid is None:

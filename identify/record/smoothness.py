@@ -105,16 +105,6 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
     times, poses (N,) and (N, 6)  Times, s, and measured poses, without lost ones.
     covariance (6, 6)             Covariance of a pose.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> times = np.arange(100) / 60
-    >>> poses = np.outer(0.01 * np.sin(5 * times), np.ones(6))
-    >>> poses += 1e-6 * np.random.default_rng(0).standard_normal(poses.shape)
-    >>> poses[40, 1] += 1e-3
-    >>> gross_errors(times, poses, 1e-12 * np.eye(6))
-    array([40])
-
     References
     ----------
     Rousseeuw, Least median of squares regression, Journal of the American Statistical Association

@@ -118,14 +118,7 @@ class Telemetry:
 
 
 def check_increasing(time: Array, rows: Rows) -> None:
-    """Check that the times (N,) of rows increase. Raises RecordError with the first that does not.
-
-    Examples
-    --------
-    >>> check_increasing(np.array([0.0, 0.1, 0.1]), Rows("mine.csv", [2, 3, 4]))
-    Traceback (most recent call last):
-    identify.errors.RecordError: mine.csv line 4: its time 0.1 s is also that of line 3
-    """
+    """Check that the times (N,) of rows increase. Raises RecordError with the first that does not."""
     strange = np.flatnonzero(~np.isfinite(time))
     if len(strange):
         raise RecordError(f"{rows.place(int(strange[0]))}: its time is not a finite number")
