@@ -33,14 +33,10 @@ from identify.model.body_torques import (
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import FRICTION_OFFSET
 
-PASSIVE_GROUP = "friction of passive joints"
-"""Group of the friction of passive joints."""
-
-MOVING = 0.01
-"""Velocity above which a joint moves, as a share of its RMS velocity."""
-
+PASSIVE_GROUP = "friction of passive joints"  # group of the friction of passive joints
+MOVING = 0.01  # velocity above which a joint moves, as a share of its RMS velocity
+# Least standard deviation, N m or N, of an offset of friction that a remedy states.
 LEAST_OFFSET = 0.01
-"""Least standard deviation, N m or N, of an offset of friction that a remedy states."""
 
 
 @dataclass(frozen=True)

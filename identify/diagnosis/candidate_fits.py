@@ -19,21 +19,15 @@ from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import NEAR, Ranked, Rows, indistinguishable, misfit_of
 from identify.estimation.output_error import OutputErrorProblem
 
+# Share of the best statistic from which on a cause that is tried at a size is fitted, too.
 CLOSE = 0.8
-"""Share of the best statistic from which on a cause that is tried at a size is fitted, too."""
-
-LOOSE = 0.3
-"""The same share, where the best candidate leaves some of the misfit when it is fitted."""
-
+LOOSE = 0.3  # the same share, where the best candidate leaves some of the misfit when it is fitted
+# Share of a misfit which, if the best candidate leaves more, lets others be fitted from afar.
 MOST_LEFT = 0.2
-"""Share of a misfit which, if the best candidate leaves more, lets others be fitted from afar."""
-
+# Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
 RIVALS = 3
-"""Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
-"""
-
+# Share of a fitted cost by which two fits can differ, as each follows the motion only so far.
 INEXACT = 1e-3
-"""Share of a fitted cost by which two fits can differ, as each follows the motion only so far."""
 
 
 @dataclass(frozen=True)

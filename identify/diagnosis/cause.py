@@ -17,11 +17,10 @@ from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
+# Function that returns the problem with a cause of a given size. It changes nothing else.
 Change = Callable[[OutputErrorProblem, float], OutputErrorProblem]
-"""Function that returns the problem with a cause of a given size. It changes nothing else."""
-
+# Function (run, its place) that returns what a cause of size one changes at each frame.
 RunColumn = Callable[[LoopModel, int], Array]
-"""Function (run, its place) that returns what a cause of size one changes at each frame."""
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,10 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
 
-CLOCK_STEP_S = 1e-4
-"""Change of a latency for differences."""
-
-SHORTEST_S = 1e-4
-"""Shortest time for which a command acts, s."""
-
-SCALE_STD = 1e-3
-"""Standard deviation of the scale of commands in an ordinary workshop."""
-
-SCALE_STEP = 1e-4
-"""Change of the scale of commands for differences."""
+CLOCK_STEP_S = 1e-4  # change of a latency for differences
+SHORTEST_S = 1e-4  # shortest time for which a command acts, s
+SCALE_STD = 1e-3  # standard deviation of the scale of commands in an ordinary workshop
+SCALE_STEP = 1e-4  # change of the scale of commands for differences
 
 
 def command_causes(problem: OutputErrorProblem) -> tuple[Cause, ...]:

@@ -45,8 +45,7 @@ from identify.progress import SilentProgress
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
-MOST_STEPS = 30
-"""Largest number of steps of the search for the optimum under the logged commands."""
+MOST_STEPS = 30  # largest number of steps of the search for the optimum under the logged commands
 
 
 def diagnose(
@@ -181,8 +180,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
     return (*causes, *(one.companion for one in causes if one.companion is not None))
 
 
-STEP = 1e-4
-"""Step of a cause that carries none."""
+STEP = 1e-4  # step of a cause that carries none
 
 
 def own_cause(name: str) -> Cause:

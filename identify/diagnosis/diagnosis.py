@@ -18,8 +18,7 @@ from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whit
 if TYPE_CHECKING:
     import pandas as pd
 
-NAMED = 3
-"""Number of causes that one line names of those that cannot be told apart from another."""
+NAMED = 3  # number of causes that one line names of those that cannot be told apart from another
 
 
 @dataclass(frozen=True)

@@ -13,26 +13,16 @@ from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.output_error import OutputErrorProblem
 
+# Criteria of one search.
 STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=5)
-"""Criteria of one search."""
-
-ROUNDS = 6
-"""Largest number of searches."""
-
-FINER = 0.3
-"""Factor of the steps of differences from one search to the next."""
-
-SLOW = 0.25
-"""Fall of the cost by a search, as a share, below which differences become finer."""
-
+ROUNDS = 6  # largest number of searches
+FINER = 0.3  # factor of the steps of differences from one search to the next
+SLOW = 0.25  # fall of the cost by a search, as a share, below which differences become finer
+# Number of searches after which effects that depend on the motion are those of the new one.
 RENEWALS = 2
-"""Number of searches after which effects that depend on the motion are those of the new one."""
-
-STANDS = 2e-4
-"""Fall of the cost by another search, as a share, below which sizes stand."""
-
+STANDS = 2e-4  # fall of the cost by another search, as a share, below which sizes stand
+# Criteria of a search of the parameters alone.
 FOLLOW = replace(STOP, cost_tolerance=1e-2, max_iterations=6)
-"""Criteria of a search of the parameters alone."""
 
 
 @dataclass(frozen=True)

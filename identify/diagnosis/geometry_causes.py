@@ -16,15 +16,13 @@ from identify.diagnosis.cause import (
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
-STEPS = {"m": 1e-5, "rad": 1e-4}
-"""Change of a number for differences, by its unit."""
-
+STEPS = {"m": 1e-5, "rad": 1e-4}  # change of a number for differences, by its unit
+# Standard deviation of the zero of a joint in an ordinary workshop, by its unit.
 ZERO_STDS = {"m": 1e-4, "rad": 1e-3}
-"""Standard deviation of the zero of a joint in an ordinary workshop, by its unit."""
-
+# Numbers that are zeros of joints, which a shift of the commands stands for.
 ZEROS = ("crank_zero", "zero_length")
-"""Numbers that are zeros of joints, which a shift of the commands stands for."""
 
+# Names of the groups of numbers, by their kinds.
 GROUPS = {
     "base_joint": "places of the base joints",
     "platform_joint": "places of the platform joints",
@@ -33,7 +31,6 @@ GROUPS = {
     "crank_length": "lengths of the cranks",
     "link_length": "lengths of the links",
 }
-"""Names of the groups of numbers, by their kinds."""
 
 
 def geometry_causes(problem: OutputErrorProblem) -> tuple[Cause, ...]:

@@ -25,23 +25,14 @@ from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
 from identify.model.unequal_gains import with_unequal_gains
 
+# Velocities over which static friction fades, as shares of the joints' RMS velocity.
 SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
-"""Velocities over which static friction fades, as shares of the joints' RMS velocity."""
-
-FRICTION = "law of friction"
-"""Group of the laws of friction, of which a joint has one."""
-
-FINER = 4
-"""Factor of the steps a frame with which a finer model is tried."""
-
+FRICTION = "law of friction"  # group of the laws of friction, of which a joint has one
+FINER = 4  # factor of the steps a frame with which a finer model is tried
+# Deflection at the largest torque for differences, by the unit of joint coordinates.
 DEFLECTION = {"rad": 1e-4, "m": 1e-5}
-"""Deflection at the largest torque for differences, by the unit of joint coordinates."""
-
-GAIN_STEP = 1e-3
-"""Change of a gain for differences, as a share of the gain."""
-
-LEAST_GAIN = -0.9
-"""Least difference of a gain, as a share of it. A law needs gains above zero."""
+GAIN_STEP = 1e-3  # change of a gain for differences, as a share of the gain
+LEAST_GAIN = -0.9  # least difference of a gain, as a share of it. A law needs gains above zero.
 
 
 def loop_causes(

@@ -32,20 +32,13 @@ from identify.estimation.explanation import (
 )
 from identify.estimation.output_error import OutputErrorProblem
 
+# Size of the cosine between two projected columns from which on they cannot be told apart.
 ALIKE = 0.99
-"""Size of the cosine between two projected columns from which on they cannot be told apart."""
-
+# Size of that cosine up to which columns are as exact as to tell which cause is the better one.
 EXACT = 0.999
-"""Size of that cosine up to which columns are as exact as to tell which cause is the better one."""
-
-NEAR = 9.0
-"""Difference of two statistics that chance may make, in units of the noise."""
-
-ROUNDING = 1e-13
-"""Share of the largest eigenvalue of the products of columns that is rounding."""
-
-FEW = 3
-"""Largest number of causes alone that are compared with a group."""
+NEAR = 9.0  # difference of two statistics that chance may make, in units of the noise
+ROUNDING = 1e-13  # share of the largest eigenvalue of the products of columns that is rounding
+FEW = 3  # largest number of causes alone that are compared with a group
 
 
 @dataclass(frozen=True)

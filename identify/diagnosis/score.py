@@ -23,14 +23,11 @@ import numpy as np
 
 from identify.arrays import Array
 
+# Share of a column's length below which nothing is left of it beside the parameters. Differences of
+# runs that stick and slip are not more exact.
 HIDDEN = 1e-5
-"""Share of a column's length below which nothing is left of it beside the parameters.
-
-Differences of runs that stick and slip are not more exact.
-"""
-
+# Smallest share of the largest singular value for which directions of a group count as several.
 DEPENDENT = 1e-3
-"""Smallest share of the largest singular value for which directions of a group count as several."""
 
 
 @dataclass(frozen=True)

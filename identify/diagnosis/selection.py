@@ -44,21 +44,14 @@ from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error import OutputErrorProblem
 
-CHANCE = 0.01
-"""Probability that a right model is accused of any cause in the catalogue."""
+CHANCE = 0.01  # probability that a right model is accused of any cause in the catalogue
+MOST = 3  # largest number of causes or groups that are selected
+SEVERAL = 2  # number of causes above which a selection begins anew with another first one
 
-MOST = 3
-"""Largest number of causes or groups that are selected."""
-
-SEVERAL = 2
-"""Number of causes above which a selection begins anew with another first one."""
-
+# Share of the misfit that the causes must explain for it to count as explained. A cause that is
+# there leaves noise once it is fitted. Groups of many numbers can take up most of the effect of a
+# cause outside the catalogue.
 MOST_OF_IT = 0.9
-"""Share of the misfit that the causes must explain for it to count as explained.
-
-A cause that is there leaves noise once it is fitted. Groups of many numbers can take up most of the
-effect of a cause outside the catalogue.
-"""
 
 
 @dataclass(frozen=True)

@@ -25,32 +25,18 @@ from identify.arrays import Array, triangular_factor
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
 
+# Remainder below which a column of length one counts as linearly dependent on the pivots. The
+# remainder of a column is the length of its part that is orthogonal to the pivots.
 DEPENDENT = 1e-8
-"""Remainder below which a column of length one counts as linearly dependent on the pivots.
-
-The remainder of a column is the length of its part that is orthogonal to the pivots.
-"""
-
-LONG_ENOUGH = 1e-3
-"""Smallest remainder of a pivot column, as a fraction of the longest remainder."""
-
+LONG_ENOUGH = 1e-3  # smallest remainder of a pivot column, as a fraction of the longest remainder
+# Coefficient that counts as rounding, as a fraction of a group's largest contribution.
 NEGLIGIBLE = 1e-7
-"""Coefficient that counts as rounding, as a fraction of a group's largest contribution."""
-
-MOTIONS = 200
-"""Number of random motions. They excite every parameter that can be excited."""
-
+MOTIONS = 200  # number of random motions. They excite every parameter that can be excited.
+# Ranges of random positions about home, as shares of the platform's size. The largest range in
+# which the robot reaches all drawn poses is used.
 REACH_SHARES = (0.03, 0.01, 0.003, 0.001)
-"""Ranges of random positions about home, as shares of the platform's size.
-
-The largest range in which the robot reaches all drawn poses is used.
-"""
-
+# Range of random angles about home, rad, for the first of REACH_SHARES. It shrinks with the share.
 TURN = 0.05
-"""Range of random angles about home, rad, for the first of REACH_SHARES.
-
-It shrinks with the share.
-"""
 
 
 @dataclass(frozen=True)

@@ -65,11 +65,9 @@ AT_BOUND = 1e-12  # distance from a bound that counts as rounding, in scales of 
 
 Linearisation = tuple[float, Array, Array]
 
+# Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain).
+# The step stays within the bounds and within `radius` times the scale.
 Proposal = Callable[[Array, Array, Array, Array, Array, float], tuple[Array, float]]
-"""Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain).
-
-The step stays within the bounds and within `radius` times the scale.
-"""
 
 
 class Problem(Protocol):

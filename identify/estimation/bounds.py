@@ -32,23 +32,16 @@ from dynamics.spatial_inertia import MOMENTS
 from identify.arrays import Array
 from identify.estimation.prior import StartingGuess
 
+# Lower bound of parameters that must be above zero, as a share of the initial guess. Examples are
+# the platform's mass and the integral gain.
 SMALLEST_SHARE = 1e-3
-"""Lower bound of parameters that must be above zero, as a share of the initial guess.
-
-Examples are the platform's mass and the integral gain.
-"""
-
+# Distance of the start of a search from bodies that are flat, as a share of their second moments.
+# The logarithms of a flat body are infinite.
 INSIDE = 1e-3
-"""Distance of the start of a search from bodies that are flat, as a share of their second moments.
-
-The logarithms of a flat body are infinite.
-"""
-
+# Smallest second moment of a full body, as a share of the sum of those of the initial guess.
 FLATTEST = 1e-4
-"""Smallest second moment of a full body, as a share of the sum of those of the initial guess."""
-
+# Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz).
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
-"""Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz)."""
 
 
 def least_values(layout: ParameterLayout) -> Array:

@@ -32,8 +32,7 @@ from identify.estimation.covariance import (
 if TYPE_CHECKING:
     import pandas as pd
 
-COVERAGE = 1.96
-"""Coverage factor of the expanded uncertainty, for 95 %."""
+COVERAGE = 1.96  # coverage factor of the expanded uncertainty, for 95 %
 
 
 class Source(NamedTuple):
@@ -43,6 +42,7 @@ class Source(NamedTuple):
     evaluation: str
 
 
+# Sources of uncertainty by the names that the covariance gives them.
 SOURCES = {
     NOISE: Source("noise of the poses (pixels)", "B"),
     "motion": Source("noise of the poses in the servo", "B"),
@@ -65,7 +65,6 @@ SOURCES = {
     MODEL: Source("error of the model", "A"),
     CORRELATED: Source("covariances of these sources", "B"),
 }
-"""Sources of uncertainty by the names that the covariance gives them."""
 
 
 @dataclass(frozen=True)

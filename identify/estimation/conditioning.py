@@ -17,12 +17,10 @@ from identify.arrays import Array
 from identify.estimation.base_parameters import BaseParameters
 from identify.estimation.prior import StartingGuess
 
+# Condition number of the poses' information above which double precision is not enough. With a
+# resolution of 1.1e-16, the variance of the least known direction then has fewer than three correct
+# digits.
 POOR = 1e13
-"""Condition number of the poses' information above which double precision is not enough.
-
-With a resolution of 1.1e-16, the variance of the least known direction then has fewer than three
-correct digits.
-"""
 
 
 @dataclass(frozen=True)

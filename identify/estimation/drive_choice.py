@@ -30,17 +30,11 @@ from identify.progress import Progress, SilentProgress
 from identify.scenario import Model
 from identify.scenario.plant_sections import AUTO
 
-SURE = 0.95
-"""Smallest probability with which a law counts as certain."""
-
+SURE = 0.95  # smallest probability with which a law counts as certain
+# Number of iterations of the first search for every law. After these, laws that fit the record are
+# near their optimum. Other laws could need many more.
 FIRST = 4
-"""Number of iterations of the first search for every law.
-
-After these, laws that fit the record are near their optimum. Other laws could need many more.
-"""
-
-HOPELESS = 10.0
-"""Factor of the best cost above which the search for a law is not continued."""
+HOPELESS = 10.0  # factor of the best cost above which the search for a law is not continued
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dynamics.parameters import ParameterLayout
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
 
+# Distance of a centre of mass from its body, in standard deviations, that gives a warning.
 OUTSIDE_STDS = 3.0
-"""Distance of a centre of mass from its body, in standard deviations, that gives a warning."""
 
 
 def full_body_warnings(

@@ -57,24 +57,15 @@ from identify.estimation.prior import (
 )
 from identify.estimation.scale_anchor import ScaleAnchor
 
+# Share of the prior standard deviation and of the size of a quantity. The standard deviation of an
+# identified quantity is below this share of both.
 IDENTIFIABLE_SHARE = 0.5
-"""Share of the prior standard deviation and of the size of a quantity.
-
-The standard deviation of an identified quantity is below this share of both.
-"""
-
+# Share of an estimate's variance due to errors of the guess above which it rests on the prior.
 RESTS_ON_PRIOR = 0.5
-"""Share of an estimate's variance due to errors of the guess above which it rests on the prior."""
-
+# Ordinary friction, as a share of the holding torque or force. It is Coulomb friction, or viscous
+# friction at 1 rad/s or 1 m/s.
 FRICTION_SHARE = 0.1
-"""Ordinary friction, as a share of the holding torque or force.
-
-It is Coulomb friction, or viscous friction at 1 rad/s or 1 m/s.
-"""
-
-
-ASYMMETRY_SHARE = 0.1
-"""Ordinary first moments and products of inertia, as a share of `asymmetry`."""
+ASYMMETRY_SHARE = 0.1  # ordinary first moments and products of inertia, as a share of `asymmetry`
 
 
 @dataclass(frozen=True)
@@ -189,11 +180,9 @@ def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
     return np.asarray((combined_std(rows, part) / combined_std(rows, covariance)) ** 2)
 
 
+# Largest relative standard deviation of the common factor without a warning. Only the part due to
+# the initial guess counts, and only if an instrument was used to fix the factor.
 SCALE_KNOWN = 0.015
-"""Largest relative standard deviation of the common factor without a warning.
-
-Only the part due to the initial guess counts, and only if an instrument was used to fix the factor.
-"""
 
 
 def scale_warnings(

@@ -51,8 +51,7 @@ from identify.runtime import one_thread
 from identify.scenario import Scenario
 from identify.scenario.sections import Identification
 
-Record: TypeAlias = xr.Dataset | str | PathLike[str]
-"""Record, or the path of its netCDF file."""
+Record: TypeAlias = xr.Dataset | str | PathLike[str]  # record, or the path of its netCDF file
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from scipy.special import log_ndtr, ndtri
 from identify.arrays import Array
 from identify.estimation.bounds import ParameterBounds
 
-HALF_WIDTH = float(ndtri(0.975))
-"""Half the width of a 95 % interval, in standard deviations."""
+HALF_WIDTH = float(ndtri(0.975))  # half the width of a 95 % interval, in standard deviations
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:

@@ -36,17 +36,12 @@ from identify.model.loop_model import LoopModel
 from identify.model.torque_model import commands_before
 from identify.scenario import Filter
 
+# Length of a segment, s. It is a few periods of the joint loop. In this time an unstable loop does
+# not leave the reach.
 SEGMENT_S = 0.5
-"""Length of a segment, s.
-
-It is a few periods of the joint loop. In this time an unstable loop does not leave the reach.
-"""
-
+# Bandwidth of the joint loop, rad/s. It converts the sensor's noise into standard deviations of
+# rates and integrals.
 BANDWIDTH = 20.0
-"""Bandwidth of the joint loop, rad/s.
-
-It converts the sensor's noise into standard deviations of rates and integrals.
-"""
 
 
 @dataclass(frozen=True)

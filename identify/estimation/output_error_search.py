@@ -26,28 +26,20 @@ from identify.model.loop_model import LoopModel
 from identify.progress import Advance, Progress
 from identify.record.stored_common_errors import FRICTION, kind_of
 
-LINEARISATIONS = 6
-"""Largest number of linearisations in the common errors."""
-
+LINEARISATIONS = 6  # largest number of linearisations in the common errors
+# Linearisations after which steps of the common errors are halved, because they can alternate.
 FULL_STEPS = 2
-"""Linearisations after which steps of the common errors are halved, because they can alternate."""
-
+# Change of the most likely common errors, in standard deviations, at which the loop ends.
 SETTLED = 0.02
-"""Change of the most likely common errors, in standard deviations, at which the loop ends."""
+MISSED = 1.2  # mean squared residual above which the search is repeated from another start
 
-MISSED = 1.2
-"""Mean squared residual above which the search is repeated from another start."""
-
+# Change of common errors with a wide prior at which they count as near their optimum. It is in the
+# standard deviations of `LoopModel.in_deciding_stds`, which are those of the errors for known
+# parameters. For unknown parameters they are far larger, and the change is a small part of them.
 NEAR = 1.0
-"""Change of common errors with a wide prior at which they count as near their optimum.
 
-It is in the standard deviations of `LoopModel.in_deciding_stds`, which are those of the errors for
-known parameters. For unknown parameters they are far larger, and the change is a small part of
-them.
-"""
-
+# Relative change of the cost at which multiple shooting ends. Finer searches follow it.
 CLOSE_ENOUGH = 1e-2
-"""Relative change of the cost at which multiple shooting ends. Finer searches follow it."""
 
 
 @dataclass(frozen=True)

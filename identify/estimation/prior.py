@@ -58,8 +58,8 @@ def gains_among(layout: ParameterLayout, kinds: Collection[str]) -> list[str]:
     return [name for name in layout.joint_pid_names if name.rpartition(".")[2] in kinds]
 
 
+# Factor that makes the standard deviation of a gain negligible if the drives do not read it.
 FIXED = 1e-9
-"""Factor that makes the standard deviation of a gain negligible if the drives do not read it."""
 
 
 def starting_guess(
@@ -112,8 +112,8 @@ def model_guess(robot: Robot, model: Model, settings: Identification) -> Startin
     )
 
 
+# Largest negligible holding torque, as a share of the torque to accelerate by GRAVITY.
 WEIGHTLESS = 0.01
-"""Largest negligible holding torque, as a share of the torque to accelerate by GRAVITY."""
 
 GRAVITY = 9.81  # m/s^2
 

@@ -40,8 +40,7 @@ from identify.record.stored_common_errors import ASSUMPTIONS
 if TYPE_CHECKING:
     import pandas as pd
 
-STRONGEST = 10
-"""Number of correlations of identified parameters that a result lists."""
+STRONGEST = 10  # number of correlations of identified parameters that a result lists
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import as_number, shown
 
+# Anchors that measure a parameter, see `measured_parameter`.
 MEASURING = ("platform_mass", "joint_gain")
-"""Anchors that measure a parameter, see `measured_parameter`."""
 
 ANCHORS = (*MEASURING, "payload", "prior")
 
@@ -36,11 +36,9 @@ def measured_parameter(anchor: str, layout: ParameterLayout) -> str:
     return {"platform_mass": "platform.mass", "joint_gain": layout.joint_pid_names[0]}[anchor]
 
 
+# Standard deviation of an ordinary instrument, by units. A balance measures the platform's mass. A
+# gain comes from the data of the controller.
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
-"""Standard deviation of an ordinary instrument, by units.
-
-A balance measures the platform's mass. A gain comes from the data of the controller.
-"""
 
 
 def default_std(name: str, layout: ParameterLayout) -> float:

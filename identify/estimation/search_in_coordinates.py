@@ -23,8 +23,8 @@ from identify.estimation.bounded_least_squares import (
 )
 from identify.estimation.bounds import ParameterBounds
 
+# Criteria of the search for a step along a curved function.
 ALONG_CURVE = StopCriteria(cost_tolerance=1e-10, parameter_tolerance=0.0, max_iterations=200)
-"""Criteria of the search for a step along a curved function."""
 
 
 @dataclass(frozen=True)

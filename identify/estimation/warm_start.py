@@ -46,14 +46,12 @@ from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import LATENCY, SCALE, Marginal
 from identify.scenario import Filter
 
+# Share of the record left out at either end, where filtered derivatives are inaccurate.
 EDGE_FRACTION = 0.02
-"""Share of the record left out at either end, where filtered derivatives are inaccurate."""
-
+# Velocity above which a joint counts as slipping, as a share of its RMS velocity.
 SLIPPING_SHARE = 0.5
-"""Velocity above which a joint counts as slipping, as a share of its RMS velocity."""
-
+# Number of solutions of a fit. Each solution is weighted by the residual of the one before.
 REWEIGHTINGS = 3
-"""Number of solutions of a fit. Each solution is weighted by the residual of the one before."""
 
 
 def linear_warm_start(problem: OutputErrorProblem) -> Array:

@@ -32,8 +32,7 @@ from identify.scenario import Model
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
-LEAST_COMMAND = 1e-10
-"""Largest change of a command, rad, m, N m or N, that counts as zero."""
+LEAST_COMMAND = 1e-10  # largest change of a command, rad, m, N m or N, that counts as zero
 
 
 @dataclass(frozen=True)

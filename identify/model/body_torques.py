@@ -76,8 +76,8 @@ def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
     return np.asarray(torques - torques[0])
 
 
+# For each of k wrenches, names of the parameters of full bodies that act together.
 Together = tuple[tuple[str, ...], ...]
-"""For each of k wrenches, names of the parameters of full bodies that act together."""
 
 
 @lru_cache(maxsize=8)

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
 
 Run = TypeVar("Run", bound="LoopModel")
 
-LEAST_SCALE = 0.1
-"""Smallest scale of the commands that a model can contain."""
+LEAST_SCALE = 0.1  # smallest scale of the commands that a model can contain
 
 
 def with_recorded_errors(

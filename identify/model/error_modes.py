@@ -17,12 +17,9 @@ from identify.runtime import in_threads
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
+# Step of the differences in a constant of the law of friction, in standard deviations. The step in
+# other errors is one standard deviation. The motion is far from linear in constants of friction.
 FRICTION_STEP = 1e-4
-"""Step of the differences in a constant of the law of friction, in standard deviations.
-
-The step in other errors is one standard deviation. The motion is far from linear in constants of
-friction.
-"""
 
 
 def error_modes(

@@ -99,14 +99,10 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     return torque_model(run, side.low_pass) if takes_torques(record) else run
 
 
-REACH = 4.0
-"""Largest offset of a clock that is tried, in its standard deviations."""
-
-DELAYS = 50
-"""Number of delays of a clock, of either sign, that are tried first."""
-
+REACH = 4.0  # largest offset of a clock that is tried, in its standard deviations
+DELAYS = 50  # number of delays of a clock, of either sign, that are tried first
+# Relative difference up to which the rate of commands counts as equal to the frame rate.
 SAME_RATE = 0.05
-"""Relative difference up to which the rate of commands counts as equal to the frame rate."""
 
 
 def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:

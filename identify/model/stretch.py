@@ -18,17 +18,10 @@ from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.record.stored_common_errors import START
 
-FIRST_S = 0.2
-"""Time, s, after the start of a stretch. The poses in this time determine the start."""
-
-FEWEST = 6
-"""Smallest number of poses that determine the start."""
-
-DEGREE = 3
-"""Degree of the polynomial through the first poses."""
-
-WIDE = 20.0
-"""Ratio of the prior standard deviations of a start to those of the polynomial."""
+FIRST_S = 0.2  # time, s, after the start of a stretch. The poses in this time determine the start.
+FEWEST = 6  # smallest number of poses that determine the start
+DEGREE = 3  # degree of the polynomial through the first poses
+WIDE = 20.0  # ratio of the prior standard deviations of a start to those of the polynomial
 
 
 @dataclass(frozen=True)

@@ -40,15 +40,11 @@ from identify.model.stretch import Stretch
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE
 from identify.runtime import in_threads
 
+# Steps of the clock's errors, s and s/s, for difference quotients of the poses. At these steps, a
+# quotient differs from the derivative by about 2e-4 of it.
 CLOCK_STEPS = {CLOCK_OFFSET: 1e-4, CLOCK_DRIFT: 5e-6}
-"""Steps of the clock's errors, s and s/s, for difference quotients of the poses.
-
-At these steps, a quotient differs from the derivative by about 2e-4 of it.
-"""
-
+# Decimals of the times of events, s. A command and a pose of the same rounded time are one event.
 ROUNDING = 9
-"""Decimals of the times of events, s. A command and a pose of the same rounded time are one event.
-"""
 
 
 @dataclass(frozen=True)
@@ -254,13 +250,13 @@ class TimedModel(LoopModel):
         return dict(zip(places, in_threads(moved, changes), strict=True))
 
 
+# Fields of a run with one row per frame.
 PER_FRAME = (
     *("time", "pose", "pose_rate", "torque", "command", "measured", "measured_ok"),
     *("joint_integral", "servo_integral", "pose_sensitivity", "start_sensitivity"),
     "command_sensitivity",
     *("motor_angle", "motor_rate", "filtered_rate"),
 )
-"""Fields of a run with one row per frame."""
 
 
 def _at_rows(run: ClosedLoopRun, rows: NDArray[np.intp]) -> ClosedLoopRun:

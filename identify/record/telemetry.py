@@ -118,7 +118,10 @@ class Telemetry:
 
 
 def check_increasing(time: Array, rows: Rows) -> None:
-    """Check that the times (N,) of rows increase. Raises RecordError with the first that does not."""
+    """Check that the times (N,) of rows increase.
+
+    Raises RecordError with the first that does not.
+    """
     strange = np.flatnonzero(~np.isfinite(time))
     if len(strange):
         raise RecordError(f"{rows.place(int(strange[0]))}: its time is not a finite number")

@@ -55,17 +55,10 @@ from identify.validation.pose_prediction import PosePrediction, predicted_runs
 
 TRUTH = 1
 TRAJECTORIES = 2
-FRAME = 3
-"""Children of the seed of a row, beside `identified.EXPERIMENT`."""
-
-AT_REST = 1e-9
-"""Largest change of a pose, m or rad, while the platform rests."""
-
-MOST_TRUTHS = 50
-"""Largest number of truths that are drawn for a row."""
-
-INNER = 0.683
-"""Probability of the shorter intervals, one standard deviation to both sides."""
+FRAME = 3  # children of the seed of a row, beside `identified.EXPERIMENT`
+AT_REST = 1e-9  # largest change of a pose, m or rad, while the platform rests
+MOST_TRUTHS = 50  # largest number of truths that are drawn for a row
+INNER = 0.683  # probability of the shorter intervals, one standard deviation to both sides
 
 COLUMNS = {
     "intervals": Column(

@@ -28,6 +28,8 @@ from identify.studies.rows.identified import (
 from identify.studies.rows.kind import Column, Kind, Row
 from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
 
+# Unit, meaning, factor and field of the score for each figure, by the end of the figure's name. If
+# the field is None, the end of the figure's name is the name of the field.
 FIGURES = {
     "groups_percent": (
         "%",
@@ -55,10 +57,6 @@ FIGURES = {
     ),
     "seconds": ("s", "time of the estimate", 1.0, None),
 }
-"""Unit, meaning, factor and field of the score for each figure, by the end of the figure's name.
-
-If the field is None, the end of the figure's name is the name of the field.
-"""
 
 STARTING = START.replace(" ", "_")
 

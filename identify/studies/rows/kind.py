@@ -77,6 +77,8 @@ def timing(*names: str) -> tuple[str, ...]:
     )
 
 
+# Keys of a sensor file except timing, labels and renderer. The renderer is left out because the
+# scenario's renderer is always used.
 SENSOR = (
     "sensor.rig.",
     "sensor.camera.",
@@ -88,18 +90,15 @@ SENSOR = (
     "sensor.platform.",
     "sensor.base.",
 )
-"""Keys of a sensor file except timing, labels and renderer.
 
-The renderer is left out because the scenario's renderer is always used.
-"""
-
+# Keys on which pictures and measured poses depend, beside the timing.
 PICTURES = ("scenario.sensor", "scenario.renderer", "scenario.pose_method", *SENSOR)
-"""Keys on which pictures and measured poses depend, beside the timing."""
 
 BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientation_amplitude_rad")
+# Keys on which a random pose or path in the scenario's box depends.
 PATH = ("scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", *BOX)
-"""Keys on which a random pose or path in the scenario's box depends."""
 
+# Keys of the limits of a random path.
 LIMITS = (
     "scenario.excitation.travel_margin_rad",
     "scenario.excitation.travel_margin_m",
@@ -108,7 +107,6 @@ LIMITS = (
     "scenario.excitation.least_leverage",
     "scenario.excitation.most_condition",
 )
-"""Keys of the limits of a random path."""
 
 NOISE_OFF = IneffectiveKeys(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
@@ -117,6 +115,7 @@ NOISE_OFF = IneffectiveKeys(
     "change",
 )
 
+# Keys without effect if the plant lacks the part to which they belong.
 PLANT = (
     IneffectiveKeys(
         ("scenario.plant.geometry_seed",),
@@ -137,9 +136,11 @@ PLANT = (
         "scenario.plant.joint_stiffness_N_m is not given: the joints are rigid",
     ),
 )
-"""Keys without effect if the plant lacks the part to which they belong."""
 
 
+# Keys that are allowed among the changes of any kind. They are labels, the renderer, the drift
+# watch, and all keys that a scenario checks against its frame rate. A change of the frame rate can
+# require a change of such a key.
 BESIDE = (
     "scenario.name",
     "scenario.description",
@@ -155,11 +156,6 @@ BESIDE = (
     "scenario.validation.duration_s",
     "scenario.rig.watch",
 )
-"""Keys that are allowed among the changes of any kind.
-
-They are labels, the renderer, the drift watch, and all keys that a scenario checks against its
-frame rate. A change of the frame rate can require a change of such a key.
-"""
 
 
 def check_read(study: Study, reads: KeysRead, first: Scenario, options: BaseModel) -> None:
@@ -222,19 +218,12 @@ def _always(
 _SPELLINGS = [timing(name) for name in IN_FILE]
 
 
-Row = dict[str, float]
-"""Figures of a row by name."""
-
-
+Row = dict[str, float]  # figures of a row by name
+# Setting of all rows: no drift watch of the cameras, because no figure depends on it.
 UNWATCHED = {"rig.watch": "none"}
-"""Setting of all rows: no drift watch of the cameras, because no figure depends on it."""
-
-
+# Beginning of the names of figures that are probabilities of values below the truth. They are
+# uniform over the rows if the stated distributions are right, see `studies.uniformity`.
 PROBABILITY = "below: "
-"""Beginning of the names of figures that are probabilities of values below the truth.
-
-They are uniform over the rows if the stated distributions are right, see `studies.uniformity`.
-"""
 
 
 @dataclass(frozen=True)

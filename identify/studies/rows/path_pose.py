@@ -41,8 +41,8 @@ from identify.trajectory import FourierTrajectory
 DRAWN_PATH = 0
 SENSOR = 1
 LATENCY = 2
+# Number of instants per frame period at which the pose in use is compared with the true pose.
 INSTANTS_PER_FRAME = 16
-"""Number of instants per frame period at which the pose in use is compared with the true pose."""
 
 COLUMNS = {
     "frames": Column("1", "stereo pictures taken"),
@@ -132,8 +132,7 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
-FRAME = 4.3e3
-"""Memory per frame, bytes, as measured with up to 1,800,000 frames."""
+FRAME = 4.3e3  # memory per frame, bytes, as measured with up to 1,800,000 frames
 
 
 def memory(setup: Setup, options: PathPoseOptions) -> float:

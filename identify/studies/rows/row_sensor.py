@@ -26,18 +26,11 @@ from identify.scenario.section import Section
 from identify.setup import Setup
 from identify.studies.rows.kind import Column, Row
 
-SENSORS_KEPT = 16
-"""Number of cached sensors per process. A sensor takes about a megabyte."""
-
-DROPPED = "dropped frame"
-"""Reason for which a drawn frame is lost."""
-
+SENSORS_KEPT = 16  # number of cached sensors per process. A sensor takes about a megabyte.
+DROPPED = "dropped frame"  # reason for which a drawn frame is lost
+# Way of teaching. ``exact``: frames and sticker places have no error, so rows show observation
+# noise alone. ``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s per row).
 Teaching = Literal["exact", "sensor"]
-"""Way of teaching.
-
-``exact``: frames and sticker places have no error, so rows show observation noise alone.
-``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s per row).
-"""
 
 
 class SensorOptions(Section):
@@ -149,6 +142,7 @@ def stated_um(covariances: Array) -> tuple[float, float]:
     )
 
 
+# Figures of rows with measured poses.
 POSE_COLUMNS = {
     "position_rms_um": Column(
         "um", "error of the measured position, rms over pictures and axes", main=True
@@ -163,7 +157,6 @@ POSE_COLUMNS = {
         "urad", "error of the measured orientation according to the sensor's covariance"
     ),
 }
-"""Figures of rows with measured poses."""
 
 
 def pose_figures(errors: Array, covariances: Array) -> Row:

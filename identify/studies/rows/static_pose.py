@@ -46,11 +46,9 @@ POSES = 0
 SENSOR = 1
 DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
+# Standard deviation of the predicted pose, m and rad, near which stickers are searched. It is the
+# error of a tracker's prediction.
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
-"""Standard deviation of the predicted pose, m and rad, near which stickers are searched.
-
-It is the error of a tracker's prediction.
-"""
 
 COLUMNS = {
     "captures": Column("1", "stereo pictures taken"),

@@ -27,11 +27,8 @@ from identify.studies.rows.row_sensor import DrawnSensor
 
 TROUBLE = 0
 RECORD = 1
-AGAIN = 2
-"""Streams of a case: its trouble, its record, and the record after something was mended."""
-
-DRAWS = 10
-"""Largest number of draws of a case until the robot can run."""
+AGAIN = 2  # streams of a case: its trouble, its record, and the record after something was mended
+DRAWS = 10  # largest number of draws of a case until the robot can run
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from identify.studies.rows.gauntlet import bodies, measured, mechanical
 from identify.studies.rows.gauntlet.trouble import Draw, Laboratory, Trouble
 
+# Kinds of trouble that the diagnosis has causes for.
 INSIDE: dict[str, Draw] = {
     "zero of a joint": mechanical.zero,
     "geometry": mechanical.geometric_number,
@@ -29,24 +30,22 @@ INSIDE: dict[str, Draw] = {
     "load that is not stated": bodies.load,
     "cameras": measured.cameras,
 }
-"""Kinds of trouble that the diagnosis has causes for."""
 
+# Kinds of trouble outside the catalogue of the diagnosis.
 OUTSIDE: dict[str, Draw] = {
     "backlash": mechanical.backlash,
     "steps of commands": mechanical.quantised,
 }
-"""Kinds of trouble outside the catalogue of the diagnosis."""
 
+# Names of all kinds of trouble. Rows name a kind by its place here.
 TROUBLES: tuple[str, ...] = (*INSIDE, *OUTSIDE)
-"""Names of all kinds of trouble. Rows name a kind by its place here."""
 
 Wrong = Literal["drawn", "none", "one", "two", "outside"]
 
+# Probability of each sort of case, if the sort is drawn.
 SHARES: dict[Wrong, float] = {"one": 0.55, "two": 0.2, "none": 0.125, "outside": 0.125}
-"""Probability of each sort of case, if the sort is drawn."""
-
+# Kinds that are never drawn with another. Their size shows only if nothing else is wrong.
 ALONE = ("stated noise",)
-"""Kinds that are never drawn with another. Their size shows only if nothing else is wrong."""
 
 
 def drawn_troubles(

@@ -20,20 +20,13 @@ from identify.studies.rows.gauntlet.trouble import (
 )
 from identify.studies.rows.gauntlet.troubled_plants import late_plant
 
+# Standard deviation with which a laboratory states a latency that a diagnosis has found. It is so
+# large that the record itself determines the latency.
 LATENCY_STD_S = 1e-3
-"""Standard deviation with which a laboratory states a latency that a diagnosis has found.
-
-It is so large that the record itself determines the latency.
-"""
-
-SCALE_STD = 1e-4
-"""Standard deviation of the scale of the cameras that a record states."""
-
-MOST_FRAMES = 4
-"""Largest number of frames with gross errors."""
-
+SCALE_STD = 1e-4  # standard deviation of the scale of the cameras that a record states
+MOST_FRAMES = 4  # largest number of frames with gross errors
+# Pattern of a remedy that marks a frame as lost. It captures the number of the frame.
 FRAME = re.compile(r"mark frame (\d+)")
-"""Pattern of a remedy that marks a frame as lost. It captures the number of the frame."""
 
 
 def late_by(seconds: float, per_second: float = 0.0) -> Callable[[xr.Dataset], xr.Dataset]:

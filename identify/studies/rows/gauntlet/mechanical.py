@@ -20,20 +20,16 @@ from identify.studies.rows.gauntlet.trouble import (
 )
 from identify.studies.rows.gauntlet.troubled_plants import PlantWithPlay
 
+# Smallest and largest error of a zero, by the unit of the joints.
 ZERO = {"rad": (2e-4, 1.5e-3), "m": (5e-5, 5e-4)}
-"""Smallest and largest error of a zero, by the unit of the joints."""
-
+# Smallest and largest error of another number of the geometry, by unit.
 NUMBER = {"rad": (1e-3, 8e-3), "m": (1e-4, 8e-4)}
-"""Smallest and largest error of another number of the geometry, by unit."""
-
+# Smallest and largest step of commands, by the unit of the joints.
 STEP = {"rad": (3e-4, 2e-3), "m": (3e-5, 2e-4)}
-"""Smallest and largest step of commands, by the unit of the joints."""
-
+# Smallest and largest friction of passive joints, N m s/rad or N m, by its law.
 PASSIVE = {"viscous": (0.01, 0.05), "coulomb": (3e-3, 2e-2)}
-"""Smallest and largest friction of passive joints, N m s/rad or N m, by its law."""
-
+# Smallest and largest width of play, by the unit of the joints.
 PLAY = {"rad": (5e-4, 3e-3), "m": (1e-4, 1e-3)}
-"""Smallest and largest width of play, by the unit of the joints."""
 
 
 def _moved_by(change: Callable[[RobotGeometry], RobotGeometry]) -> Callable[[Plant], Plant]:

@@ -15,8 +15,8 @@ from identify.diagnosis.diagnosis import Finding
 from identify.experiment.plant import Plant
 from identify.scenario import Scenario
 
+# Pattern of a setting in a remedy, as it would be typed, with or without quotes.
 SETTING = re.compile(r"--set (?:'([^']+)'|(\S+))")
-"""Pattern of a setting in a remedy, as it would be typed, with or without quotes."""
 
 
 def unchanged_plant(plant: Plant) -> Plant:
@@ -121,8 +121,8 @@ class Laboratory:
     holding: float
 
 
+# Function that draws a trouble, with a size as it occurs in workshops.
 Draw = Callable[[Laboratory, np.random.Generator], Trouble]
-"""Function that draws a trouble, with a size as it occurs in workshops."""
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

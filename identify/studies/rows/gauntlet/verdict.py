@@ -9,6 +9,7 @@ from identify.diagnosis.loop_causes import FRICTION
 from identify.diagnosis.measurement_causes import KINDS
 from identify.studies.rows.gauntlet.case import Case
 
+# Names of groups of causes. Rows name a group by its place here.
 GROUPS: tuple[str, ...] = (
     "scale of the commands",
     "latency of the commands",
@@ -32,19 +33,15 @@ GROUPS: tuple[str, ...] = (
     "gross errors",
     "noise of the sensor",
 )
-"""Names of groups of causes. Rows name a group by its place here."""
 
+# Smallest share of a case's intervals that must contain the truth for the verdict "right". The
+# intervals of a case depend on each other. In one of twenty right models, the common scale of all
+# parameters is off by two standard deviations, so that a third of the intervals miss the truth.
+# With a wrong model, nearly all miss it, or nothing is identified. The share over all cases is
+# judged separately.
 HOLD = 0.5
-"""Smallest share of a case's intervals that must contain the truth for the verdict "right".
 
-The intervals of a case depend on each other. In one of twenty right models, the common scale of all
-parameters is off by two standard deviations, so that a third of the intervals miss the truth. With
-a wrong model, nearly all miss it, or nothing is identified. The share over all cases is judged
-separately.
-"""
-
-FIRST = 3
-"""Number of findings among which both of two troubles must be."""
+FIRST = 3  # number of findings among which both of two troubles must be
 
 Verdict = Literal["right intervals", "right cause", "failed"]
 
