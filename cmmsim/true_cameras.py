@@ -33,13 +33,12 @@ from cmmsim.imaging.scene_bodies import (
 from cmmsim.imaging.stereo_camera import VirtualStereoCamera
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.uncertainty.known_rig import rig_changes
-from cmmsim.without_images.centre_errors import CentreErrors
 from cmmsim.without_images.drawn_stickers import (
     STATISTICAL,
     Light,
     StatisticalStereoCamera,
 )
-from cmmsim.without_images.sticker_scene import StickerScene
+from cmmsim.without_images.sticker_scene import CentreErrors, StickerScene
 from cmmsim.without_images.verified import require_proved
 
 # Renderers that replace each body by the convex hull of its mesh.

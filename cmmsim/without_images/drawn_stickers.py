@@ -31,8 +31,7 @@ from cmmsim.imaging.scene_bodies import PlacedBodies
 from cmmsim.imaging.stereo_camera import Quality
 from cmmsim.measuring.observation import Observer
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.without_images.centre_errors import CentreErrors
-from cmmsim.without_images.sticker_scene import StickerScene
+from cmmsim.without_images.sticker_scene import CentreErrors, StickerScene
 from cmmsim.without_images.verified import NAME, require_short
 
 if TYPE_CHECKING:

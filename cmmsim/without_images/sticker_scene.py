@@ -1,4 +1,6 @@
-"""True places of stickers, and the convex solids that can hide them."""
+"""True places of stickers, errors of their centres by print, and the solids that can hide them."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene_bodies import ConvexSolid, Mesh, SceneBody
+from cmmsim.measuring.print_allowance import centre_errors_px
 
 if TYPE_CHECKING:
     from cmmsim.without_images.hiding_kernels import Solids
@@ -34,7 +38,7 @@ class StickerScene:
     solids: tuple[ConvexSolid, ...]
 
     @classmethod
-    def of(cls, bodies: Sequence[SceneBody], obstacles: Sequence[Mesh]) -> "StickerScene":
+    def of(cls, bodies: Sequence[SceneBody], obstacles: Sequence[Mesh]) -> StickerScene:
         """Return the scene of bodies with stickers and of further solids."""
         discs = [
             (stack.discs[-1], owner) for owner, body in enumerate(bodies) for stack in body.stickers
@@ -87,7 +91,7 @@ class StickerScene:
         return hidden
 
     @cached_property
-    def occluders(self) -> "Solids":
+    def occluders(self) -> Solids:
         """Solids as ``hidden_stickers`` takes them."""
         from cmmsim.without_images.hiding_kernels import Solids
 
@@ -100,3 +104,29 @@ class StickerScene:
         starts = np.cumsum([0, *(len(normals) for normals, _ in faces)])
         normals, offsets = (np.concatenate(values) for values in zip(*faces, strict=True))
         return Solids(starts, normals, offsets, middles, np.array(radii))
+
+
+PRINT_STREAM = 2
+
+
+@dataclass(frozen=True)
+class CentreErrors:
+    """Errors of sticker centres due to uneven print and outlines that are not round.
+
+    ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
+    ``changing_px`` is the rms of the errors that change from exposure to exposure.
+    """
+
+    constant: Array
+    changing_px: float
+
+    @classmethod
+    def of(cls, file: SensorFile, radius_px: float, count: int) -> CentreErrors:
+        """Draw the errors of ``count`` stickers with the radius ``radius_px`` in the image."""
+        constant, changing = centre_errors_px(file, radius_px)
+        rng = np.random.default_rng([file.print.seed, PRINT_STREAM])
+        return cls(constant * rng.standard_normal((2, count, 2)), changing)
+
+    def added_to(self, centres: Array, rng: np.random.Generator) -> Array:
+        """Return the centres (2, m, 2) of one exposure, with their errors."""
+        return centres + self.constant + self.changing_px * rng.standard_normal(centres.shape)

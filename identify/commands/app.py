@@ -13,8 +13,7 @@ import typer
 from identify.commands.camera_calibration import calibrate
 from identify.commands.check import check
 from identify.commands.comparisons import estimators, variation
-from identify.commands.diagnosis import budget, diagnose
-from identify.commands.gauntlet import gauntlet
+from identify.commands.diagnosis import budget, diagnose, gauntlet
 from identify.commands.geometry_run import geometry
 from identify.commands.help import (
     BEYOND_LIMIT,

@@ -31,8 +31,8 @@ from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RunFiles, digest
 from identify.reporting.figures.logs import motion_figure
 from identify.scenario import load_scenario
-from identify.stages.diagnose import ENTRY as DIAGNOSIS
-from identify.stages.diagnose import with_diagnosis
+from identify.stages.explain import ENTRY as DIAGNOSIS
+from identify.stages.explain import with_diagnosis
 from identify.stages.plan import (
     check_planned,
     identified_files,

@@ -16,7 +16,7 @@ from identify.progress import SilentProgress
 from identify.record.provenance import RunFiles, store_robot
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
 from identify.reporting.run_result import parameter_vector
-from identify.stages.run_budget import error_budget, pose_budget
+from identify.stages.explain import error_budget, pose_budget
 from identify.validation.pose_prediction import predicted_runs
 from tests.identify.commands import command, one_line
 from tests.identify.run_files import write_covariance, write_runs

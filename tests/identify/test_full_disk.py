@@ -140,9 +140,7 @@ CASES = {
         "identify --record {made}/run/experiment.nc --out {place}/new/run", (), IDENTIFY, "run"
     ),
     "validate": Case("validate --out {place}/run", ("run",), VALIDATE, "run"),
-    "diagnose": Case(
-        "diagnose {place}/run", ("run",), ("identify.stages.diagnose.diagnosis_from",)
-    ),
+    "diagnose": Case("diagnose {place}/run", ("run",), ("identify.stages.explain.diagnosis_from",)),
     "budget": Case("budget {place}/run", ("run",)),
     "report": Case("report --out {place}/run", ("run",), REPORT),
     "estimators": Case(

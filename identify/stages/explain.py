@@ -1,6 +1,8 @@
-"""Stage that states what each source of uncertainty adds to poses, parameters and predictions."""
+"""Stages that explain an identified run: causes of its misfit, and sources of its uncertainty."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -8,10 +10,14 @@ import xarray as xr
 from dynamics import load_robot
 from dynamics.closed_loop import LoopFailure
 from identify.arrays import Array
+from identify.diagnosis.cause import Cause
+from identify.diagnosis.diagnose import diagnosis_from
+from identify.diagnosis.diagnosis import Diagnosis
 from identify.estimation.budget import Budget, budget_of, parameter_budget, together
 from identify.estimation.covariance import NOISE
+from identify.estimation.identification import output_error_problem
 from identify.files.dataset import POSE, read_sources
-from identify.files.run_folder import RunFolder, check_entries, load_result
+from identify.files.run_folder import RunFolder, check_entries, load_result, save_result
 from identify.loop_parameters import settled_drive
 from identify.model.from_record import predicting_model
 from identify.model.model_side import ModelSide, model_side
@@ -20,9 +26,58 @@ from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RECORDS, RunFiles
 from identify.record.stored_common_errors import CHANGES, kind_of, read_common_errors
 from identify.reporting.run_result import parameter_vector
-from identify.scenario import load_scenario
+from identify.scenario import Scenario, load_scenario
+from identify.stages.plan import identified_files
 from identify.trajectory import load_trajectories
 from identify.validation.pose_prediction import predicted_variances
+
+ENTRY = "diagnosis"  # name of the entry of result.json that holds the diagnosis
+
+
+def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
+    """Diagnose the identified model of a run folder, and store the diagnosis in result.json.
+
+    own: the user's own causes, which are tried as well. Raises RecordError if the result is
+    incomplete or was made of another record, and the errors of `identify.diagnose`.
+    """
+    files, result, scenario, side = _identified(folder)
+    identification = result["identification"]
+    names = identified_files(files.folder, scenario.identification)
+    records = [files.content(name) for name in names]
+    problem = output_error_problem(records, side, scenario.identification)
+    estimate = parameter_vector(side.robot, identification, "estimate")
+    found = diagnosis_from(problem, estimate, own, identification["nuisance_estimates"])
+    save_result(files.folder.result, with_diagnosis(result, found))
+    return found
+
+
+def _identified(
+    folder: Path, *further: str
+) -> tuple[RunFiles, dict[str, Any], Scenario, ModelSide]:
+    """Return files, result, scenario and model's side of an identified run.
+
+    ``further`` names files that must be those of the result, besides the records.
+    """
+    run_folder = RunFolder(folder)
+    run_folder.require("scenario.toml", "experiment.nc", *further, "result.json")
+    files = RunFiles(run_folder)
+    result = load_result(run_folder.result)
+    check_entries(run_folder.result, result, "identify")
+    files.check_made_of(*RECORDS, *further, result=result)
+    scenario = load_scenario(run_folder.whole_scenario)
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run_folder.path).robot
+    side = model_side(robot, scenario).with_drive(settled_drive(result["identification"]))
+    return files, result, scenario, side
+
+
+def with_diagnosis(result: dict[str, Any], found: Diagnosis) -> dict[str, Any]:
+    """Return a result with a diagnosis, whose warnings replace those of an earlier diagnosis."""
+    identification = result["identification"]
+    earlier = (result.get(ENTRY) or {}).get("warnings", [])
+    kept = [text for text in identification["warnings"] if text not in earlier]
+    warned = identification | {"warnings": [*kept, *found.warnings()]}
+    return result | {"identification": warned, ENTRY: found.to_dict()}
+
 
 UNITS = 3 * ("m",) + 3 * ("rad",)
 
@@ -53,16 +108,9 @@ def error_budget(folder: Path | str) -> Budget:
     --------
     >>> error_budget("runs/quick-0").to_dataframe()  # doctest: +SKIP
     """
-    run_folder = RunFolder(Path(folder))
-    run_folder.require("scenario.toml", "experiment.nc", "covariance.nc", "result.json")
-    files = RunFiles(run_folder)
-    result = load_result(run_folder.result)
-    check_entries(run_folder.result, result, "identify")
-    files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
-    scenario = load_scenario(run_folder.whole_scenario)
-    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run_folder.path).robot
+    files, result, _, side = _identified(Path(folder), "covariance.nc")
+    run_folder = files.folder
     identification = result["identification"]
-    side = model_side(robot, scenario).with_drive(settled_drive(identification))
     covariance = files.covariance_of(side.robot)
     sources = read_sources(run_folder.covariance, covariance)
     budgets = [
