@@ -24,7 +24,7 @@ DEEPEST_ELEMENT = 150  # largest depth of XML elements
 LARGEST_YAML = 100_000  # largest size of a YAML file, in bytes
 # Pattern of the names of robots, sensors, scenarios and studies, which are used as file names.
 NAME = r"^\w[\w .+-]*$"
-# Largest number of characters of these names. The file name then has at most 255 bytes.
+# Largest number of characters of a name. Its file name then has at most 255 bytes.
 LONGEST_NAME = 60
 
 _YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)

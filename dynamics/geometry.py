@@ -1,6 +1,4 @@
-"""Geometry of a parallel robot: its legs, the home pose of the platform, and the travel of
-the joints.
-"""
+"""Geometry of a parallel robot: legs, home pose of the platform, and travel of the joints."""
 
 import hashlib
 from collections import Counter
@@ -26,6 +24,7 @@ SAME_PLACE = 1e-6  # distance, m, below which joints of two legs coincide
 class RobotGeometry:
     """Legs and chart of a robot. Two geometries are equal if all their numbers are equal.
 
+    `chart` has the entries of the pose that the platform can change, and the home pose.
     `travel_limit` is the largest magnitude of a joint coordinate, rad or m. `gravity` (3,) is in
     m/s^2. Lengths are in m, and vectors are in the axes of the base unless stated otherwise. Legs
     are assembled: the branch of each leg's inverse kinematics at home is selected. `full_bodies`
@@ -223,7 +222,7 @@ class RobotGeometry:
         )
 
     def shifted(self, joints: np.ndarray) -> "RobotGeometry":
-        """Geometry whose joint coordinates at each pose are smaller by values (n,), rad or m."""
+        """Geometry whose joint coordinates at each pose are smaller by `joints` (n,), rad or m."""
         return replace(
             self,
             legs=tuple(leg.shifted(float(by)) for leg, by in zip(self.legs, joints, strict=True)),
@@ -330,9 +329,7 @@ class MovableGeometry:
 
     @cached_property
     def symbols(self) -> tuple[ca.SX, ...]:
-        """Deviations (g,) of the geometric numbers, m and rad, which are the last input of
-        functions.
-        """
+        """Deviations (g,) of the geometric numbers, m and rad: the last input of functions."""
         return (ca.SX.sym("deviations", len(self.nominal.number_names)),)
 
     @cached_property

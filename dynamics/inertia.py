@@ -57,7 +57,7 @@ class BodyInertias:
 def physical_inertias(
     layout: ParameterLayout, parameters: np.ndarray, allow_changes: bool = False
 ) -> BodyInertias:
-    """Inertias of parameters (p,) that a multibody engine accepts.
+    """Inertias of all bodies for parameters (p,), such that a multibody engine accepts them.
 
     Raises UnphysicalInertiaError, with bodies and values, if a body must be changed and
     `allow_changes` is False.

@@ -116,10 +116,10 @@ class Parameters(BaseModel):
 class Unstated(Strict):
     """Standard deviations of the differences between real bodies and joints and the model.
 
-    The model of a centred body has its centre of mass in one place, and its axes of inertia along
-    its own axes. The model of a passive joint without a viscous parameter turns freely. Real bodies
-    and joints are near these models. The defaults are for an ordinary workshop. Zero states that
-    bodies and joints are exactly as modelled.
+    The model of a centred body has its centre of mass at the reference point, and its principal
+    axes of inertia along its own axes. The model of a passive joint without a viscous parameter
+    turns freely. Real bodies and joints differ from these models. The defaults are for an ordinary
+    workshop. Zero states that bodies and joints are exactly as modelled.
     """
 
     centre_std: float = Field(

@@ -234,7 +234,7 @@ class ParameterLayout:
         return np.broadcast_to(rows, (*gains.shape[:-1], self.joints, len(JOINT_PID)))
 
     def converted_gains(self, gains: np.ndarray, other: "ParameterLayout") -> np.ndarray:
-        """Gains in another layout of the same robot, whose joints share them or have their own.
+        """Gains in another layout of the same robot, shared by all joints or joint by joint.
 
         Gains that become shared are the mean of those of all joints.
         """

@@ -54,7 +54,7 @@ def own_functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
 
 @lru_cache(maxsize=4)
 def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
-    """Compiled functions for all geometries near a nominal one. Their last input is deviations."""
+    """Compiled functions for all geometries near a nominal one, with deviations as last input."""
     movable = MovableGeometry(nominal)
     key = b"movable" + nominal.digest
     return compiled_functions(

@@ -40,12 +40,11 @@ LENGTH_FIELDS = {
     "rod": "rod_length",
 }
 
-# Distances, seen from above, of the base joints from the middle of the base, and of the platform
-# joints from the middle of the platform.
+# Radii of the circles, seen from above, on which base joints and platform joints lie.
 RADII = ("base_radius", "platform_radius")
 # Moment of inertia of each body of a leg about the axis along its length.
 MOMENT_ABOUT_LENGTH = {"crank": "Ixx", "link": "Izz", "cylinder": "Izz", "rod": "Izz"}
-# Number of digits of joint coordinates, from the first digit of the radius of their circle on.
+# Number of digits to which points are rounded, counted from the first digit of their radius.
 DIGITS = 9
 SAMPLES = 2000  # number of random positions of the joints within the travel limit
 # Factor by which the travel limit is reduced until no pose within it is near a singularity.
@@ -151,12 +150,12 @@ def _on_circle(joint: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _shortened(values: np.ndarray, size: float) -> np.ndarray:
-    """Values rounded to `DIGITS` digits, counted from the first digit of a size on."""
+    """Values rounded to `DIGITS` digits, counted from the first digit of `size`."""
     return np.round(values, DIGITS - 1 - int(np.floor(np.log10(size))))
 
 
 def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
-    """Direction (3,) of a horizontal crank that is seen from above at right angles to its link.
+    """Direction (3,) of a horizontal crank that, seen from above, is at right angles to its link.
 
     `span` is the vector from the crank's axis to the platform joint. `side` is 1 for a crank on the
     left of `span`, and -1 on the right.
@@ -242,7 +241,7 @@ def _check_stroke(leg: Leg) -> None:
 def _scaled(
     layout: ParameterLayout, dynamic: np.ndarray, ratios: Mapping[str, float]
 ) -> np.ndarray:
-    """Dynamic parameters after scaling of the bodies, which stay physical. See the module."""
+    """Dynamic parameters of the scaled bodies, all of which can exist. See the module."""
     values = dynamic.copy()
     bodies = layout.bodies_of(values)
     moments = [FULL_INERTIAL.index(name) for name in MOMENTS]

@@ -2,7 +2,7 @@
 
 Commands keep their order. A command that would overtake the one before it waits, and arrives
 together with it. If several commands arrive together, only the last one acts. With the linear hold,
-a command ramps over one frame period from the previous command and then remains constant. A command
+the command ramps from the previous one over one frame period, and then remains constant. A command
 that arrives during the ramp of the previous one starts at the end value of that ramp.
 """
 
@@ -21,7 +21,7 @@ Instant = tuple[int, float]
 
 
 class CommandSchedule(NamedTuple):
-    """Spans of time in which one command acts. Each span ends with its frame at the latest.
+    """Spans of time in which one command acts. A span does not go beyond the end of its frame.
 
     The spans of frame k have the indices first[k] to first[k + 1] - 1. The other arrays have one
     entry per span. `command` is the number of the frame that issued the command; it is negative
@@ -40,7 +40,7 @@ def command_schedule(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run.
 
     Commands issued before the run have the latencies of the start state. If it has none, they have
-    the latency of the timing.
+    the latency of `FrameTiming`.
     """
     if problem.times is not None:
         return _schedule_at_times(problem)
@@ -112,7 +112,7 @@ def _schedule(
     )
 
 
-# Difference, s, up to which two instants count as one if the times of frames are given.
+# Largest difference, s, of instants that count as one. It is used if `times` are given.
 SAME_S = 1e-9
 
 
@@ -142,7 +142,7 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     inside = np.concatenate([arrivals, arrivals + period] if linear else [arrivals])
     inside = inside[(inside > times[0]) & (inside < times[-1])]
     begins = np.unique(np.concatenate([times, inside]))
-    # an instant that counts as one with the next begins no span, unless it is a frame
+    # an instant that the next one follows within SAME_S begins no span, unless it is a frame
     kept = np.append(np.diff(begins) > SAME_S, True) | np.isin(begins, times)
     begins = begins[kept]
     newest = np.maximum(np.searchsorted(arrivals, begins, side="right") - 1, 0)

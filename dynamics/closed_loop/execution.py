@@ -96,7 +96,7 @@ def run_repeats(
 def _run_together(
     problem: LoopProblem, noises: np.ndarray, compiled: bool
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do runs that differ in their noise (runs, frames, 6), with one run per lane."""
+    """Do runs that differ in their noise (runs, frames, 6), one in each lane (`lane_kernels`)."""
     sizes = problem.sizes
     frames = problem.frames
     runs = len(noises)
@@ -129,7 +129,7 @@ def _run_together(
 def _set_up(
     problem: LoopProblem, commands: np.ndarray, compiled: bool, runs: int = 1
 ) -> tuple[Any, ...]:
-    """Memory, record and plan of runs, and the functions of the robot and of the servo's robot.
+    """Memory, record and plan of runs, and the functions of `robot` and of `servo_robot`.
 
     The caller must keep a reference to the functions, because their machine code is freed with
     them.
@@ -153,7 +153,7 @@ def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -
 
 
 def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
-    """Poses for the coordinates that the kernels have recorded."""
+    """Poses, rates and sensitivities for the coordinates that the kernels have recorded."""
     chart = problem.robot.geometry.chart
     poses = {
         "pose": chart.pose(recorded["pose"]),
@@ -263,7 +263,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
 def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarray:
     """Derivatives (m, p) of the servo integral at rest.
 
-    The integral determines the command. Its derivatives follow from those of the command (n, p).
+    They follow from those of the command (n, p), because the integral determines the command.
     """
     ki = problem.settings.servo.ki
     size = problem.sizes.coordinates
@@ -338,12 +338,12 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # A feedforward is the whole command at the start, so that the servo's part is zero.
+    # At the start, a feedforward is the whole command, and the servo's part is zero.
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
     # The last inputs of a function are constants: parameters and geometric numbers. If its inputs
-    # have a column for each stage, all columns have the same constants.
+    # have a column for each Runge-Kutta stage, all columns have the same constants.
     for inputs, function, constants in (
         (now.known.inputs, functions["equation_of_motion"], rigid),
         (now.served.inputs, servo_jacobian, rigid[:0]),
@@ -359,7 +359,7 @@ def _fill(
     now.parameters = len(columns)
     now.start_moves = problem.start_sensitivities
     now.step_column = len(columns) + problem.further_columns
-    # kernels work on whole vectors of columns; the last columns can be unused
+    # kernels work on groups of LANES columns, so that the last columns can be unused
     now.width = plain(whole_vectors)(int(now.step_column))
 
 

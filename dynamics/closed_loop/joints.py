@@ -52,7 +52,7 @@ class FrictionLaw:
     ----------
     name : {"coulomb_viscous", "smoothed", "stribeck"}
         coulomb_viscous has the exact sign of eq. 24 and sticks up to the Coulomb torque. smoothed
-        has tanh(theta_dot / smoothing_velocity) and never sticks. stribeck sticks up to
+        has tanh(theta_dot / smoothing_velocity) instead, and never sticks. stribeck sticks up to
         static_ratio times the Coulomb torque. When the joint slips, the excess over the Coulomb
         torque fades as exp(-(theta_dot / stribeck_velocity)^2).
     smoothing_velocity : float, optional
@@ -171,7 +171,7 @@ class JointElasticity:
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
     def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the rigid bodies behind the springs, without the inertia of the motors.
+        """Parameters of the bodies that the springs drive, without the inertia of the motors.
 
         Raises SimulationError if the actuator of a leg drives more than one body.
         """
@@ -197,9 +197,9 @@ class JointElasticity:
     ) -> int:
         """Number of integration steps per frame that resolves the fastest motion near a pose (6,).
 
-        The rate of the fastest motion is the largest eigenvalue of the joints and motors under
-        joint PID and friction, linearised at rest. Raises SimulationError if the inertia of a motor
-        is not below that of its crank.
+        The rate of the fastest motion is the magnitude of the largest eigenvalue of the joints and
+        motors under joint PID and friction, linearised at rest. Raises SimulationError if the
+        inertia of a motor is not below that of the body that it drives.
         """
         self._check_motors(robot, parameters)
         basis = robot.geometry.chart.basis
@@ -245,7 +245,7 @@ class JointElasticity:
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """Matrix (2 n, 2 n) of stiffness, or of damping, for the coordinates of bodies, then motors.
+    """Stiffness or damping matrix (2 n, 2 n). The bodies come first, then the motors.
 
     `spring` is the value between each body and its motor, and `at_motor` (n,) are the values
     between the motors and the base.

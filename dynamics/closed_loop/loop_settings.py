@@ -116,10 +116,10 @@ class ServoGains:
             real(f"servo gain {name}", getattr(self, name), SimulationError, least=0)
 
     def demand(self, error: np.ndarray, rate_error: np.ndarray, integral: np.ndarray) -> np.ndarray:
-        """Demand (m,) of the servo in the coordinates of the platform, eq. 30.
+        """Demand (m,) of the servo, eq. 30: the command before the Jacobian maps it to the joints.
 
-        The arguments are the error (m,) of the pose, its rate and its integral. The compiled loop
-        has the same law in `visual_servo_kernels.serve`.
+        The arguments are the error (m,) of the coordinates, its rate and its integral. The compiled
+        loop has the same law in `visual_servo_kernels.serve`.
         """
         return self.kp * error + self.kd * rate_error + self.ki * integral
 
@@ -128,8 +128,8 @@ class ServoGains:
 class FrameTiming:
     """Timing of the frames and of the joint commands.
 
-    The rate of the command in the joint PID, U_dot, is the difference of the last two commands
-    divided by the frame period, whether the command jumps or ramps.
+    The joint PID uses a rate of the command, U_dot: the difference of the last two commands divided
+    by the frame period, even if the command jumps.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class FrameTiming:
     latency_s : float
         Time from the exposure of a frame to the arrival of its command, s.
     hold : {"zero", "linear"}
-        With "zero" the command jumps to its new value. With "linear" it ramps there over one frame.
+        With "zero" the command jumps to its new value. With "linear" it ramps to it over one frame.
 
     Raises
     ------
@@ -185,7 +185,7 @@ class LoopSettings:
     elasticity : JointElasticity, optional
         Springs of the joints. The default is rigid joints.
     drives : Drives
-        Law and limit of the actuators.
+        Law of the drives, and limits of torques and commands.
 
     Raises
     ------

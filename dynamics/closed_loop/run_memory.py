@@ -1,7 +1,7 @@
 """Memory of a closed-loop run, in the form that its kernels use.
 
-A run allocates no memory. Its kernels work on four records that are made before the run: NumPy
-structured scalars, whose fields are numbers, arrays of fixed size, and further records. Numba
+A run allocates no memory. Its kernels work on records that are made before the run. A record is a
+NumPy structured scalar. Its fields are numbers, arrays of fixed size, and further records. Numba
 compiles a kernel for the types of its arguments, and the type of a record includes all sizes of the
 robot. The same compiled kernels thus serve every robot of the same sizes, and the compiler knows
 every length. `LAYOUT` lists the fields, `_lengths` gives the length of each dimension, and
@@ -104,11 +104,12 @@ def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
 class Memory(NamedTuple):
     """Records of one run.
 
-    `task` does not change during a run; it has addresses of compiled functions, laws, parameters
-    and gains. `now` is the state of the integrator. `evaluations` (5,) have all computed values at
-    the stages of a step and at its end. Rows of stuck joints are in the order of `now.stuck`.
-    `tangent` has derivatives: a row for each unknown, and columns for the parameters, for the start
-    state or directions, and for the length of a step that an event shortens.
+    `task` does not change during a run. It has laws, parameters, gains, and addresses of compiled
+    functions. `now` is the state of the integrator. `evaluations` (5,) have the values computed at
+    the four stages of a step and at its end. Their rows for stuck joints are in the order of
+    `now.stuck`. `tangent` has derivatives, with a row for each unknown. Its columns are for the
+    parameters, then the start state or directions, then the length of a step that an event
+    shortens. In kernels, `at` is `evaluations` or one of them, and `d` is `tangent`.
     """
 
     task: Any
@@ -176,7 +177,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         record_field("known"),
         record_field("served"),
         record_field("stopping"),
-        # joints: -1, 0 (stuck) or 1 for the direction of slip; the numbers of the stuck joints
+        # mode of each joint (0: stuck, -1 or 1: direction of slip), indices of the stuck joints
         integers("mode stuck", "joint"),
         # counters and switches
         integers("ramping moved events events_left start_moves time_moves length_moves"),
@@ -260,12 +261,12 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("shared", "shared input"),
     ),
     "tangent": (
-        # rows of `slope_derivative`
+        # inputs of each column of `slope_derivative`
         reals("trial", "trial row", "column"),
         reals("acting command_rate", "joint", "column"),
         reals("push", "coordinate", "column"),
         reals("direct", "joint", "column"),
-        # its results at each stage; slopes of filtered rates come before the torques
+        # its outputs at each stage; slopes of filtered rates come before the torques
         reals("k", "stage", "stage row", "column"),
         # derivatives of the state, and of filtered rates in a trial
         reals("x", "unknown", "column"),
@@ -339,7 +340,7 @@ def empty_memory(sizes: Sizes) -> Memory:
 
 
 def empty(name: str, sizes: Sizes) -> Any:
-    """Record filled with zeros that begins at the beginning of a line of the processor's cache.
+    """Record filled with zeros. It begins where a line of the processor's cache begins.
 
     A vector instruction on its fields then accesses one line instead of two.
     """

@@ -1,7 +1,7 @@
 """Stability of the sampled loop near rest, from the linear map of its state from frame to frame.
 
-Small deviations of the robot under its joint PID (eq. 31) obey a linear differential equation.
-While a command acts, the matrix exponential is its exact solution. The servo (eq. 30), with the
+Small deviations of the robot under its joint PID (eq. 31) obey a linear differential equation. As
+long as one command acts, the matrix exponential solves it exactly. The servo (eq. 30), with the
 latency of its commands, closes the loop once per frame. The loop is stable if all eigenvalues of
 the map are inside the unit circle. Dry friction and elasticity of the joints are neglected. Near
 rest, dry friction only makes the loop more stable.
@@ -32,9 +32,10 @@ def frame_map(
 ) -> np.ndarray:
     """Map (s, s) of small deviations from rest at a pose (6,), from frame to frame.
 
-    The state consists of the coordinates, their rates, the joint integrals, the coordinates
-    measured at the last frame, the servo integrals, and the past commands that can still act, the
-    latest first. Raises the same errors as `closed_loop.equilibrium`.
+    The state consists of the coordinates, their rates, the joint integrals, the filtered rates if
+    the drives have them, the coordinates measured at the last frame, the servo integrals, and the
+    past commands that can still act, the latest first. Raises the same errors as
+    `closed_loop.equilibrium`.
     """
     return _state_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
@@ -51,11 +52,10 @@ def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.
 def pose_response(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> Callable[[float], np.ndarray]:
-    """Response of the coordinates to small oscillations of the desired ones about a pose (6,).
+    """Frequency response from the desired to the true coordinates, near rest at a pose (6,).
 
-    Returns a function of the angular frequency, rad/s. This function returns the matrix (m, m) from
-    the desired to the true coordinates at the frames. Raises the same errors as
-    `closed_loop.equilibrium`.
+    Returns a function of the angular frequency, rad/s. Its result is the complex matrix (m, m) for
+    values at the frames. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
@@ -78,7 +78,8 @@ def _state_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     """Map (s, s) of `frame_map`, then the effect (s, m) of the desired coordinates at the frame.
 
-    Every quantity in this function is a matrix that acts on the state and the desired coordinates.
+    Every quantity in this function, such as `state` or `commands`, is a matrix. It maps the state
+    and the desired coordinates at the beginning of the frame to that quantity.
     """
     joints, size = robot.jacobian.shape
     timing = settings.timing
@@ -143,7 +144,7 @@ def gain_margin(
 def lowest_frame_rate(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> float:
-    """Lowest frame rate, Hz, at which the loop is stable, with the same latency in s.
+    """Lowest frame rate, Hz, at which the loop is stable. The latency in s is not changed.
 
     If the loop is unstable at the rate of the settings, the result is above that rate. It is NaN if
     the loop is stable at no rate.
@@ -155,7 +156,7 @@ def lowest_frame_rate(
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
-    # The size of the map grows with the number of frames in the latency; fifty are enough.
+    # the size of the map grows with the number of frames in the latency, here at most fifty
     fastest = min(
         100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
     )
@@ -182,8 +183,8 @@ class _NearRest(NamedTuple):
     """Robot near rest, without the gains and the timing of the servo.
 
     `motion` is the matrix of `_joint_loop`. `jacobian` (n, m) is the Jacobian of the joints with
-    respect to the coordinates. `turning` (n, m) is the derivative, with respect to the coordinates,
-    of the Jacobian times the demand that holds the joints.
+    respect to the coordinates. `turning` (n, m) is the derivative of the Jacobian times the demand
+    of the servo, with respect to the coordinates. The demand is the one that holds the joints.
     """
 
     motion: np.ndarray
@@ -215,9 +216,9 @@ def _joint_loop(
     """Matrix of the linear differential equation of the joints under their drives.
 
     The state consists of q, q_dot, joint integrals, filtered rates if there are any, the command,
-    its slope, and U_dot. The command changes with its slope, which can differ from the U_dot in the
-    law of the drive. An integral that the law does not use is made to decay, because it would
-    otherwise count as not stable.
+    its slope, and U_dot in the law of the drive. The slope is the true rate of the command, and can
+    differ from U_dot. An integral that the law does not use is made to decay. Otherwise its
+    eigenvalue would be at the limit of stability.
     """
     q = robot.coordinates(pose)
     joints = robot.layout.joints
@@ -261,7 +262,7 @@ def _joint_loop(
 
 
 def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """Command of a frame as a matrix of the servo's inputs.
+    """Matrix from the inputs of the servo to the command of a frame.
 
     The inputs are the errors of the coordinates at this frame and at the previous frame, and the
     servo integral before this frame.
@@ -278,8 +279,8 @@ def torque_motion(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear motion near rest at a pose (6,), for drives that take torques.
 
-    Returns the matrix (2 m, 2 m) of coordinates and rates, and the accelerations (m, n) due to
-    torques beyond those that hold the robot.
+    Returns the matrix (2 m, 2 m) of the differential equation of coordinates and rates. The second
+    result is the acceleration (m, n) per torque added to those that hold the robot.
     """
     q = robot.coordinates(pose)
     rest = np.zeros(len(robot.coordinate_names))
@@ -303,9 +304,9 @@ def last_stable(
 ) -> float:
     """Limit of stability on the way from a start to one of two ends.
 
-    It is the first value at which the radius passes 1. If the loop is stable at the start, the
-    search goes to `stable_end`, and returns that end if the loop is stable all the way. Otherwise,
-    it goes to `other_end`, and returns NaN if the loop is stable nowhere.
+    The limit is the first value at which the radius passes 1. If the loop is stable at the start,
+    the search goes to `stable_end`, and returns that end if the loop is stable all the way. If it
+    is unstable at the start, the search goes to `other_end`, and returns NaN if it finds no limit.
     """
     stable = radius(start) < 1
     value = start

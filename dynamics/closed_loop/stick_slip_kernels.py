@@ -1,8 +1,11 @@
 """Kernels for motion with dry joint friction over a span of time with one command.
 
-Between changes of the modes the motion is smooth, and the classical Runge-Kutta method integrates
-it. A mode ends when a slipping joint comes to rest, or when a stuck joint reaches its breakaway
-torque (eq. 24). The step is shortened to end at this event, up to rounding errors.
+The mode of a joint is stuck, or slipping in one direction. Between changes of the modes the motion
+is smooth, and the classical Runge-Kutta method integrates it. A mode ends when a slipping joint
+comes to rest, or when a stuck joint reaches its breakaway torque (eq. 24). The step is shortened to
+end at this event, up to rounding errors. The margin of a mode is positive as long as the mode
+holds: it is the speed of a slipping joint, or the unused fraction of the breakaway torque. The
+arguments `task`, `now`, `at` and `d` are explained in `run_memory`.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import clear, copy, dot, fill, solve
@@ -33,7 +36,7 @@ TORQUE_ROUNDING = 1e-13
 
 
 # Purposes of the step that is being tried. TAKEN: the last step was accepted, and no step is being
-# tried. WHOLE: the step may be accepted. HALF: half the step, to see whether modes are broken in
+# tried. WHOLE: a step to the target time. HALF: half the step, to see whether modes are broken in
 # between. AGAIN: the whole step again, after half of it broke no mode. BRACKET: a step in search of
 # the beginning of the bracket of an event. CROSSING: a step that ends at the estimated event.
 TAKEN, WHOLE, HALF, AGAIN, BRACKET, CROSSING = range(6)
@@ -127,10 +130,10 @@ def remember(now: Record, h: float, margin: float) -> None:
 def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
     """Search for the step length at which the modes cease to hold, up to the last length tried.
 
-    `margin` is the margin at the end of the last step. It crosses zero at the length that is
-    searched for. The search uses inverse interpolation, and halves the bracket if the interpolation
-    leaves it. The first guess uses the stage at half the step. A joint that has just started from
-    rest has no margin yet; the beginning of its bracket is found by halving.
+    At this length, the margin crosses zero. `margin` is the one at the end of the last step. The
+    search uses inverse interpolation, and halves the bracket if the interpolation leaves it. The
+    first guess uses the stage at half the step. The margin of a joint that has just started from
+    rest is zero, so that the beginning of its bracket is found by halving.
     """
     now.events_left -= 1
     if now.events_left < 0:
@@ -149,8 +152,8 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float
 def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
     """Request the next step of the search for an event.
 
-    The bracket is halved until it begins with a margin. If 40 halvings have found no such bracket,
-    the last step tried is accepted.
+    The bracket is halved until the margin at its beginning is positive. If 40 halvings have found
+    no such bracket, the last step tried is accepted.
     """
     if now.low_margin < NO_MARGIN and now.trials < 40:
         ask(now, BRACKET, now.high / 2)
@@ -179,7 +182,7 @@ def ask_between(now: Record, length: float) -> None:
 
 @kernel
 def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Replace an end of the bracket by the step that was tried, which is half as long."""
+    """Replace an end of the bracket by the step tried. Its length is half of `now.high`."""
     now.trials += 1
     if margin > 0:
         now.low = now.length
@@ -335,10 +338,10 @@ def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, hel
 def begin_span(
     task: Record, now: Record, at: Record, d: Record, duration: float, steps: int
 ) -> None:
-    """Begin a span of a duration, s, with one command, whose torques have been computed.
+    """Begin a span with one command, whose torques have been computed. `duration` is in s.
 
-    Torques jump at the start of a span. The modes are therefore decided again, unless all stuck
-    joints hold.
+    Torques jump at the start of a span. The modes are therefore decided again, unless the friction
+    of all stuck joints still holds them.
     """
     start = at[0]
     now.moved = 0
@@ -357,7 +360,7 @@ def begin_span(
 
 @kernel
 def next_step(now: Record, at: Record) -> bool:
-    """Request the next step of the span, unless a step is being tried. Return False at its end."""
+    """Request the next step, unless a step is being tried. Return False at the end of the span."""
     if now.purpose != TAKEN:
         return True
     while at[0].time >= now.target:

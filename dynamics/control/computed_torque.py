@@ -8,13 +8,14 @@ it leads from the present pose of the robot into r. The torque is the mean over 
 because it acts for that time.
 
 With an observer, the recovery motion begins at the state predicted for the arrival of the torque.
-The estimated disturbance is subtracted. Dry friction has the signs of the recovery motion. Near
-rest, joints often move against the desired motion. Its signs would then make the torque wrong by
-twice the Coulomb torque.
+The estimated disturbance is subtracted. The signs of dry friction are those of the recovery motion.
+Near rest, joints often move against the desired motion, whose signs would then make the torque
+wrong by twice the Coulomb torque.
 
 Without an observer, the recovery motion begins at the last measured pose. Its rate is the
-difference of the last two poses. An integral replaces the disturbance. Dry friction has the signs
-of the desired motion, because the sign of a rate that is half a frame old chatters.
+difference of the last two poses divided by the time between them. An integral of the error replaces
+the disturbance. The signs of dry friction are those of the desired motion, because the measured
+rates are half a frame old, and their signs would chatter.
 """
 
 from collections.abc import Callable
@@ -31,15 +32,15 @@ from dynamics.control.observer import Estimate
 from dynamics.kinematics.platform import Chart
 
 INTEGRAL_FACTOR = 0.2  # factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer
-# Ratio to the bandwidth of the rate at which the subtracted disturbance follows the estimate. A
-# higher rate would mainly pass noise on to the robot.
+# Rate at which the subtracted disturbance follows the estimate, divided by the bandwidth. A higher
+# rate would mainly pass noise on to the robot.
 FOLLOWING_RATE = 1.0
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
 
 
 def error_map(feedback: Feedback) -> np.ndarray:
-    """Matrix (2, 2) that maps an error and its rate, while it decays, to their time derivatives."""
+    """Matrix (2, 2) from a decaying error and its rate to their time derivatives."""
     w = feedback.bandwidth
     return np.array([[0.0, 1.0], [-(w**2), -2 * feedback.damping * w]])
 
@@ -99,7 +100,7 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
     """Controller with an observer, whose estimates are appended to `expected`."""
     observer = assignment.watched(drives)
-    # fraction of the difference from the estimate that is made up in one frame
+    # fraction of the difference by which `subtracted` approaches the estimate in a frame
     fraction = 1 - np.exp(-FOLLOWING_RATE * assignment.feedback.bandwidth * assignment.period)
     subtracted = observer.disturbance
 
@@ -164,8 +165,8 @@ def _torque(
 ) -> np.ndarray:
     """Mean torque (n,) over the first frame of a recovery motion, N m or N.
 
-    Dry friction has the signs of the motion `dry`. `viscous` (n,) is viscous friction in addition
-    to that of the model.
+    The signs of dry friction are those of the motion `dry`. `viscous` (n,) is viscous friction in
+    addition to that of the model.
     """
     span = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
     return np.asarray(span.torque[0] + viscous * (span.end[0] - span.begin[0]) / assignment.period)

@@ -86,7 +86,7 @@ def design_servo(
         )
 
     period = 1 / settings.timing.frame_rate_hz
-    # a servo that is stable on most robots; its logarithms are varied, because gains are positive
+    # A servo that is stable on most robots. The logarithms are varied, because gains are positive.
     start = np.log([0.3, 0.06 * period, bandwidth])
     best = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
@@ -113,7 +113,7 @@ WANTED_MARGIN = 1.5  # gain margin of the servo at which the search for drives e
 
 @dataclass(frozen=True)
 class DesignedDrives:
-    """Gains of the drives by design, and the motion of the joints with them.
+    """Designed gains of the drives, and characteristic values of the joints with these gains.
 
     `gains` (3,) are lp, li and ld. `inertias` are the smallest and the largest eigenvalue of the
     inertia matrix at the joints, kg m^2 or kg. `frequencies` are the highest and the lowest natural
@@ -133,10 +133,10 @@ def design_drives(
 ) -> DesignedDrives:
     """Gains of the joint PID that all joints share, for which the servo of each loop is stable.
 
-    The largest inertia at home gets the natural frequency and the damping of the built-in robots.
-    Other values are tried if the gain margin of a servo is below `WANTED_MARGIN`. `dynamic` are
-    sets of dynamic parameters (p,), the first one for the design. Raises SimulationError, with the
-    largest gain margin found, if there are no such gains.
+    The first gains give the largest inertia at home the natural frequency and the damping of the
+    built-in robots. Others are tried if the gain margin of a servo is below `WANTED_MARGIN`.
+    `dynamic` are sets of dynamic parameters (p,). The inertia is that of the first set, and margins
+    are found for all. Raises SimulationError, with the largest margin, if no gains are stable.
     """
     pose = robot.home_pose
     zero = np.zeros(len(robot.layout.joint_pid_names))
@@ -221,7 +221,8 @@ def check_torque_gains(
     """Raise SimulationError if the law computed_torque is too fast. The error states the limit.
 
     The law is too fast if it is unstable near rest, or if its bandwidth exceeds half the frame
-    rate. A torque that acts for a whole frame then stops the platform, but hardly moves it back.
+    rate. Beyond that, a torque that acts for a whole frame stops the platform, but hardly moves it
+    back.
     """
     rate = settings.timing.frame_rate_hz
     radius = torque_radius(model, settings, pose, feedback)
@@ -264,7 +265,8 @@ def _torque_map(
     """Map of the law computed_torque from frame to frame.
 
     The state has coordinates and rates. Without an observer, it also has the previously measured
-    coordinates, the integral of the error, and the torques that have not yet arrived.
+    coordinates, the integral of the error, and the torques that have not yet arrived. `factor`
+    scales the gains of the law.
     """
     motion, push = stability.torque_motion(model.robot, model.parameters, pose)
     size = len(motion) // 2
@@ -316,9 +318,7 @@ def _torque_map(
 
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
-    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, at most the Nyquist
-    frequency.
-    """
+    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, or the Nyquist frequency."""
     # the error may not be monotonic: a grid finds the first crossing, which Brent's method refines
     places = np.geomspace(1e-2, np.pi * rate_hz, 60)
     beyond = [_error_ratio(response(w)) > HALF_POWER for w in places]

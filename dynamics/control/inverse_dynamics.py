@@ -108,8 +108,8 @@ class Model:
     ) -> np.ndarray:
         """Actuator torques (N, n), N m or N, for pose rates and accelerations (N, 6) (eq. 17, 23).
 
-        Dry friction has the signs of the joint velocities `dry_along` (N, n). The default is those
-        of the motion. Raises the same errors as `Robot.inverse_dynamics`.
+        The signs of dry friction are those of the joint velocities `dry_along` (N, n), by default
+        those of the motion. Raises the same errors as `Robot.inverse_dynamics`.
         """
         robot = self.robot
         parameters = self.dynamic.copy()
@@ -131,8 +131,8 @@ class Spans:
     """Joint coordinates and torques of a motion over spans of time of equal length.
 
     `begin` and `end` (N, n) are joint coordinates at the ends of a span, and `mean` (N, n) is their
-    mean over the span. `mean_integral` (N, n) is the mean, over the span, of their integral since
-    its beginning. `torque` (N, n) is the mean torque.
+    mean over the span. The integral of the joint coordinates from the beginning of the span on has
+    the mean `mean_integral` (N, n). `torque` (N, n) is the mean torque.
     """
 
     begin: np.ndarray
@@ -147,8 +147,8 @@ def spans(
 ) -> Spans:
     """Joint coordinates and torques of a motion over the spans that begin at times (N,), s.
 
-    Dry friction has the signs of the joint velocities of the motion `dry`, if given. Raises the
-    same errors as `Robot.inverse_dynamics`.
+    The signs of dry friction are those of the joint velocities of the motion `dry`, if given.
+    Raises the same errors as `Robot.inverse_dynamics`.
     """
     fraction = (NODES + 1) / 2
     weight = WEIGHTS / 2

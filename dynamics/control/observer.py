@@ -1,4 +1,4 @@
-"""Observer of the robot: an extended Kalman filter of its motion with its drives.
+"""Observer: an extended Kalman filter for the motion of a robot and its drives.
 
 Between two frames, the state follows the model under the commands that have arrived (`prediction`).
 At a lost frame, the state only becomes more uncertain. Three kinds of errors are part of the state:
@@ -31,10 +31,10 @@ TORQUE_DOUBT = 1e-3
 # Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s.
 VISCOUS_DOUBT = 5.0
 # Ratio of the model error with torque commands to the model error with joint commands. With torque
-# commands, an error of a factor that all parameters share has an effect, too.
+# commands, an error that is a common factor of all parameters has an effect, too.
 TORQUE_COMMAND_FACTOR = 2.0
-# Time constant, s, with which information from earlier innovations about the scales fades. Far from
-# the solution the gradient is different, so that old information slows down convergence.
+# Time constant, s, with which information about the scales, from earlier innovations, fades. Far
+# from the solution the gradient is different, so that old information slows down convergence.
 MEMORY_TIME = 2.0
 # Prior information about the logarithms of the scales of the walk and of the noise.
 PRIOR_INFORMATION = (0.3, 200.0)
@@ -100,8 +100,8 @@ class Observer:
         else:
             self._state[blocks.integral] = self._model.held(pose, self._drives)[1]
         torque_scale = np.abs(static_torque).mean()
-        # The random walk changes as much in a frame period as the error of the model, which
-        # changes smoothly along a motion.
+        # Within a frame period, the random walk changes as much as the error of the model. This
+        # error changes smoothly along a motion.
         walk = np.zeros(blocks.size)
         deviation = np.zeros(blocks.size)
         model_error = TORQUE_COMMAND_FACTOR if self._drives.torques else 1.0

@@ -30,9 +30,9 @@ MOST_ITERATIONS = 12
 FRICTION_TOLERANCE = 1e-6
 # Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly.
 LEAST_WIDTH = 1e-9
-SHORTEST_HALVED = 1.5e-3  # length, s, below which a step in which a joint reverses is not halved
+SHORTEST_HALVED = 1.5e-3  # length, s, below which no step is halved, even if a joint reverses in it
 # Smallest ratio of the velocity change by dry friction to the velocity's standard deviation. It is
-# above zero because it is a divisor.
+# above zero because the velocity change is a divisor.
 LEAST_REACH = 1e-3
 
 
@@ -237,8 +237,9 @@ def expected_dry_friction(
     a torque over the step, and `largest` (n,) is the largest torque. `smooth` is the velocity over
     which the torque changes its sign.
 
-    With this gain, propagated errors have the variance of the velocity after dry friction, which
-    stops a part of the distribution. The slope of the expected torque would give another variance.
+    Dry friction brings a part of the distribution of velocities to rest. The gain is chosen so that
+    propagated errors have the variance that remains. The slope of the expected torque would give
+    another variance.
     """
     own_effect = np.diag(velocity_by_torque)
     reach = np.maximum(own_effect * largest + smooth, LEAST_REACH * width)

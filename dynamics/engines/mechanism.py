@@ -52,8 +52,9 @@ class Freedom(NamedTuple):
     """Elementary joint between two bodies.
 
     `kind` is "hinge", "slide" or "ball". `point` (3,), m, and `axis` (3,) are in the axes of the
-    base. `coordinate` is that at home, rad or m. `friction` is the dry friction, N m or N, and the
-    viscous friction, N m s/rad or N s/m. `actuator` is the number of the actuator, or None.
+    base. `coordinate` is its coordinate at home, rad or m. `friction` is the dry friction, N m or
+    N, and the viscous friction, N m s/rad or N s/m. `actuator` is the number of the actuator, or
+    None.
     """
 
     kind: str

@@ -88,7 +88,7 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
         count = int(model.body_jntnum[body])
         joints = range(first, first + count)
         if any(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE) for joint in joints):
-            # The platform floats: legs connect it to the base, and not a joint of its own.
+            # The platform floats: only the legs connect it to the base.
             continue
         freedoms = tuple(
             _freedom(mujoco, model, data, joint, driven.get(joint)) for joint in joints

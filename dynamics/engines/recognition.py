@@ -309,6 +309,6 @@ def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
     mass = basis.T @ np.array(ca.evalf(mass_matrix(geometry, home, ca.SX(rigid)))) @ basis
     inertia = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
     lp = inertia * DEFAULT_FREQUENCY**2
-    # an integral that is slow enough to leave frequency and damping nearly unchanged
+    # an integral gain that is small enough to leave frequency and damping nearly unchanged
     li = lp * DEFAULT_FREQUENCY / 20
     return np.array([lp, li, 2 * DEFAULT_DAMPING * inertia * DEFAULT_FREQUENCY])

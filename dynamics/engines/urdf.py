@@ -31,6 +31,9 @@ def urdf_texts(
 ) -> tuple[str, str]:
     """URDF and YAML of a robot with dynamic parameters (p,), by default the nominal ones.
 
+    If `platform_on_a_leg` is True, the platform has a spherical joint on the first leg instead of a
+    floating joint.
+
     Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
     body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
     """

@@ -5,7 +5,8 @@ tree, whose root is the fixed base. The YAML file has these keys:
 
 - closed_loop: pairs of frames that coincide. A frame is named by a link, or by a joint, which
   stands for the frame of its child.
-- type: for each pair, "3d" if only the points coincide, or "6d" if the axes coincide, too.
+- type: for each pair, "3d" if only the points coincide, or "6d" (the default) if the axes coincide,
+  too.
 - name_mot: the actuated joints.
 - joint_name and joint_type: joints with another type than in the URDF file, and these types. A type
   is SPHERICAL, FIXED, or UJOINT_XY (hinges about x, then y, of the frame of the joint).
@@ -60,7 +61,7 @@ class _Joint:
     """Joint of the tree.
 
     `place` (4, 4) is its frame in the frame of the parent, and `axes` (2, 3) are its axes in its
-    own frame.
+    own frame. `span` is the range of its coordinate, if the file states one.
     """
 
     name: str

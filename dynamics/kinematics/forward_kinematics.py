@@ -1,8 +1,8 @@
 """Forward kinematics: Newton's method on the closure of the loops, for all rows of a batch at once.
 
 The gaps of the loops are smooth functions of the pose, even if a leg cannot reach it. Hence no step
-can leave their domain. In the pose that is found, a leg can have another assembly than at home. The
-closed-form inverse kinematics therefore checks the result.
+can leave their domain. In the pose that is found, a leg can be folded the other way than at home.
+The closed-form inverse kinematics therefore checks the result.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -129,7 +129,7 @@ def search(
 def close_loops(
     closure: Closure, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 6) that close the loops best for joint coordinates (N, n), and steps (N,) taken.
+    """Poses (N, 6) that best close the loops for joint coordinates (N, n), and step counts (N,).
 
     Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
     negligible or reduces its gaps no further.

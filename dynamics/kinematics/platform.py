@@ -1,4 +1,4 @@
-"""Coordinates of the platform, and its motion with the joints A of the legs, in CasADi.
+"""Coordinates of the platform, and the motion of the platform and of its joints A, in CasADi.
 
 For every robot, the pose has the six entries [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta)
 Rz(gamma) (eq. 1). The coordinates of a platform with fewer degrees of freedom are the entries that
@@ -173,7 +173,7 @@ class Chart:
     def basis(self) -> np.ndarray:
         """Basis (6, m) of the allowed pose changes, and of the allowed twists.
 
-        Rotations are about the axes of the base in every chart.
+        Both have the same basis, because a chart has all rotations, none, or only that about z.
         """
         return np.eye(6)[:, list(self.freedoms)]
 

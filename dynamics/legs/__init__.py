@@ -1,6 +1,6 @@
 """Kinds of legs, as functions of the motion of their platform joint A.
 
-A kind of leg has its geometry and the kinematics of its bodies, from which its dynamics follow
+A kind of leg defines its geometry and the kinematics of its bodies. Its dynamics follow from these
 (`leg.Leg`). RSS is the kind in the paper. All code that depends on the kind of a leg is in this
 folder and in robot files.
 """

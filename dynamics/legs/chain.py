@@ -1,4 +1,4 @@
-"""Kind of a leg from its chain of joints at home, as another program describes it."""
+"""Leg found from its chain of joints at home, as files of other programs describe it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,15 +20,15 @@ SAME = 1e-6
 
 
 class Chain(NamedTuple):
-    """Joints of a leg at home, in order from the base to A. Vectors are in the axes of the base, m.
+    """Joints of a leg at home, in order from the base. Vectors are in the axes of the base, m.
 
     `joints` are the kinds of the k joints: "hinge", "slide", "universal" or "ball", with * for the
-    actuated one. `points` (k, 3) are their positions. The last is A, or the middle between two
-    parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second axis of a universal
-    joint. `coordinate` is the coordinate of the actuated joint. `platform_joint` is A in the axes
-    of the platform. `across` (3,) is the vector from the first of two bars to the second, or zero.
-    `centres` (k - 1, 3) are the centres of mass of the bodies. `rods` are the lengths and radii of
-    the drawn rods of the bodies, or None.
+    actuated one. `points` (k, 3) are their positions. The last is the platform joint A, or the
+    middle between two parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second
+    axis of a universal joint. `coordinate` is that of the actuated joint. `platform_joint` is A in
+    the axes of the platform. `across` (3,) is the vector from the first of two bars to the second,
+    or zero. `centres` (k - 1, 3) are the centres of mass of the bodies. `rods` are the lengths and
+    radii of the drawn rods of the bodies, or None.
     """
 
     joints: tuple[str, ...]

@@ -2,11 +2,12 @@
 
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
 its joints, m, its lengths, m, and small rotations of its axis, rad. Rotations are relative to the
-leg itself. The rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank,
-`u` is about its zero direction, and `crank_zero` is about the crank axis.
+present axis, and thus zero unless the leg is moved. The rotations `u` and `v` are about axes
+perpendicular to that of the leg. On a crank, `u` is about its zero direction, and `crank_zero` is
+about the crank axis.
 
-A leg can be described by another leg and a vector of deviations of the geometric numbers. The
-deviations can be symbols, with respect to which the leg then has derivatives.
+A leg can be described by another leg and a vector of deviations of the geometric numbers. If the
+deviations are symbols, expressions of the leg can be differentiated with respect to them.
 """
 
 from typing import Any, TypeVar

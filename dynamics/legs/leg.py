@@ -8,9 +8,9 @@ columns). This form needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
 work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
-method `coordinate`, in `rss`, `pss` or `ups`. Vectors are in the axes of the base, also the
-position (3,) of A. Units are SI. The actuated coordinate is in rad for a rotating
-actuator, and in m for a sliding one.
+method `coordinate`, in `rss`, `pss` or `ups`. All vectors, such as the position (3,) of A, are in
+the axes of the base. Units are SI. The actuated coordinate is in rad for a rotating actuator, and
+in m for a sliding one.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Placement(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Body in the chain from the base to A, for other engines and for drawing.
+    """Body in the chain from the base to A, for other physics engines and for drawing.
 
     `joint` connects it with the body before it, or with the base. It is "hinge" about `axis`,
     "slide" along `axis`, "universal" about `axis` and then about x of this body, or "ball". `axis`
@@ -155,7 +155,7 @@ class Leg(BaseModel, ABC):
 
     @property
     def side(self) -> float | ca.SX:
-        """Sign of the square root on the branch, +1 or -1. It is +1 if no branch is selected."""
+        """Sign of the square root in the inverse kinematics. It is +1 if no branch is selected."""
         return 1.0 if self.branch is None else self.branch
 
     def assembled(self, joint: np.ndarray, number: int) -> Self:
@@ -208,7 +208,7 @@ class Leg(BaseModel, ABC):
 
     @abstractmethod
     def shifted(self, by: float) -> Self:
-        """Leg whose coordinate at each position of A is smaller by a value, rad or m."""
+        """Leg whose coordinate at each position of A is smaller by `by`, rad or m."""
 
     @abstractmethod
     def coordinate(self, position: ca.SX) -> ca.SX:
@@ -220,7 +220,7 @@ class Leg(BaseModel, ABC):
 
     @abstractmethod
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
-        """Gap of the loop, m^2, for any coordinate.
+        """Gap of the leg's loop, m^2: half the error of a squared length, for any coordinate.
 
         It is a smooth function of the position, even out of reach.
         """
@@ -233,7 +233,7 @@ class Leg(BaseModel, ABC):
     def leverage(self, position: ca.SX) -> ca.SX:
         """Leverage of the actuator on its leg, in 0..1.
 
-        It is zero if the leg is singular (J_a1).
+        It is zero if the leg is singular, because its entry of J_a1 (eq. 7) is then zero.
         """
 
     @abstractmethod

@@ -1,8 +1,8 @@
 """Acceleration from the equation of motion, and derivatives of the slope of the state (CasADi).
 
-The slope of a state is its time derivative. Both use a factor of the mass matrix (see `factored`).
-Derivatives are columns, one for each variable. A variable is a parameter or an entry of the start
-state, for example. All columns solve the same equations.
+The slope of a state is its time derivative. All functions use a factor of the mass matrix (see
+`factored`). Derivatives are columns, one for each variable. A variable is a parameter or an entry
+of the start state, for example. All columns solve the same linear equations.
 """
 
 from collections.abc import Sequence
@@ -61,7 +61,7 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     The torques that hold stuck joints are not included. The platform has m coordinates. All columns
     share the inputs of one stage; stages are side by side in memory. These inputs are the outputs
     of `motion_derivatives`; J_theta (n, m), and J_theta with zeros for stuck joints; the factor of
-    M (m, m); minus the derivatives (n,) of joint torques with respect to joint velocities; and
+    M (m, m); the negated derivatives (n,) of joint torques with respect to joint velocities; and
     their derivatives (n,) with respect to the error, its integral, and the rate of the command.
 
     The inputs of each column are the derivatives of pose and rate (m,), and of joint integral,
