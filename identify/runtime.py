@@ -29,14 +29,17 @@ T = TypeVar("T")
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
-def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """Return what a function returns for each item, computed on all cores.
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Yield what a function returns for each item, in their order, computed in `threads()` threads.
 
     Threads are enough for runs of the compiled loop, which does not hold Python's lock. The
     function must not call CasADi, which is not safe in threads.
     """
-    with ThreadPoolExecutor(cores()) as pool:
-        return list(pool.map(function, items))
+    if threads() == 1:
+        yield from map(function, items)
+        return
+    with ThreadPoolExecutor(threads()) as pool:
+        yield from pool.map(function, items)
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:
@@ -55,6 +58,15 @@ def cores() -> int:
     Systems other than Linux do not report this. There it is the number of cores of the machine.
     """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads() -> int:
+    """Return the number of threads for computations: one per core, or fewer by OMP_NUM_THREADS.
+
+    A process of a study has this variable, because there are as many processes as cores.
+    """
+    most = os.environ.get("OMP_NUM_THREADS", "")
+    return min(max(int(most), 1), cores()) if most.isdecimal() else cores()
 
 
 STOPPED = 130  # exit status of a command after Ctrl-C

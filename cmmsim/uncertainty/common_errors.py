@@ -145,7 +145,7 @@ class MeasuringGeometry:
             ],
             axis=2,
         )
-        changes = np.stack([pose_jacobian(pose) for pose in poses]) @ small[:, :, kept]
+        changes = pose_jacobian(poses) @ small[:, :, kept]
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
 
     def _by_rig(self, view: _View) -> Array:
@@ -154,10 +154,7 @@ class MeasuringGeometry:
         The effect of the rig on teaching is included.
         """
         frames, places = self.taught_by_rig
-        return (
-            view.registered(view.points_by_rig() - view.points_by_places(places))
-            + view.levers @ frames
-        )
+        return view.by_pixels(view.by_rig) - view.by_places(places) + view.levers @ frames
 
     @cached_property
     def taught_by_rig(self) -> tuple[Array, Array]:
@@ -189,9 +186,9 @@ class MeasuringGeometry:
         pixels = self.print.shifts(
             self.rig, camera_from_platform, self.taught.platform_places, self.platform
         )
-        points = view.points_by_pixels(pixels[:, :, view.seen]) - view.points_by_places(places)
+        small = view.by_pixels(pixels[:, :, view.seen]) - view.by_places(places)
         std = self.print.std
-        return (view.registered(points) + view.levers @ frames) / np.where(std > 0.0, std, 1.0)
+        return (small + view.levers @ frames) / np.where(std > 0.0, std, 1.0)
 
     def _taught_by_print(self, print_errors: PrintErrors) -> tuple[Array, Array]:
         """Return the errors of teaching per standard deviation of the print's errors.
@@ -307,57 +304,60 @@ class _View:
 
     def by_delay(self, poses: Array, rates: Array) -> Array:
         """Return small errors (N, 6, 1) of base_from_platform per s of the right camera's delay."""
-        spin = np.einsum(
-            "nij,nj->ni", np.stack([euler_rates_matrix(pose) for pose in poses]), rates[:, 3:]
-        )
+        spin = (euler_rates_matrix(poses) @ rates[:, 3:, None])[..., 0]
         turn = self.camera_from_base[:3, :3]
         velocities = (rates[:, :3] @ turn.T)[:, None] + np.cross(
             (spin @ turn.T)[:, None], self.arms
         )
         pixels = np.zeros((*self.slopes.shape[:-1], 1))
         pixels[1, ..., 0] = np.einsum("nmij,nmj->nmi", self.slopes[1], velocities)
-        return self.registered(self.points_by_pixels(pixels))
+        return self.by_pixels(pixels)
 
-    def points_by_rig(self) -> Array:
-        """Return the changes (N, n, 3, 24) of triangulated points per unit of the rig's errors."""
-        return self.points_by_pixels(self.by_rig)
+    def by_pixels(self, pixels: Array) -> Array:
+        """Return small errors (N, 6, p) of base_from_platform that changes of pixels cause.
 
-    def points_by_places(self, places: Array) -> Array:
-        """Return the changes (N, n, 3, p) of expected points per unit of p errors.
+        The errors are in base axes. ``pixels`` (2, N, n, 2, p) are the changes of the stickers'
+        pixels. The information of a triangulated point cancels: it weights the point, and its
+        inverse is a factor of the point's change.
+        """
+        count, seen = self.arms.shape[:2]
+        of_each = pixels.reshape(2, count, 2 * seen, -1)
+        return self._registered((self._by_movement.swapaxes(2, 3) @ of_each).sum(axis=0))
+
+    def by_places(self, places: Array) -> Array:
+        """Return the small movements (N, 6, p) of base_from_platform that fit changes of places.
 
         ``places`` (p, n, 3) are the changes of the taught places.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
-        return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])
+        count, seen = self.arms.shape[:2]
+        by_place = (self.slopes @ turns[:, None]).reshape(2, count, seen, 2, 3)
+        by_movement = self._by_movement.reshape(2, count, seen, 2, 6)
+        pulls = (by_movement.swapaxes(3, 4) @ by_place).sum(axis=0)
+        rows = pulls.transpose(0, 2, 1, 3).reshape(6 * count, 3 * seen)
+        columns = places[:, self.seen].reshape(-1, 3 * seen).T
+        return self._registered((rows @ columns).reshape(count, 6, -1))
 
-    def registered(self, changes: Array) -> Array:
-        """Return small errors (N, 6, p) of base_from_platform that changes of points cause.
-
-        The errors are in base axes. ``changes`` (N, n, 3, p) of the stickers' points are in camera
-        axes.
-        """
-        rows = np.concatenate(
-            [np.broadcast_to(np.eye(3), (*self.arms.shape[:2], 3, 3)), -skew(self.arms)], axis=3
-        )
-        weighted = np.einsum("nmij,nmik->nmjk", rows, self._information)
-        normal = np.einsum("nmij,nmjk->nik", weighted, rows)
-        movement = np.linalg.solve(normal, np.einsum("nmij,nmjp->nip", weighted, changes))
+    def _registered(self, pulls: Array) -> Array:
+        """Return the movements (N, 6, p), in base axes, of a registration with right sides."""
+        movement = np.linalg.solve(self._normal, pulls)
         turn = self.camera_from_base[:3, :3].T
         return np.concatenate([turn @ movement[:, :3], turn @ movement[:, 3:]], axis=1)
 
-    @property
-    def _information(self) -> Array:
-        """Information matrix (N, n, 3, 3) of each point for pixel noise of 1 px²."""
-        return np.einsum("cnmki,cnmkj->nmij", self.slopes, self.slopes)
+    @cached_property
+    def _by_movement(self) -> Array:
+        """Derivatives (2, N, 2 n, 6) of the pixels with respect to movements of the platform.
 
-    def points_by_pixels(self, pixels: Array) -> Array:
-        """Return changes (N, n, 3, p) of triangulated points.
-
-        ``pixels`` (2, N, n, 2, p) are the changes of their pixels.
+        The movements are in camera axes, and turn the platform about its origin.
         """
-        return np.linalg.solve(
-            self._information, np.einsum("cnmki,cnmkp->nmip", self.slopes, pixels)
-        )
+        eyes = np.broadcast_to(np.eye(3), (*self.arms.shape[:2], 3, 3))
+        rows = np.concatenate([eyes, -skew(self.arms)], axis=3)
+        return (self.slopes @ rows).reshape(2, len(self.arms), -1, 6)
+
+    @cached_property
+    def _normal(self) -> Array:
+        """Normal matrix (N, 6, 6) of a registration for pixel noise of 1 px²."""
+        return (self._by_movement.swapaxes(2, 3) @ self._by_movement).sum(axis=0)
 
 
 def _view(geometry: MeasuringGeometry, frames: Array) -> _View:

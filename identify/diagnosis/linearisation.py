@@ -230,7 +230,7 @@ def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) ->
         except DynamicsError:
             return None
 
-    return in_threads(of, problems)
+    return [*in_threads(of, problems)]
 
 
 def allowed(problem: OutputErrorProblem, parameters: Array) -> Array:

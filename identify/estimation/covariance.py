@@ -29,7 +29,6 @@ all parameters are about one percent too small.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,7 +48,7 @@ from identify.estimation.explanation import Misfit, coloured_score_covariance, m
 from identify.estimation.output_error import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance
-from identify.runtime import cores
+from identify.runtime import in_threads
 
 NOISE, MODEL, LOAD, GUESS, ANCHOR = "noise", "model", "load", "guess", "anchor"
 """Sources of uncertainty beside the common errors: noise of the poses, error of the model, error of
@@ -323,11 +322,9 @@ def _repeated_scores(
     results = []
     # Each draw has its own generator, so results do not depend on the order of threads.
     each = rng.spawn(DRAWS)
-    # Threads are enough, because the compiled loop runs LANES draws at once without Python's lock.
-    with ThreadPoolExecutor(cores()) as pool:
-        for some in pool.map(repeat, [each[k : k + LANES] for k in range(0, DRAWS, LANES)]):
-            results += [result for result in some if result]
-            advance(len(some))
+    for some in in_threads(repeat, [each[k : k + LANES] for k in range(0, DRAWS, LANES)]):
+        results += [result for result in some if result]
+        advance(len(some))
     rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
     drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
     squares = [square for _, square in results]

@@ -208,12 +208,18 @@ def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
     It is None if the model is unstable with both.
     """
     first, second = _candidates(problem, warm)
-    # The search first linearises at these parameters, and can reuse the sensitivities. It cannot
-    # if the problem is whitened for common errors, or if `physical` changes the coordinates.
-    ahead = not problem.physical and not any(run.common.all_names for run in problem.runs)
+    ahead = _reuses_sensitivities(problem)
     costs = [(problem.cost(first, ahead=ahead), first), (problem.cost(second), second)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
+
+
+def _reuses_sensitivities(problem: OutputErrorProblem) -> bool:
+    """Return whether a search can reuse the sensitivities of a run with its first parameters.
+
+    It cannot if `physical` changes the coordinates, or if errors of bodies change the run.
+    """
+    return not problem.physical and not any(run.common.body_std for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
@@ -236,9 +242,11 @@ def _with_common_errors(
     """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])
-    inside = [
-        start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))
-    ]
+    first, *others = map(problem.bounds.nearest, starts)
+    # The search most likely begins at the first start.
+    cost = problem.cost(first, ahead=_reuses_sensitivities(problem))
+    inside = [first] if np.isfinite(cost) else []
+    inside += [start for start in others if np.isfinite(problem.cost(start))]
     whitened = problem.with_common_errors(inside[0])
     best = min(inside, key=whitened.cost)
     return (whitened if best is inside[0] else problem.with_common_errors(best)), best

@@ -112,7 +112,7 @@ def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
     if run.settings.drives.torques:
         return found
     made, changes = differentiated(run, parameters, run.bodies[moving].transpose(1, 2, 0))
-    run.known_runs[True] = parameters.tobytes(), made
+    run.known_runs.add(parameters, made)
     places = first + np.flatnonzero(moving)
     return found | {int(place): changes[:, :, k] for k, place in enumerate(places)}
 

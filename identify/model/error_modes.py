@@ -4,12 +4,14 @@ Errors that act as changes of the commands need no run of their own: one run is 
 all of these changes.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynamics.closed_loop import ClosedLoopRun, most_directions
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, most_directions
+from dynamics.parameters import LANES
 from identify.arrays import Array
 from identify.record.stored_common_errors import FRICTION, kind_of
 from identify.runtime import in_threads
@@ -51,7 +53,10 @@ def error_modes(
         for k in moving
         for sign in (1.0, -1.0)
     ]
-    found = in_threads(lambda end: shown(run.having(end).simulate(parameters)), ends)
+    # Errors of poses come first, because their runs differ only in what the servo measures.
+    measured = 2 * sum(k < len(run.common.names) for k in moving)
+    found = _measuring(run, parameters, shown, ends[:measured])
+    found += in_threads(lambda end: shown(run.having(end).simulate(parameters)), ends[measured:])
     for place, k in enumerate(moving):
         more, less = found[2 * place : 2 * place + 2]
         high, low = ends[2 * place : 2 * place + 2]
@@ -61,6 +66,32 @@ def error_modes(
         return modes
     by_geometry = geometry.modes(lambda robot: run.simulate(parameters, robot=robot).pose)
     return np.concatenate([modes, by_geometry], axis=2)
+
+
+def _measuring(
+    run: "LoopModel",
+    parameters: Array,
+    shown: Callable[[ClosedLoopRun], Array],
+    ends: Sequence[Array],
+) -> list[Array]:
+    """Return the poses (N, 6) of a run whose servo measures with each of some common errors (k,).
+
+    The errors differ from those of the model only in errors of poses, so that several runs are
+    simulated together. Raises LoopFailure if the model is unstable.
+    """
+    if not ends:
+        return []
+    count = len(run.common.names)
+    changes = (np.array(ends) - run.errors_had)[:, :count]
+    noises = np.tensordot(changes, run.common.modes, (1, 2))
+    groups = np.split(noises, range(LANES, len(noises), LANES))
+    made = in_threads(lambda group: run.simulate_repeats(parameters, group), groups)
+    found = []
+    for one in chain.from_iterable(made):
+        if isinstance(one, LoopFailure):
+            raise one
+        found.append(shown(one))
+    return found
 
 
 def differentiated(

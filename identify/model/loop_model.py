@@ -94,7 +94,10 @@ class LoopModel(Residuals):
     def having(self, drawn: Array) -> "LoopModel":
         """Return a copy with common errors (k,), in standard deviations, not below their limits."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
-        return replace(self, drawn=contained, marginal=None)
+        other = replace(self, drawn=contained, marginal=None)
+        if not other.errors_had[other.contained].size:
+            other.known_runs.update(self.known_runs)  # no error moves the model
+        return other
 
     def with_common_errors(self, parameters: Array) -> "LoopModel":
         """Return a copy of the model with residuals that are also whitened for common errors.
@@ -104,7 +107,8 @@ class LoopModel(Residuals):
         """
         if not self.common.all_names:
             return self
-        run = replace(self, bodies=body_errors(self, parameters))
+        bodies = body_errors(self, parameters)
+        run = self if bodies is None else replace(self, bodies=bodies)
         seen = run.modes(parameters)[self.ok]
         modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
         had = modes[:, self.contained] @ self.errors_had[self.contained]

@@ -13,6 +13,7 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun
 from dynamics.parameters import RigidGroups
 from identify.arrays import Array
+from identify.model.known_runs import KnownRuns
 from identify.record.stored_common_errors import Marginal
 
 
@@ -54,15 +55,12 @@ class Residuals:
 
     def _latest_run(self, parameters: Array, sensitivities: bool) -> ClosedLoopRun:
         """Return the model's run, cached for repeated parameters. Raises LoopFailure."""
-        given = parameters.tobytes()  # a copy, because the caller can change the array
-        if self.known_runs.get(sensitivities, (b"", None))[0] != given:
-            self.known_runs[sensitivities] = given, self.simulate(parameters, sensitivities)
-        return self.known_runs[sensitivities][1]
+        return self.known_runs.latest(parameters, sensitivities, self.simulate)
 
     @cached_property
-    def known_runs(self) -> dict[bool, tuple[bytes, ClosedLoopRun]]:
-        """Latest run without and latest run with sensitivities, and their parameters."""
-        return {}
+    def known_runs(self) -> KnownRuns:
+        """Latest runs of the model."""
+        return KnownRuns()
 
     def white_residuals(self, parameters: Array, rng: np.random.Generator) -> Array:
         """Return `residuals` (n, 6) of a model driven by commands. If it is right, they are white.

@@ -216,7 +216,7 @@ class TimedModel(LoopModel):
         """Return, by place of the error, the changes (N, 6) of the poses by errors of a start."""
         runs = self._simulated(parameters, sensitivities=True, by_start=True)
         # The search linearises at the same parameters next.
-        self.known_runs[True] = parameters.tobytes(), _joined(runs)
+        self.known_runs.add(parameters, _joined(runs))
         stds = self.common.loop_std
         places = {name: len(self.common.names) + k for k, name in enumerate(stds)}
         found = {}

@@ -144,7 +144,7 @@ class GeometryErrors:
         The changes are zero along unnoticed directions. poses_of: function that returns the poses
         (N, 6) of a run of a robot near the known robot.
         """
-        found = in_threads(poses_of, [robot for pair in self._moved for robot in pair])
+        found = [*in_threads(poses_of, [robot for pair in self._moved for robot in pair])]
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
         for place, (more, less) in enumerate(zip(found[::2], found[1::2], strict=True)):
             modes[:, :, place] = (more - less) / 2.0

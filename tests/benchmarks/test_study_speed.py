@@ -176,7 +176,7 @@ def test_rate_of_sensor_rows(two_cores, run, record_property):
 @pytest.mark.parametrize(
     ("study", "rows", "minutes"),
     [
-        (identifications(IDENTIFICATIONS), 1000, 20.0),
+        (identifications(IDENTIFICATIONS), 1000, 10.0),
         (load_study("estimators"), 200, 15.0),
     ],
     ids=["identifications", "leaderboard"],

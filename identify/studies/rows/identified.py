@@ -16,6 +16,7 @@ from pydantic import Field
 
 from dynamics.closed_loop import differentiate_servo
 from identify.arrays import Array
+from identify.estimation.base_parameters import structure
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
 from identify.experiment.plant import Plant
@@ -269,6 +270,7 @@ def _unseen_figures(
 
     truth: true parameters (p,).
     """
+    groups = structure(side.robot).rigid_groups
     models = []
     for prediction, one in zip(predicted, unseen, strict=True):
         if prediction.slopes is not None:  # the prediction is already a run of the identified model
@@ -277,10 +279,15 @@ def _unseen_figures(
         reference = recorded_reference(one.record)
         latencies = logged_latencies(one.record, side.timing)
         run = differentiate_servo(
-            side.robot, result.estimate, reference, side.settings, latencies=latencies
+            side.robot,
+            result.estimate,
+            reference,
+            side.settings,
+            latencies=latencies,
+            groups=groups,
         )
         assert run.pose_sensitivity is not None
-        models.append((run.pose, run.pose_sensitivity))
+        models.append((run.pose, groups.of_all(run.pose_sensitivity)))
     true = [model_on_record(side, truth, one.record) for one in unseen]
     errors = np.concatenate(
         [poses - true_poses(one.truth) for (poses, _), one in zip(models, unseen, strict=True)]
