@@ -14,7 +14,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.asking import Asked
 from identify.diagnosis.cause import Cause
-from identify.diagnosis.fit import Point, fit
+from identify.diagnosis.fit import Point, fit, with_last_columns
 from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import NEAR, Ranked, Rows, indistinguishable, misfit_of
 from identify.estimation.output_error import OutputErrorProblem
@@ -252,7 +252,10 @@ def fitted(
     sizes = point.sizes[kept]
     free = np.zeros(len(left), dtype=bool)
     known = with_fitted(causes, places, point.causes)
-    return fitted(problem, point.parameters, known, left, sizes, sizes, free, None)
+    last = replace(point.linear, by_causes=point.columns[:, kept])
+    there = [known[place] for place in left]
+    linear = with_last_columns(problem, point.parameters, there, sizes, last)
+    return fitted(problem, point.parameters, known, left, sizes, sizes, free, linear)
 
 
 def shown_sizes(point: Point) -> NDArray[np.bool_]:

@@ -175,7 +175,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
         *geometry_causes(problem),
         *loop_causes(problem, parameters, runs),
         *body_causes(problem, parameters, runs),
-        *measurement_causes(problem, parameters),
+        *measurement_causes(problem, runs),
     )
     return (*causes, *(one.companion for one in causes if one.companion is not None))
 

@@ -189,16 +189,20 @@ def _differences(
         (max(-own, causes[k].least - sizes[k]), own) for k, own in zip(places, by, strict=True)
     ]
     moves = np.eye(len(causes))[list(places)]
+    # a cause at its least size is not moved down, and the residuals there are known
     ends = [
         with_causes(problem, causes, sizes + by * move)
         for span, move in zip(spans, moves, strict=True)
         for by in span
+        if by
     ]
-    found = each_residuals(ends, parameters)
-    return [
-        _slope(residual, less, more, *span)
-        for less, more, span in zip(found[::2], found[1::2], spans, strict=True)
-    ]
+    found = iter(each_residuals(ends, parameters))
+    slopes = []
+    for low, high in spans:
+        less = next(found) if low else residual
+        more = next(found) if high else residual
+        slopes.append(_slope(residual, less, more, low, high))
+    return slopes
 
 
 def _slope(

@@ -12,12 +12,14 @@ References
 Cook and Weisberg, Residuals and influence in regression, Chapman and Hall, 1982.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from dynamics.closed_loop import ClosedLoopRun
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, OnPoses, in_each_run
 from identify.estimation.output_error import OutputErrorProblem
@@ -38,9 +40,11 @@ KINDS = {"rig": "errors of the cameras", "teaching": "errors of teaching"}
 """Names of the groups of errors that all frames share, by their kind."""
 
 
-def measurement_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the causes in the measured poses of a problem at its optimum (p,)."""
-    return (*shared_errors(problem), *gross_errors(problem, parameters))
+def measurement_causes(
+    problem: OutputErrorProblem, runs: Sequence[ClosedLoopRun]
+) -> tuple[Cause, ...]:
+    """Return the causes in the measured poses of a problem. runs: those of the model."""
+    return (*shared_errors(problem), *gross_errors(problem, runs))
 
 
 def shared_errors(problem: OutputErrorProblem) -> tuple[Cause, ...]:
@@ -74,12 +78,12 @@ def _shared(name: str, place: int, std: float) -> Cause:
     )
 
 
-def gross_errors(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return the components of the poses of suspicious frames."""
+def gross_errors(problem: OutputErrorProblem, runs: Sequence[ClosedLoopRun]) -> tuple[Cause, ...]:
+    """Return the components of the poses of suspicious frames. runs: those of the model."""
     places = [
         (number, int(frame))
-        for number, run in enumerate(problem.runs)
-        for frame in suspicious_frames(run.residuals(parameters), run.ok)
+        for number, (run, found) in enumerate(zip(problem.runs, runs, strict=True))
+        for frame in suspicious_frames(run.without_common(run.run_residuals(found)), run.ok)
     ][:MOST_FRAMES]
     return tuple(
         _gross(number, frame, component) for number, frame in places for component in range(6)

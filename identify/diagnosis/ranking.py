@@ -148,7 +148,8 @@ def rank(
     """
     left = beside.part(residual)
     usable = np.isfinite(columns).all(axis=0)
-    projected = beside.part(np.where(usable, columns, 0.0))
+    # single columns are taken from it many times
+    projected = np.asfortranarray(beside.part(np.where(usable, columns, 0.0)))
     lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
     every = candidates(causes)
     price = np.log(len(rows.of_poses(residual)))
@@ -229,6 +230,8 @@ def _possible_score(
     inside = list(places)
     while True:
         found = score(projected[:, inside], left, lengths[inside])
+        if len(places) == len(inside) == 1 and found.sizes[0] >= causes[places[0]].least:
+            return found
         least = np.array([causes[place].least for place in inside])
         beyond = np.maximum(least - found.sizes, 0.0) * lengths[inside]
         if not inside or not beyond.any():

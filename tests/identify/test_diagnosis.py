@@ -15,7 +15,7 @@ from identify.diagnosis.candidate_fits import shown_sizes
 from identify.diagnosis.cause import Cause, InList, in_each_run
 from identify.diagnosis.diagnose import diagnosis_from, own_cause
 from identify.diagnosis.diagnosis import Size, remedies_of
-from identify.diagnosis.fit import Point
+from identify.diagnosis.fit import SETTLED, Point
 from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.score import OrthogonalComplement, score
 from identify.diagnosis.selection import CHANCE
@@ -239,6 +239,19 @@ def test_noise_that_is_stated_wrongly_is_named_with_its_ratio(times):
     assert only.name == "noise of the sensor"
     assert all(abs(one.value - times) < 3 * one.std for one in only.sizes)
     assert f"state {only.sizes[0].value:.3g} times" in only.remedies[0]
+
+
+@pytest.mark.slow
+def test_sizes_stand_where_columns_are_not_computed_anew(monkeypatch):
+    """Against fits whose columns are those of every new point."""
+    record = record_of(3, plant=with_zeros(5e-4, 0, 0, 0, 0, 0), monkeypatch=monkeypatch)
+    found = []
+    for settled in (SETTLED, 0.0):
+        monkeypatch.setattr("identify.diagnosis.fit.SETTLED", settled)
+        found.append(diagnosed(record).findings[0])
+    one, other = found
+    assert one.name == other.name
+    assert one.sizes[0].value == pytest.approx(other.sizes[0].value, abs=0.02 * other.sizes[0].std)
 
 
 @pytest.mark.slow
