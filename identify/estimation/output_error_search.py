@@ -17,6 +17,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.common_error_estimates import errors_in_models
+from identify.estimation.growing_window import over_growing_window
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.search_in_coordinates import minimise_in_coordinates
@@ -113,7 +114,7 @@ def search_with_common_errors(
     The model is linearised in the common errors about their most likely values. The search is
     repeated until these values converge.
     """
-    problem, start = _with_common_errors(problem, starts)
+    first, begin = problem, start = _with_common_errors(problem, starts)
     in_motion = any(run.begins_in_motion for run in problem.runs)
     bent = any(_bends_far(run) for run in problem.runs)
     if bent:
@@ -121,8 +122,7 @@ def search_with_common_errors(
     solution = search(problem, start, advance)
     if bent and Search(problem, solution).missed:
         # Far from the right errors, the parameters can have gone to a wrong minimum.
-        warm = problem.bounds.nearest(linear_warm_start(problem))
-        other, start = with_likely_errors(problem, warm)
+        other, start = over_growing_window(first, begin) if in_motion else _warm_again(problem)
         again = search(other, start, lambda n=1: None)
         if again.costs[-1] < solution.costs[-1]:
             problem = other
@@ -135,12 +135,20 @@ def search_with_common_errors(
         if turn >= FULL_STEPS:
             before = [run.errors_had for run in problem.runs]
             errors = [(one + other) / 2.0 for one, other in zip(errors, before, strict=True)]
-        problem = problem.having(errors).with_common_errors(solution.parameters)
+        moved = problem.having(errors).with_common_errors(solution.parameters)
         # The progress bar expects only one search.
-        again = search(problem, solution.parameters, lambda n=1: None)
+        again = search(moved, solution.parameters, lambda n=1: None)
+        if Search(moved, again).missed and not Search(problem, solution).missed:
+            break  # the linear estimate of errors that the record hardly shows went too far
+        problem = moved
         counted = solution.evaluations + again.evaluations
         solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
     return Search(problem, solution)
+
+
+def _warm_again(problem: OutputErrorProblem) -> tuple[OutputErrorProblem, Array]:
+    """Return the problem with its most likely common errors, from a new linear warm start."""
+    return with_likely_errors(problem, problem.bounds.nearest(linear_warm_start(problem)))
 
 
 def _bends_far(run: LoopModel) -> bool:

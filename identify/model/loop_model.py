@@ -189,6 +189,10 @@ class LoopModel(Residuals):
         """Return a change (k,) of the common errors in prior standard deviations."""
         return change
 
+    def beginning(self, window_s: float) -> "LoopModel":
+        """Return a copy with the residuals of a first window, s, of each start in motion."""
+        return self
+
     def on_grid(self) -> "LoopModel":
         """Return this run, approximately, with frames one period apart, for linear fits."""
         return self

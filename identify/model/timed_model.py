@@ -67,6 +67,14 @@ class TimedModel(LoopModel):
         """Return a copy of the model, which the logged commands always drive."""
         return replace(self, driven=True, marginal=None)
 
+    def beginning(self, window_s: float) -> "TimedModel":
+        """Return a copy with only the good frames of a first window, s, of each stretch."""
+        near = np.zeros(len(self.ok), dtype=bool)
+        for stretch in self.stretches:
+            times = self.times[stretch.rows]
+            near[stretch.rows] = times - times[0] <= window_s
+        return replace(self, ok=self.ok & near, marginal=None)
+
     @cached_property
     def acting_now(self) -> Array:
         """Times (M,), s, at which the commands act with the errors that the model contains."""
