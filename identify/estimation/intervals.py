@@ -8,15 +8,20 @@ estimate, the unheld estimate is
 
 with the information W and the part g of the cost's gradient that the active bounds balance. At a
 flat body, all of the gradient with respect to its ten numbers is balanced. The interval of the
-unheld estimate, truncated at the bounds, has the stated coverage. But it can be empty, or not
-contain the estimate. The returned interval is the union of the intervals of both estimates and the
-range between them, truncated at the smallest allowed value. It is never empty, contains the
-estimate, and has at least the stated coverage. The truncated interval of the bounded estimate alone
-does not have this coverage, because a sum of many quantities near their bounds is estimated too
-high by more than its standard deviation.
+unheld estimate, truncated at the bounds, has the stated coverage whatever the truth. But it can be
+empty, or not contain the estimate. Averaged over all truths within the bounds, it is off: a bound
+that a quantity cannot cross also moves all quantities that are correlated with it. The stated
+distribution is therefore the distribution of the unheld estimate, truncated at all bounds, see
+`truncated_normal`. Its interval alone would not do either, because it places a sum of many
+quantities whose true values are at their bounds too high, by more than its standard deviation.
+
+The returned interval is the union of both intervals and the range between them and the estimate,
+truncated at the smallest allowed value. It is never empty, contains the estimate, and has at least
+the stated coverage. Without bounds nearby, both intervals are the same.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +29,7 @@ from scipy.special import log_ndtr, ndtri
 
 from identify.arrays import Array
 from identify.estimation.bounds import ParameterBounds
+from identify.estimation.truncated_normal import TruncatedNormal, truncated
 
 HALF_WIDTH = float(ndtri(0.975))  # half the width of a 95 % interval, in standard deviations
 
@@ -55,20 +61,30 @@ class BoundedEstimate:
 
         They are truncated at the smallest allowed values.
         """
-        half = HALF_WIDTH * combined_std(rows, self.covariance)
-        # The interval covers the intervals of both estimates, see the module docstring.
-        centres = np.stack([rows @ self.estimate, rows @ self.unheld])
-        low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
-        return np.stack([low, centres.max(axis=0) + half], axis=1)
+        unheld = rows @ self.unheld
+        mean, std = self.within.marginals(rows)
+        # The interval of the estimate has no width, see the module docstring.
+        middles = np.stack([unheld, mean, rows @ self.estimate])
+        stds = np.stack([combined_std(rows, self.covariance), std, np.zeros(len(rows))])
+        low = (middles - HALF_WIDTH * stds).min(axis=0)
+        high = (middles + HALF_WIDTH * stds).max(axis=0)
+        return np.stack([np.maximum(low, self.bounds.least(rows)), high], axis=1)
+
+    @cached_property
+    def within(self) -> TruncatedNormal:
+        """Stated distribution: that of the unheld estimate, truncated at all bounds."""
+        lower = self.bounds.linear_lower
+        bounded = np.isfinite(lower)
+        directions = np.asarray(np.linalg.inv(self.bounds.matrix)[bounded], dtype=float)
+        return truncated(self.unheld, self.covariance, directions, lower[bounded])
 
     def probabilities(self, rows: Array, values: Array) -> Array:
         """Return the probabilities (n,) that the quantities rows (n, p) @ parameters are smaller.
 
         values (n,): values with which the quantities are compared. The stated distribution of a
-        quantity is normal about its unheld estimate, truncated at its smallest allowed value.
+        quantity is normal as in `within`, truncated at its smallest allowed value.
         """
-        std = combined_std(rows, self.covariance)
-        centre = rows @ self.unheld
+        centre, std = self.within.marginals(rows)
         # Logarithms of upper tails keep their digits far below a bound.
         tail = log_ndtr((centre - values) / std)
         whole = log_ndtr((centre - self.bounds.least(rows)) / std)
