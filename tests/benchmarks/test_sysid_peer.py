@@ -137,7 +137,7 @@ def best_of_peer(rows, excitation):
     return min((rows[excitation, plant, PEER] for plant in PLANTS), key=lambda row: row.error)
 
 
-def test_it_takes_at_most_a_fifth_of_the_peers_time(rows, record_property):
+def test_it_takes_at_most_an_eighth_of_the_peers_time(rows, record_property):
     """Medians with the peer's sines; of the peer's two plants the one that it is faster on."""
     found, load = rows
     for key, row in found.items():
@@ -145,8 +145,8 @@ def test_it_takes_at_most_a_fifth_of_the_peers_time(rows, record_property):
     theirs = min(found[SINES, plant, PEER].time for plant in PLANTS)
     ours = found[SINES, EXACT, OURS].time
     judge(
-        ours <= theirs / 5,
-        f"{ours:.2f} s, mujoco.sysid {theirs:.2f} s: {ours / theirs:.3f}, goal 0.2",
+        ours <= theirs / 8,
+        f"{ours:.2f} s, mujoco.sysid {theirs:.2f} s: {ours / theirs:.3f}, goal 0.125",
         load,
     )
 
