@@ -3,10 +3,7 @@
 Seen from above, joints keep their directions from the middle of the robot. Cranks and sliders keep
 their axes. All joint coordinates are zero at home. There, a crank with a vertical axis is at right
 angles to its link, as seen from above, because it then moves the platform best. All other cranks
-keep their direction.
-
-Bodies keep their material. A platform is scaled as a plate of the same thickness, and the bodies of
-the legs as bars of the same section.
+keep their direction. `scaled_bodies` says what becomes of the bodies.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +18,12 @@ from dynamics.closed_loop.loop_settings import LoopSettings
 from dynamics.control.gains import DesignedDrives, design_drives
 from dynamics.errors import RobotFileError
 from dynamics.geometry import RobotGeometry
-from dynamics.inertia import physical_inertias
 from dynamics.kinematics.platform import Chart
 from dynamics.legs.leg import Leg
 from dynamics.parameter_set import ParameterSet, Unstated
-from dynamics.parameters import ParameterLayout
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
-from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
+from dynamics.scaled_bodies import impossible_kinds, rounded, scaled_bodies
 
 # Name of each length, and the field of a leg that it sets.
 LENGTH_FIELDS = {
@@ -42,8 +37,6 @@ LENGTH_FIELDS = {
 
 # Radii of the circles, seen from above, on which base joints and platform joints lie.
 RADII = ("base_radius", "platform_radius")
-# Moment of inertia of each body of a leg about the axis along its length.
-MOMENT_ABOUT_LENGTH = {"crank": "Ixx", "link": "Izz", "cylinder": "Izz", "rod": "Izz"}
 # Number of digits to which points are rounded, counted from the first digit of their radius.
 DIGITS = 9
 SAMPLES = 2000  # number of random positions of the joints within the travel limit
@@ -88,8 +81,12 @@ def robot_of_lengths(
     geometry = replace(
         geometry, travel_limit=_travel(geometry, like.geometry, ratios), unstated=Unstated()
     )
+    guessed = like.layout.bodies_of(like.parameter_sets["guess"].dynamic)
+    rods = {name: new[name] for name in impossible_kinds(like.layout, guessed)}
     sets = {
-        key: ParameterSet(_scaled(like.layout, values.dynamic, ratios), values.joint_pid)
+        key: ParameterSet(
+            scaled_bodies(like.layout, values.dynamic, ratios, rods), values.joint_pid
+        )
         for key, values in like.parameter_sets.items()
     }
     robot = _within_limits(Robot(RobotDescription(name, geometry, sets)))
@@ -98,11 +95,11 @@ def robot_of_lengths(
     designed = np.tile(drives.gains, len(guess) // 3)
     sets = {
         # the ratios between the gains of the sets are kept
-        key: ParameterSet(values.dynamic, _rounded(designed * values.joint_pid / guess))
+        key: ParameterSet(values.dynamic, rounded(designed * values.joint_pid / guess))
         for key, values in sets.items()
     }
     description = RobotDescription(name, robot.geometry, sets)
-    return description, _comments(robot, like, new, drives)
+    return description, _comments(robot, like, new, rods, drives)
 
 
 def _at_rest_at_home(geometry: RobotGeometry, new: Mapping[str, float]) -> RobotGeometry:
@@ -238,37 +235,6 @@ def _check_stroke(leg: Leg) -> None:
         )
 
 
-def _scaled(
-    layout: ParameterLayout, dynamic: np.ndarray, ratios: Mapping[str, float]
-) -> np.ndarray:
-    """Dynamic parameters of the scaled bodies, all of which can exist. See the module."""
-    values = dynamic.copy()
-    bodies = layout.bodies_of(values)
-    moments = [FULL_INERTIAL.index(name) for name in MOMENTS]
-    for row, kind in enumerate(layout.kinds):
-        if kind.name == "platform":
-            ratio = ratios["platform_radius"]
-            mass_factor, moment_factor, along = ratio**2, ratio**4, None
-        else:
-            ratio = ratios.get(kind.name, 1.0)
-            mass_factor, moment_factor = ratio, ratio**3
-            along = MOMENT_ABOUT_LENGTH.get(kind.name)
-        bodies[row, 0] *= mass_factor
-        for column, moment in zip(moments, MOMENTS, strict=True):
-            bodies[row, column] *= mass_factor if moment == along else moment_factor
-    # rounded inertias can break Ix + Iy >= Iz again, by the size of the rounding
-    for _ in range(2):
-        values[layout.rigid] = _rounded(layout.rigid_of(bodies))
-        bodies = physical_inertias(layout, values, allow_changes=True).values
-    values[layout.rigid] = layout.rigid_of(bodies)
-    return values
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """Values to four significant digits."""
-    return np.array([float(f"{value:.4g}") for value in values])
-
-
 def _within_limits(robot: Robot) -> Robot:
     """Robot with a travel limit so small that no sampled pose is near a singularity."""
     limit = robot.travel_limit
@@ -323,13 +289,23 @@ def _at_home(robot: Robot) -> workspace.WorkspaceMeasures:
 
 
 def _comments(
-    robot: Robot, like: Robot, new: Mapping[str, float], drives: DesignedDrives
+    robot: Robot,
+    like: Robot,
+    new: Mapping[str, float],
+    rods: Mapping[str, float],
+    drives: DesignedDrives,
 ) -> list[str]:
     """Comments of the robot file, which describe the design."""
     geometry = robot.geometry
     home = _at_home(robot)
     unit = robot.layout.joint_unit
     inertia = "kg" if geometry.prismatic else "kg m^2"
+    replaced = "Inertias that no rigid body can have are replaced by the nearest possible ones."
+    if rods:
+        replaced = (
+            f"No rigid body can have the inertias of {' and '.join(sorted(rods))} of {like.name}: "
+            "here they are those of uniform round rods of steel with these masses and lengths."
+        )
     lengths = ", ".join(f"{name} {value:g} m" for name, value in new.items())
     angles = [
         ", ".join(f"{np.degrees(np.arctan2(y, x)):.4g}" for x, y, _ in joints)
@@ -347,9 +323,9 @@ def _comments(
         "an ordinary workshop. They widen the intervals of an identification. 0 is for a robot "
         "that is exactly as this file says.",
         f"Bodies are those of {like.name}, scaled: the platform as a plate of the same thickness, "
-        "the bodies of the legs as bars of the same section. Inertias that no rigid body can have "
-        "are replaced by the nearest possible ones. Put in your own masses and inertias where you "
-        f"know them. Friction is that of {like.name}. `truth` is used by simulated experiments.",
+        f"the bodies of the legs as bars of the same section. {replaced} Put in your own masses "
+        f"and inertias where you know them. Friction is that of {like.name}. `truth` is used by "
+        "simulated experiments.",
         f"Gains by design: the inertia at the joints is {drives.inertias[0]:.2g} to "
         f"{drives.inertias[1]:.2g} {inertia}. With lp, the natural frequencies are "
         f"{drives.frequencies[1]:.3g} to {drives.frequencies[0]:.3g} rad/s; with ld, the damping "

@@ -8,8 +8,9 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import FrameTiming, LoopSettings, ServoGains, stability
 from dynamics.errors import RobotFileError
 from dynamics.robot_file import built_in_robots, parsed_robot, read_robot_file
-from dynamics.robot_lengths import _at_rest_at_home, _scaled, lengths_of, robot_of_lengths
+from dynamics.robot_lengths import _at_rest_at_home, lengths_of, robot_of_lengths
 from dynamics.robot_text import robot_text
+from dynamics.scaled_bodies import scaled_bodies
 
 # The paper's servo.
 LOOPS = [
@@ -107,12 +108,26 @@ def test_bodies_are_scaled_as_plates_and_bars():
     robot = load_robot("ups6")
     ratios = {"platform_radius": 2.0, "cylinder": 3.0, "rod": 0.5}
     given = robot.parameter_sets["truth"].dynamic
-    made = robot.layout.bodies_of(_scaled(robot.layout, given, ratios))
+    made = robot.layout.bodies_of(scaled_bodies(robot.layout, given, ratios, {}))
     old = robot.layout.bodies_of(given)
     rows = [robot.layout.bodies.index(name) for name in ("platform", "cylinder1", "rod1")]
     parts = (made / np.where(old, old, 1))[rows][:, [0, 4, 5, 6]]
     bars = [[3, 27, 27, 3], [0.5, 1 / 8, 1 / 8, 0.5]]
     np.testing.assert_allclose(parts, [[4, 16, 16, 16], *bars], rtol=5e-4)  # four digits
+
+
+def test_links_and_cranks_whose_printed_inertias_no_body_has_become_rods():
+    """By the moments of a slender bar, m L^2/12, beside which the thickness of a link is small."""
+    made, comments = robot_of_lengths("mine", load_robot("rss6"), OTHER["rss6"], LOOPS)
+    for values in made.parameter_sets.values():
+        layout = Robot(made).layout
+        bodies = layout.bodies_of(values.dynamic)
+        places = [layout.bodies.index(name) for name in ("link1", "link6", "crank1", "crank6")]
+        links, cranks = bodies[places[:2]], bodies[places[2:]]
+        np.testing.assert_allclose(links[:, 4:6] / links[:, [0]], 0.25**2 / 12, rtol=0.02)
+        assert (links[:, 6] < 0.05 * links[:, 4]).all()
+        np.testing.assert_allclose(cranks[:, 5:7] / cranks[:, [0]], 0.08**2 / 12, rtol=0.3)
+    assert any("crank and link of rss6: here they are those of uniform" in one for one in comments)
 
 
 def check_made(name, lengths):
