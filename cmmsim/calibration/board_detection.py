@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.square_detection import find_charuco, find_chessboard
+from cmmsim.calibration.square_detection import counts_squares, find_charuco, find_chessboard
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.detection.tags import find_tags
@@ -110,7 +110,9 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
             f"{board.dictionary}"
         )
     if found is None:
-        return f"no {board.kind} of {board.columns} x {board.rows} found"
+        squares = board.kind == "chessboard" and counts_squares(grey, board.columns, board.rows)
+        hint = ", but one with a corner less each way: count inner corners, not squares"
+        return f"no {board.kind} of {board.columns} x {board.rows} found{hint if squares else ''}"
     measured = np.isfinite(found).all(axis=1)
     fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(found)
     if measured.sum() < fewest:

@@ -40,6 +40,16 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
     return _fine(grey, corners, nearest)
 
 
+def counts_squares(grey: NDArray[np.uint8], columns: int, rows: int) -> bool:
+    """Tell whether a quick search finds a chessboard of this many squares."""
+    corners = (columns - 1, rows - 1)
+    # OpenCV refuses boards of fewer corners.
+    if min(corners) < 3:
+        return False
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    return bool(cv2.findChessboardCorners(grey, corners, flags=flags)[0])
+
+
 def find_charuco(grey: NDArray[np.uint8], board: Board) -> Array | None:
     """Return the corners (rows * columns, 2) px, or None. Corners that are not seen are NaN.
 

@@ -108,10 +108,12 @@ def _right_from_left(section: RightFromLeft) -> Array:
             f"apart, got {list(section.translation)}"
         )
     if right_centre[0] <= 0.0 or right_from_left[2, 2] <= 0.0:
+        place = ", ".join(f"{value:.4g}" for value in section.translation)
+        turn = ", ".join(f"{value:.4g}" for value in section.rotation_vector)
         raise SensorFileError(
             "rig.right_from_left: the right camera must stand to the right of the left camera "
             "(translation x below zero if both look in the same direction) and look in about the "
-            f"same direction, got {section.model_dump()}"
+            f"same direction, got translation [{place}] m and rotation_vector [{turn}] rad"
         )
     return right_from_left
 

@@ -216,5 +216,5 @@ def _changes(there: str, here: str) -> str:
 
 def _short(value: Any) -> str:
     """Show a value on one line, shortened to `SHOWN_CHARACTERS`."""
-    text = "nothing" if value is None else json.dumps(value)
+    text = "not stated" if value is None else json.dumps(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

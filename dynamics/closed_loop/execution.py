@@ -148,8 +148,7 @@ def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -
     }
     fields |= _poses(problem, fields, measured)
     time = problem.frame_times.copy()
-    events = int(now.events)
-    return ClosedLoopRun(time=time, **fields, events=events, start=problem.start)
+    return ClosedLoopRun(time=time, **fields, events=int(now.events), start=problem.start)
 
 
 def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
@@ -391,10 +390,12 @@ def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFail
     """Error of a run that ended early. It counts the frames with actuators at the torque limit."""
     limit = problem.settings.drives.torque_limit
     unit = problem.robot.layout.unit("joint1.coulomb")
+    run = "closed loop" if problem.commands is None else "run under commands"
     saturated = saturated_frames(record.torque[:frame], limit)
     when = f"t = {problem.frame_times[frame]:.3f} s"
     # with weak actuators, the robot can leave its reach although the loop is stable
-    if saturated:
+    if saturated or problem.commands is not None:
         why = why.replace(UNSTABLE, "")
+    if saturated:
         when += f", saturated in {saturated} of {frame} frames, limit {limit:g} {unit}"
-    return LoopFailure(f"closed loop stopped at frame {frame} ({when}): {why}", frame, saturated)
+    return LoopFailure(f"{run} stopped at frame {frame} ({when}): {why}", frame, saturated)

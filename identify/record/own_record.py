@@ -193,6 +193,8 @@ def read_description(path: Path, log: Path) -> Description:
     Raises RecordError or ScenarioError if there is no such file, it is not TOML, or its content is
     not valid.
     """
+    if not log.exists():
+        raise RecordError(f"there is no record {log}")
     if not is_file(path):
         raise RecordError(
             f"there is no file {path}, which must describe the record {log.name}; cmmsim new "

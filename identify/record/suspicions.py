@@ -5,7 +5,7 @@ drives and the errors of the geometry. If they do not, the poses are tried in ot
 other axes and mirrored, and the commands in other units, directions, orders and zeros.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import permutations, product
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dynamics import Robot
 from identify.arrays import Array
+from identify.files.dataset import POSE
 from identify.filtering import interpolated
 from identify.record.delays import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
@@ -49,6 +50,8 @@ LENGTHS_TRIED = {
     1.0: "",
     1e-3: "positions in mm and not m",
     1e-2: "positions in cm and not m",
+    0.1: "positions in mm and not cm",
+    10.0: "positions in cm and not mm",
     1e3: "positions in m and not mm",
 }
 
@@ -60,6 +63,12 @@ ANGLES_TRIED = {
 }
 
 NAMES = ("x", "y", "z")
+
+# Columns whose orders and signs are tried: their places, their names, and the other columns.
+COLUMNS = {
+    "position": (slice(0, 3), NAMES, "orientation"),
+    "angles": (slice(3, 6), POSE[3:], "position"),
+}
 
 
 def suspicions(telemetry: Telemetry, robot: Robot) -> list[str]:
@@ -146,6 +155,9 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
     hint = ""
     if len(sure) < len(alike):
         hint = order or _fitting(telemetry, robot, alike.mean())
+    elif alike.min() > 0 and unexplained(telemetry, robot) > EXPLAINED:
+        # Wrong columns of small angles leave all joints similar to their commands.
+        hint = _fitting(telemetry, robot, alike.mean())
     if not hint:
         # A joint whose drive does not follow says nothing about its own zero.
         yield from _of_joints(sure, held, coordinates, alike, robot, order)
@@ -244,10 +256,8 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
     held = [_commands_at(telemetry, poses.time[rows] - lag) for lag in LAGS_S]
     best = max(alike, FITS - 0.1)
     found = ""
-    units = product(LENGTHS_TRIED.items(), ANGLES_TRIED.items())
-    for ((metres, length), (radians, angle)), (axes, matrix) in product(units, _all_axes()):
-        scaled = poses.pose[rows] * np.repeat([metres, radians], 3)
-        tried = _on_chart(_with_axes(scaled, matrix), robot)
+    for said, other in _other_poses(poses.pose[rows]):
+        tried = _on_chart(other, robot)
         reached = _reached(tried, robot)
         if reached.mean() < FITS:
             continue
@@ -256,10 +266,32 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
         # What changes less is tried first, and only a better fit takes its place.
         if score > best + 0.02:
             best = score
-            said = [length, angle, "" if axes == NAMES else f"axes = [{', '.join(axes)}]"]
-            left = " (the frame is left-handed)" if np.linalg.det(matrix) < 0 else ""
-            found = f"with {' and '.join(filter(None, said))} it would fit{left}"
+            found = said
     return found
+
+
+def _other_poses(poses: Array) -> Iterator[tuple[str, Array]]:
+    """Yield hints with poses (N, 6) in other units and axes, and with other orders of columns.
+
+    Axes of a frame turn the position and the orientation. Columns in a wrong order, or with a wrong
+    sign, change only one of them.
+    """
+    units = product(LENGTHS_TRIED.items(), ANGLES_TRIED.items())
+    for ((metres, length), (radians, angle)), (axes, matrix) in product(units, _all_axes()):
+        scaled = poses * np.repeat([metres, radians], 3)
+        said = [length, angle, "" if axes == NAMES else f"axes = [{', '.join(axes)}]"]
+        left = " (the frame is left-handed)" if np.linalg.det(matrix) < 0 else ""
+        hint = f"with {' and '.join(filter(None, said))} it would fit{left}"
+        yield hint, _with_axes(scaled, matrix)
+    for what, (part, names, same) in COLUMNS.items():
+        for axes, matrix in _all_axes(names):
+            moved = poses.copy()
+            moved[:, part] = poses[:, part] @ matrix.T
+            hint = (
+                f"with [{', '.join(axes)}] in place of the {what} [{', '.join(names)}], and the "
+                f"{same} as it is, it would fit: columns have another order or sign"
+            )
+            yield hint, moved
 
 
 def _commands_at(telemetry: Telemetry, time: Array) -> Array:
@@ -268,17 +300,17 @@ def _commands_at(telemetry: Telemetry, time: Array) -> Array:
     return interpolated(time, commands.time, commands.command)
 
 
-def _all_axes() -> Iterator[tuple[tuple[str, ...], Array]]:
+def _all_axes(usual: Sequence[str] = NAMES) -> Iterator[tuple[tuple[str, ...], Array]]:
     """Yield names and matrices (3, 3) of all choices of axes, those with fewer changes first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         matrix = np.zeros((3, 3))
         matrix[range(3), order] = signs
         names = tuple(
-            f"{'-' if sign < 0 else ''}{NAMES[axis]}"
+            f"{'-' if sign < 0 else ''}{usual[axis]}"
             for axis, sign in zip(order, signs, strict=True)
         )
-        changed = sum(name != usual for name, usual in zip(names, NAMES, strict=True))
+        changed = sum(name != own for name, own in zip(names, usual, strict=True))
         found.append((changed, names, matrix))
     for _, names, matrix in sorted(found, key=lambda one: one[0]):
         yield names, matrix

@@ -196,6 +196,17 @@ def test_both_shapes_of_opencvs_answer_are_one(monkeypatch):
         assert np.abs(pixel_errors(PERFECT, ASYMMETRIC, *drawn)).max() < 0.1
 
 
+def test_a_chessboard_whose_squares_were_counted_in_place_of_its_corners_is_told():
+    squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
+    image = np.pad(255 * squares, 60, constant_values=255).astype(np.uint8)
+    said = find_board(image, Board(kind="chessboard", columns=9, rows=7, spacing=0.05))
+    assert said.endswith(
+        "9 x 7 found, but one with a corner less each way: count inner corners, not squares"
+    )
+    right = find_board(image, Board(kind="chessboard", columns=8, rows=6, spacing=0.05))
+    assert len(right.index) == 48
+
+
 @pytest.mark.slow
 def test_no_board_is_a_reason_and_not_an_error():
     rng = np.random.default_rng(0)

@@ -183,3 +183,22 @@ def test_a_log_is_checked_by_its_description_and_a_robot_is_told_from_it(
         capfd.readouterr().err
     )
     assert not (tmp_path / "x.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("part", "order", "signs", "said"),
+    [
+        (slice(0, 3), [1, 0, 2], [1, 1, 1], "with [y, x, z] in place of the position [x, y, z]"),
+        (slice(0, 3), [0, 1, 2], [1, -1, 1], "with [x, -y, z] in place of the position"),
+        (slice(3, 6), [1, 0, 2], [1, 1, 1], "with [beta, alpha, gamma] in place of the angles"),
+    ],
+)
+def test_columns_of_the_pose_in_another_order_or_with_another_sign_are_named(
+    record, part, order, signs, said
+):
+    sound = recorded_telemetry(record, "mine.nc")
+    moved = sound.poses.pose.copy()
+    moved[:, part] = moved[:, part][:, order] * signs
+    found = suspicions(replace(sound, poses=replace(sound.poses, pose=moved)), rss6())
+    assert len(found) == 1
+    assert said in found[0]
