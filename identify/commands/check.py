@@ -133,7 +133,7 @@ def _tell(
         (
             "yes" if finding.ok else "NO",
             finding.check,
-            "" if finding.limit is None else f"{finding.limit:.3g}",
+            "" if finding.limit is None else f"{finding.relation} {finding.limit:.3g}",
             finding.text,
         )
         for finding in findings

@@ -12,7 +12,8 @@ class Finding:
     """Result of one check.
 
     ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the number
-    1..n of the leg concerned, or None if no single leg is concerned. ``text`` is a sentence.
+    1..n of the leg concerned, or None if no single leg is concerned. ``text`` is a sentence. A good
+    value has this ``relation`` to its limit: a sign, or ``about`` for the middle of a range.
     """
 
     check: str
@@ -22,6 +23,7 @@ class Finding:
     unit: str = field(default="1", kw_only=True)
     leg: int | None = field(default=None, kw_only=True)
     text: str
+    relation: str = field(default="<=", kw_only=True)
 
     @property
     def brief(self) -> str:

@@ -58,14 +58,14 @@ def check_loop(
     except DynamicsError as error:
         # The robot is singular at home, which another finding reports.
         text = f"the loop cannot be judged at home: {error}"
-        yield Finding("loop", False, None, text, limit=1.0)
+        yield Finding("loop", False, None, text, limit=1.0, relation="<")
         return
     at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
     text = (
         f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is "
         "stable below 1"
     )
-    yield Finding("loop", radius < 1, radius, text, limit=1.0)
+    yield Finding("loop", radius < 1, radius, text, limit=1.0, relation="<")
     factor = stability.gain_margin(*arguments)
     gains = settings.servo
     text = (
@@ -77,7 +77,7 @@ def check_loop(
     elif factor < 1:
         text = text.replace("can be", "must be")
         text = text.replace(" until the loop is unstable", " for a stable loop")
-    yield Finding("gain margin", factor > 1, factor, text, limit=1.0)
+    yield Finding("gain margin", factor > 1, factor, text, limit=1.0, relation=">")
     rate = stability.lowest_frame_rate(*arguments)
     text = (
         f"the loop is stable from {rate:.3g} Hz on with this latency"
@@ -85,7 +85,13 @@ def check_loop(
         else "no frame rate makes it stable"
     )
     yield Finding(
-        "frame rate", rate < timing.frame_rate_hz, rate, text, limit=timing.frame_rate_hz, unit="Hz"
+        "frame rate",
+        rate < timing.frame_rate_hz,
+        rate,
+        text,
+        limit=timing.frame_rate_hz,
+        unit="Hz",
+        relation="<",
     )
     if radius >= 1 or not factor > 1:
         yield _advised(robot, parameters, settings)
@@ -97,13 +103,13 @@ def _advised(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings
     try:
         made = design_drives(robot, [parameters[layout.dynamic]], [settings])
     except SimulationError as error:
-        return Finding("drives by design", False, None, str(error), limit=1.0)
+        return Finding("drives by design", False, None, str(error), limit=1.0, relation=">")
     lp, li, ld = made.gains
     text = (
         f"with joint_pid = {{ lp = {lp:.3g}, li = {li:.3g}, ld = {ld:.3g} }} in the robot file the "
         f"loop is stable, and the servo's gains can be {made.margin:.3g} times as large"
     )
-    return Finding("drives by design", True, made.margin, text, limit=1.0)
+    return Finding("drives by design", True, made.margin, text, limit=1.0, relation=">")
 
 
 def check_steps(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
@@ -161,9 +167,11 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
                 f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
                 f"{made.gain_margin:.3g} times these gains make the loop unstable"
             )
-            yield Finding("servo by design", made.radius < 1, made.gain_margin, text, limit=1.0)
+            yield Finding(
+                "servo by design", made.radius < 1, made.gain_margin, text, limit=1.0, relation=">"
+            )
         except SimulationError as error:
-            yield Finding("servo by design", False, None, str(error), limit=1.0)
+            yield Finding("servo by design", False, None, str(error), limit=1.0, relation=">")
     w = asked.bandwidth
     nyquist = np.pi * settings.timing.frame_rate_hz
     text = (
@@ -173,7 +181,9 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
     )
     if torques.radius < 1:
         text += f"; {torques.gain_margin:.3g} times these gains make it unstable"
-    yield Finding("computed torque", torques.radius < 1, torques.radius, text, limit=1.0)
+    yield Finding(
+        "computed torque", torques.radius < 1, torques.radius, text, limit=1.0, relation="<"
+    )
     known = limit if limit > 0 else None
     most = f"up to {limit:.3g} rad/s" if limit > 0 else "with no bandwidth"
     text = f"computed_torque is stable {most}"

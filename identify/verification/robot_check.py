@@ -110,7 +110,7 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
     names = robot.coordinate_names
     joints = robot.layout.joints
     text = f"{joints} actuators for {len(names)} freedoms of the platform: {', '.join(names)}"
-    yield Finding("freedoms", joints == len(names), joints, text, limit=len(names))
+    yield Finding("freedoms", joints == len(names), joints, text, limit=len(names), relation="=")
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
@@ -129,7 +129,7 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
         f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
         "pose near home"
     )
-    yield Finding("travel closes", share > 0, share, text, limit=0.0)
+    yield Finding("travel closes", share > 0, share, text, limit=0.0, relation=">")
     if share > 0:
         yield from _extremes("over the travel", travel, limits)
 
@@ -141,14 +141,16 @@ def _extremes(
     text = (
         f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
     )
-    yield Finding(f"reach {where}", reach > 0, reach, text, limit=0.0, leg=leg)
+    yield Finding(f"reach {where}", reach > 0, reach, text, limit=0.0, leg=leg, relation=">")
     leverage, leg = _worst(measures.leverage, np.argmin)
     least = limits.least_leverage
     most = limits.most_condition
     text = (
         f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
     )
-    yield Finding(f"leverage {where}", leverage >= least, leverage, text, limit=least, leg=leg)
+    yield Finding(
+        f"leverage {where}", leverage >= least, leverage, text, limit=least, leg=leg, relation=">="
+    )
     condition = float(np.max(measures.platform_condition))
     text = (
         f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at "

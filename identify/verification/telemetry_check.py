@@ -71,6 +71,7 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         f"timing.frame_rate_hz is {wanted:g}",
         limit=wanted,
         unit="Hz",
+        relation="about",
     )
     # Rows that are lost do not count as jitter.
     even = np.round(steps * rate)
@@ -147,7 +148,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         ok = stated is None or 1 / NOISE <= value / stated <= NOISE
         if stated is not None:
             text += f"; stated are {scale * stated:.3g} {word}, {value / stated:.2g} times that"
-        yield Finding(name, ok, value, text, limit=stated, unit=unit)
+        yield Finding(name, ok, value, text, limit=stated, unit=unit, relation="about")
     jumps = logged.jumps
     listed = ", ".join(f"{one:.4f}" for one in jumps[:LISTED])
     more = f" and {len(jumps) - LISTED} more" if len(jumps) > LISTED else ""
@@ -250,6 +251,7 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         f"{-BEFORE_S:g} s, a motion before its commands, or a correlation below {FOLLOWS:g} fails",
         limit=-BEFORE_S,
         unit="s",
+        relation=">=",
     )
     delay = logged.delay
     timing = logged.side.timing
@@ -274,8 +276,8 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         offset,
         f"the noise of a pose is in the command {1e3 * delay.seconds:.3f} ms later (correlation "
         f"{delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
-        f"{1e3 * expected:.3f} ms: the clock of the commands is ahead by {1e3 * offset:.3f} ms, or "
-        f"the latency is another{beyond}",
+        f"{1e3 * expected:.3f} ms: the clock of the commands is {1e3 * abs(offset):.3f} ms "
+        f"{'ahead' if offset >= 0 else 'behind'}, or the latency is another{beyond}",
         limit=allowed,
         unit="s",
     )
@@ -299,7 +301,7 @@ def _parameters(logged: LoggedRun) -> Iterator[Finding]:
     limit = SHOWN_GROUPS * len(names)
     if isinstance(run, DynamicsError):
         text = f"the guessed model does not run under the commands: {run}"
-        yield Finding("parameters", False, None, text, limit=limit)
+        yield Finding("parameters", False, None, text, limit=limit, relation=">=")
         return
     shown = logged.can_show(run)
     weak = [name for name, seen in zip(names, shown, strict=True) if not seen]
@@ -311,6 +313,7 @@ def _parameters(logged: LoggedRun) -> Iterator[Finding]:
         f"the motion can show {shown.sum()} of {len(names)} groups of parameters, by the guessed "
         "model" + (f"; not {', '.join(weak[:LISTED])}{more}" if weak else ""),
         limit=limit,
+        relation=">=",
     )
 
 
