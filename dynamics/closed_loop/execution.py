@@ -40,7 +40,6 @@ MACHINE_CODE = (
     *("equation_of_motion", "free_acceleration", "response", "rate_map_derivative"),
     *("stage_derivatives", "stop_derivatives", "slope_derivative"),
 )
-
 # Kernels that other kernels call by address.
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
 UNSTABLE = " (the loop is unstable)"

@@ -49,8 +49,9 @@ def diagnose(
     Each cause of a catalogue, as the zero of a joint or the clock of the commands, is judged by how
     much it explains of what the model leaves of the record. The first one is fitted beside the
     parameters, then the next one is asked. cmmsim identify does the same where noise does not
-    explain the record. A cause of one's own is a function (run, size) that returns the model of the
-    run with it, see identify.diagnosis.diagnose.
+    explain the record, unless the watch of the cameras has warned. The first line says if no cause
+    is needed. A cause of one's own is a function (run, size) that returns the model of the run with
+    it, see identify.diagnosis.diagnose.
 
     Reads scenario.toml, experiment.nc and result.json of the folder.
 
@@ -73,7 +74,9 @@ def diagnose(
 
 
 def _say(found: "Diagnosis") -> None:
-    """Print the ranking, and the findings with their remedies."""
+    """Print whether a cause is needed, the ranking, and the findings with their remedies."""
+    if found.not_needed:
+        typer.echo(f"{found.not_needed}; what follows is not needed")
     rows = [
         (
             one.name,
@@ -94,6 +97,8 @@ def _say(found: "Diagnosis") -> None:
         "chance: probability that a right model has such a statistic for any of them; size: to "
         "first order, ± its standard deviation by noise",
     )
+    if found.not_needed:
+        return
     typer.echo(str(found))
     for finding in found.findings:
         for remedy in finding.remedies:
@@ -116,8 +121,8 @@ def budget(
     Reads scenario.toml, experiment.nc, covariance.nc and result.json of the folder, and
     validation.nc if there is one.
 
-    Writes budget.json, which is also the JSON, budget.csv and budget.png into the folder budget
-    there.
+    Writes budget.json, which is also the JSON, budget.csv, and budget.png without the parameters
+    that are not identified, into the folder budget there.
 
     \b
     Example:
@@ -132,15 +137,16 @@ def budget(
     RunFolder(run).require("scenario.toml", "experiment.nc", "covariance.nc", "result.json")
     context.with_resource(lock_folder(run))
     found = error_budget(run)
+    entries = load_result(RunFolder(run).result)["identification"]["parameters"]
+    known = {name: bool(entry["identifiable"]) for name, entry in entries.items()}
     folder = RunFolder(run).budget
     files: dict[str, Any] = {
-        "budget.png": drawn(lambda: budget_figure(found)),
+        "budget.png": drawn(lambda: budget_figure(found, known)),
         "budget.json": found.to_dict(),
     }
     files["budget.csv"] = found.to_dataframe().to_csv(index=False)
     save_files(folder, files)
-    entries = load_result(RunFolder(run).result)["identification"]["parameters"]
-    identified = [name for name, entry in entries.items() if entry["identifiable"]]
+    identified = [name for name, shown in known.items() if shown]
     tell(found.to_dict(), json, quiet, lambda: _print_budget(found, identified, folder))
 
 

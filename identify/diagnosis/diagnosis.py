@@ -115,6 +115,8 @@ class Diagnosis:
         Misfit of the model that the logged commands drive, without and with the findings.
     seconds : float
         Time that the diagnosis took, s.
+    not_needed : str
+        Why no cause is needed, as for residuals that are noise. Empty if one is.
     """
 
     findings: tuple[Finding, ...]
@@ -122,6 +124,7 @@ class Diagnosis:
     misfit: Misfit
     left: Misfit
     seconds: float
+    not_needed: str = ""
 
     @property
     def explained(self) -> float:
@@ -135,6 +138,9 @@ class Diagnosis:
 
     def __str__(self) -> str:
         asked = f"{len(self.candidates)} causes and groups were asked"
+        if self.not_needed:
+            found = "; then ".join(str(one) for one in self.findings)
+            return f"{self.not_needed}: {asked}" + (f"; not needed: {found}" if found else "")
         if self.none_of_these:
             best = f"; the most is {self.findings[0]}" if self.findings else self._unfitted
             return f"none of these explains what the model leaves of the record: {asked}{best}"
@@ -157,8 +163,8 @@ class Diagnosis:
         return f"<Diagnosis: {self}>"
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning that names the first cause, if there is any."""
-        if not self.findings and not self.none_of_these:
+        """Return a warning that names the first cause, if there is any and one is needed."""
+        if self.not_needed or not (self.findings or self.none_of_these):
             return ()
         if self.none_of_these:
             return (f"diagnosis: {self}",)
@@ -169,6 +175,7 @@ class Diagnosis:
         """Return the diagnosis for JSON."""
         return {
             "says": str(self),
+            "not_needed": self.not_needed,
             "none_of_these": self.none_of_these,
             "explained": self.explained,
             "misfit": asdict(self.misfit),

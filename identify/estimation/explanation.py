@@ -226,6 +226,22 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
     return Whiteness(correlations, np.asarray(chdtrc(lags, statistics)), together)
 
 
+# Largest excess of the residual, as a share of the noise, that needs no cause. The residual is that
+# of the model under the logged commands. Errors of the teaching can make such an excess if the
+# teaching counts as exact, as in a log that cannot state them.
+LITTLE = 0.1
+
+
+def needs_cause(misfit: Misfit, driven_misfit: Misfit, suspicious: bool) -> bool:
+    """Return whether a model misses its record by so much that a cause is worth asking for.
+
+    driven_misfit: misfit under the logged commands. suspicious: whether its residuals are not
+    white.
+    """
+    excess = driven_misfit.found - (1 + LITTLE) * driven_misfit.expected
+    return misfit.significant or suspicious or excess > 0
+
+
 @dataclass(frozen=True)
 class Explanation:
     """Judgement of how well a model explains its records.

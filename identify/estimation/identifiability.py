@@ -183,19 +183,29 @@ def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
 # Largest relative standard deviation of the common factor without a warning. Only the part due to
 # the initial guess counts, and only if an instrument was used to fix the factor.
 SCALE_KNOWN = 0.015
+# Largest relative standard deviation of the common factor without a warning, of all causes.
+SCALE_WIDE = 0.03
 
 
 def scale_warnings(
-    anchor: ScaleAnchor, gain: str, std: float, prior_share: float
+    anchor: ScaleAnchor, gain: str, std: float, prior_share: float, whole_std: float
 ) -> tuple[str, ...]:
-    """Return a warning if an instrument was used to fix the scale, but does not fix it.
+    """Return a warning if an instrument was used to fix the scale, but does not fix it well.
 
     Poses determine the controller's gain up to the scale. gain: name of this gain. std: its
     relative standard deviation due to errors of the initial guess. prior_share: share of its
-    variance due to these errors.
+    variance due to these errors. whole_std: its relative standard deviation of all causes.
     """
-    if anchor.value is None or std <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
+    if anchor.value is None:
         return ()
+    if std <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
+        if whole_std <= SCALE_WIDE:
+            return ()
+        return (
+            f"the scale anchor {anchor.name} fixes the scale of this robot only to "
+            f"{whole_std:.1%}, the standard deviation of {gain}; all values in kg, N m or N share "
+            "this error: use identification.scale_anchor = payload or joint_gain",
+        )
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "
         "measured quantity only in sums with other parameters, and the initial guess of these "
@@ -261,9 +271,10 @@ def judge(
     gain = robot.layout.joint_pid.start
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
     gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
+    gain_whole = float(uncertainty.std[gain] / estimate[gain])
     # Torque commands determine the scale.
     if not uncertainty.information[gain, gain]:
-        gain_left = 0.0
+        gain_left = gain_whole = 0.0
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -304,7 +315,11 @@ def judge(
             *full_body_warnings(robot, estimate, uncertainty.covariance, shown),
             *conditioned.warnings(),
             *scale_warnings(
-                problem.anchor, robot.layout.names[gain], gain_left, float(prior_share[gain])
+                problem.anchor,
+                robot.layout.names[gain],
+                gain_left,
+                float(prior_share[gain]),
+                gain_whole,
             ),
         ),
     )

@@ -47,7 +47,7 @@ class Goal:
     """Goal of a run: a value that must keep a limit, both in ``unit``.
 
     ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that follow the name of
-    the goal.
+    the goal. ``widened`` says what the limit is if it is not the usual one.
     """
 
     name: str
@@ -56,6 +56,7 @@ class Goal:
     limit: float
     unit: str
     detail: str = ""
+    widened: str = ""
 
     @property
     def passed(self) -> bool:
@@ -182,8 +183,10 @@ def _within(
     declared: three standard deviations of declared errors. what: words for these errors.
     """
     widest = max(limit, float(np.nanmax(declared, initial=0.0)))
-    said = f"; the limit is three standard deviations of {what}"
-    return Goal(name, value, "<=", widest, unit, text + (said if widest > limit else ""))
+    said = f"the limit is three standard deviations of {what}, {limit:g} {unit} without them"
+    if widest == limit:
+        return Goal(name, value, "<=", limit, unit, text)
+    return Goal(name, value, "<=", widest, unit, f"{text}; {said}", said)
 
 
 def _parameters(result: dict[str, Any]) -> list[Goal]:

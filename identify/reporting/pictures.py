@@ -68,7 +68,7 @@ def pictures(data: RunData) -> dict[str, Picture]:
         ),
         **_of_the_diagnosis(data.result),
         "parameters": Picture(
-            lambda: estimates.parameter_figure(names), _parameters_caption(names)
+            lambda: estimates.parameter_figure(names), _parameters_caption(found)
         ),
         **(sums if several else {}),
         "correlation": Picture(
@@ -198,11 +198,18 @@ def _of_the_motion(data: RunData) -> dict[str, Picture]:
     }
 
 
-def _parameters_caption(entries: dict[str, Any]) -> str:
+def _parameters_caption(identification: dict[str, Any]) -> str:
+    entries = identification["parameters"]
     if any(entry["true"] is not None for entry in entries.values()):
+        said = "Nineteen of twenty intervals should reach zero."
+        if identification.get("common_scale"):
+            said = (
+                "Most intervals share the error of one common factor, so that they reach zero or "
+                "miss it together: over many experiments, nineteen of twenty should reach it."
+            )
         return (
             "Error of each identified parameter with its 95 % interval, in per cent of the truth. "
-            "Grey: 5 %. Nineteen of twenty intervals should reach zero."
+            f"Grey: 5 %. {said}"
         )
     return "95 % interval of each identified parameter, in per cent of the estimate. Grey: 5 %."
 

@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from identify.arrays import Array
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
@@ -55,11 +58,13 @@ def sensor_section(data: RunData) -> Section:
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
     # The result of a real robot has no entry `sensor`, because no truth is known.
     if "sensor" not in data.result:
+        rate_hz = data.scenario.timing.frame_rate_hz
+        due = frames_due(data.experiment["time"].values, rate_hz)
         said.append(
-            f"The record as it was used has {int(ok.sum())} measured poses at "
-            f"{data.scenario.timing.frame_rate_hz:g} Hz, and {int((~ok).sum())} frames without a "
-            "pose. Rows that were left out when it was read are not counted. The truth is not "
-            "known: the uncertainties below are those that the sensor states."
+            f"The record as it was used has {int(ok.sum())} measured poses at {rate_hz:g} Hz, and "
+            f"{due - int(ok.sum())} frames without a pose: lost, missing in the log, or left out "
+            "when it was read. The truth is not known: the uncertainties below are those that the "
+            "sensor states."
         )
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_consistent:
@@ -84,6 +89,14 @@ def sensor_section(data: RunData) -> Section:
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
+
+
+def frames_due(time: Array, rate_hz: float) -> int:
+    """Return the number of frames between the first and the last time (N,) of a record, s.
+
+    It is at least N: a clock that differs makes no frame disappear.
+    """
+    return max(len(time), round(float(np.ptp(time)) * rate_hz) + 1)
 
 
 def excitation_section(data: RunData) -> Section:
@@ -115,6 +128,7 @@ def parameter_section(data: RunData) -> Section:
         "record at least halves the standard deviation of its initial guess, and reduces it to "
         "less than half of the quantity's size.",
         parameter_tables.scale_sentence(found),
+        *filter(None, [tables.common_scale_sentence(found)]),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
         *_conditioning_text(found.get("conditioning")),
@@ -244,7 +258,8 @@ def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
     entry = result.get("diagnosis")
     if entry is None:
         return ()
-    remedies = [text for one in entry["findings"] for text in one["remedies"]]
+    needed = not entry.get("not_needed")
+    remedies = [text for one in entry["findings"] if needed for text in one["remedies"]]
     introduction = (
         "The residuals of the model were examined for their cause. Each possible cause is judged "
         "by the share of the misfit that it explains in addition to the parameters. Causes that "

@@ -13,6 +13,7 @@ from typing import Any
 
 import typer
 
+from identify.estimation.common_scale import ENTRY, found_errors
 from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_advice, print_table
 from identify.reporting import paper
@@ -311,6 +312,27 @@ def identified_counts(identification: Mapping[str, Any]) -> str:
     )
 
 
+def common_scale_sentence(identification: Mapping[str, Any]) -> str:
+    """Return the sentence that states how well the common scale is known, or an empty string."""
+    scale = identification.get(ENTRY)
+    if scale is None:
+        return ""
+    shared = scale["shared"]
+    known = sum(bool(one["identifiable"]) for one in identification["parameters"].values())
+    said = (
+        f"The common scale, as {scale['gain']} shows it, is known to {100 * scale['std']:.2g} %: "
+        f"{len(shared) + 1} of the {known} identified parameters share its error"
+    )
+    errors = found_errors(identification)
+    if errors is None:
+        widest = 100 * max(shared.values())
+        return f"{said}, and without it have standard deviations of at most {widest:.2g} %."
+    return (
+        f"{said}, here {100 * errors[0]:+.2g} %, and without it are off by at most "
+        f"{100 * errors[1]:.2g} %."
+    )
+
+
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """Print a summary of the identification.
 
@@ -319,6 +341,8 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
     """
     counts = identified_counts(result["identification"])
     typer.echo(f"identified: {counts}, in {number(result['seconds'].get('identify'))} s")
+    if said := common_scale_sentence(result["identification"]):
+        typer.echo(said)
     goals = explanation_goals(result)
     for goal in goals:
         typer.echo(f"{goal.name}: {f'{number(goal.value)} {goal.unit}'.strip()}: {goal.detail}")
@@ -341,10 +365,14 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
     Missed goals follow with their likeliest causes and the command to type next.
     """
     table = goals_table(result)
+    goals = check_goals(result)
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note
     )
-    missed = [goal for goal in check_goals(result) if not goal.passed]
+    for goal in goals:
+        if goal.passed and goal.widened:
+            typer.echo(f"{goal.name}: {goal.widened}")
+    missed = [goal for goal in goals if not goal.passed]
     for goal in missed:
         typer.echo(f"missed: {goal.name}: {goal.detail}")
     for one, names in advices(missed, result, report.parent):

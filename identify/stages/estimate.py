@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 from dynamics import load_robot
+from dynamics.closed_loop import LoopFailure
 from identify.diagnosis.diagnose import diagnosed
 from identify.errors import RecordError
+from identify.estimation.common_scale import ENTRY as SCALE
+from identify.estimation.common_scale import common_scale
+from identify.estimation.explanation import needs_cause
 from identify.estimation.identification import Asked, asked_of, identified
-from identify.estimation.result import IdentificationResult
 from identify.files.atomic import write_figure, write_files
 from identify.files.dataset import covariance_netcdf, netcdf, parameter_units
 from identify.files.run_folder import (
@@ -116,23 +119,19 @@ def identify_own(
         "seed": None,
         "settings": scenario.estimator_settings(),
     }
-    found = _identified_files(run_folder, names, asked, heading, progress)
+    try:
+        found = _identified_files(run_folder, names, asked, heading, progress)
+    except LoopFailure as error:
+        raise LoopFailure(
+            f"{error}; the model does not run as the record does: axes, signs or the order of its "
+            f"columns can be wrong, see cmmsim check {paths[0]}",
+            error.frame,
+            error.saturated,
+        ) from None
     files = scenario_file(run_folder, scenario.to_toml())
     for name, one in records.items():
         files[folder / name] = netcdf(recording.record_groups(one))
     write_files(files | found, parents=True)
-
-
-# Largest excess of the residual, as a share of the noise, for which no diagnosis is made. The
-# residual is that of the model under the logged commands. Errors of the teaching can cause such an
-# excess if the teaching counts as exact.
-LITTLE = 0.1
-
-
-def _is_missed(result: IdentificationResult) -> bool:
-    """Return whether the model misses its record, so that a diagnosis is made."""
-    excess = result.driven_misfit.found - (1 + LITTLE) * result.driven_misfit.expected
-    return result.misfit.significant or result.whiteness.suspicious or excess > 0
 
 
 def _identified_files(
@@ -151,13 +150,15 @@ def _identified_files(
     """
     began = time.perf_counter()
     result = identified(asked, progress)
+    first = asked.records[0]
     diagnosis = None
-    # The diagnosis has causes only for records with joint commands.
-    if result.drive.in_loop and _is_missed(result):
+    finding = read_finding(first)
+    misses = needs_cause(result.misfit, result.driven_misfit, result.whiteness.suspicious)
+    # The diagnosis has causes only for records with joint commands, and none of the sensor.
+    if result.drive.in_loop and misses and not (finding or {}).get("warning"):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnosed(asked, result)
             advance()
-    first = asked.records[0]
     # The models run with the identified drive law.
     side = asked.side.with_drive(result.drive.law)
     before, after = (
@@ -188,8 +189,8 @@ def _identified_files(
             "identify": ended - began,
             **seconds,
         },
-        DRIFT: read_finding(first),
-        "identification": result.to_dict(),
+        DRIFT: finding,
+        "identification": result.to_dict() | {SCALE: common_scale(result)},
         "before": rms_figures(before - measured, ok),
         "after": rms_figures(after - measured, ok),
         DIAGNOSIS: None,

@@ -1,6 +1,7 @@
 """Stages that explain an identified run: causes of its misfit, and sources of its uncertainty."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from identify.diagnosis.diagnose import diagnosis_from
 from identify.diagnosis.diagnosis import Diagnosis
 from identify.estimation.budget import Budget, budget_of, parameter_budget, together
 from identify.estimation.covariance import NOISE
+from identify.estimation.explanation import LITTLE, MISFIT, SUSPICIOUS, Misfit, needs_cause
 from identify.estimation.identification import output_error_problem
 from identify.files.dataset import POSE, read_sources
 from identify.files.run_folder import RunFolder, check_entries, load_result, save_result
@@ -22,6 +24,7 @@ from identify.loop_parameters import settled_drive
 from identify.model.from_record import predicting_model
 from identify.model.model_side import ModelSide, model_side
 from identify.record.checks import TooFewFramesError
+from identify.record.conditions import DRIFT
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RECORDS, RunFiles
 from identify.record.stored_common_errors import CHANGES, kind_of, read_common_errors
@@ -47,6 +50,7 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     problem = output_error_problem(records, side, scenario.identification)
     estimate = parameter_vector(side.robot, identification, "estimate")
     found = diagnosis_from(problem, estimate, own, identification["nuisance_estimates"])
+    found = replace(found, not_needed=not_needed(result, found))
     save_result(files.folder.result, with_diagnosis(result, found))
     return found
 
@@ -68,6 +72,23 @@ def _identified(
     robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run_folder.path).robot
     side = model_side(robot, scenario).with_drive(settled_drive(result["identification"]))
     return files, result, scenario, side
+
+
+def not_needed(result: dict[str, Any], found: Diagnosis) -> str:
+    """Return why the result of a run needs no cause in the robot, or an empty string."""
+    if warning := (result.get(DRIFT) or {}).get("warning"):
+        return f"{warning}: this makes residuals of its own, and no cause in the robot is needed"
+    identification = result["identification"]
+    numbers = [identification[key] for key in MISFIT]
+    chance = identification["whiteness"]["p_value"]
+    if None in (*numbers, chance):
+        return ""
+    if needs_cause(Misfit(*numbers), found.misfit, chance < SUSPICIOUS):
+        return ""
+    return (
+        "noise explains the record, and no cause is needed for an excess below "
+        f"{LITTLE:.0%} of it: {found.misfit}"
+    )
 
 
 def with_diagnosis(result: dict[str, Any], found: Diagnosis) -> dict[str, Any]:

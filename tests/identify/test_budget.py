@@ -15,6 +15,7 @@ from identify.model.model_side import model_side
 from identify.progress import SilentProgress
 from identify.record.provenance import RunFiles, store_robot
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
+from identify.reporting.figures.estimates import budget_figure
 from identify.reporting.run_result import parameter_vector
 from identify.stages.explain import error_budget, pose_budget
 from identify.validation.pose_prediction import predicted_runs
@@ -176,3 +177,12 @@ def test_a_run_of_an_older_version_and_parts_that_do_not_sum_up_are_refused(
         read_sources(identified.covariance, covariance + np.diag(1e-6 * np.diag(covariance)))
     assert command("budget", tmp_path / "none") != 0
     assert "no run folder" in one_line(capfd.readouterr().err)
+
+
+def test_the_picture_has_the_identified_parameters_alone_most_of_the_main_source_first():
+    noise = np.array([1.0, 2.0, 9.0, 5.0])
+    names = ("pose.x", "a", "b", "hidden")
+    found = budget_of(names, ["um", *["kg"] * 3], {"noise": noise, "guess": np.ones(4)}, noise + 1)
+    figure = budget_figure(found, {"a": True, "b": True, "hidden": False})
+    rows = [label.get_text().split(":")[0] for label in figure.axes[0].get_yticklabels()]
+    assert rows == ["pose.x", "b", "a"]

@@ -14,14 +14,16 @@ from dynamics.geometry import RobotGeometry
 from identify.diagnosis.candidate_fits import shown_sizes
 from identify.diagnosis.cause import Cause, InList, in_each_run
 from identify.diagnosis.diagnose import diagnosis_from, own_cause
-from identify.diagnosis.diagnosis import Size, remedies_of
+from identify.diagnosis.diagnosis import Diagnosis, Finding, Size, remedies_of
 from identify.diagnosis.fit import SETTLED, Point
 from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.score import OrthogonalComplement, score
 from identify.diagnosis.selection import CHANCE
 from identify.errors import EstimationError
+from identify.estimation.explanation import Misfit
 from identify.files.run_folder import load_result
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
+from identify.stages.explain import not_needed, with_diagnosis
 from tests.identify import synthetic
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import (
@@ -438,6 +440,30 @@ def test_identify_stores_the_diagnosis_and_warns_and_the_command_repeats_it(run_
     said = capsys.readouterr().out
     assert "zero of joint 2" in said
     assert "cmmsim geometry finds all zeros" in said
+
+
+def test_residuals_that_are_noise_and_a_warning_of_the_cameras_need_no_cause_in_the_robot():
+    """An excess of 5 % of the noise, as the errors of taught frames make it, and one of 20 %."""
+    accused = Finding("zero of joint 4", "zeros", (), 0.4, 36.0, 1, 1e-6, (), ("--set a=1",))
+    found = Diagnosis((accused,), (), Misfit(1.05, 1.0, 0.01), Misfit(1.0, 1.0, 0.01), 0.0)
+    result = {
+        "drift_watch": None,
+        "identification": {
+            "noise_ratio": 1.02,
+            "expected_noise_ratio": 1.0,
+            "noise_ratio_std": 0.02,
+            "whiteness": {"p_value": 0.3},
+            "warnings": [],
+        },
+    }
+    calm = replace(found, not_needed=not_needed(result, found))
+    assert str(calm).startswith("noise explains the record, and no cause is needed")
+    assert "; not needed: zero of joint 4" in str(calm)
+    assert with_diagnosis(result, calm)["identification"]["warnings"] == []
+    missed = replace(found, misfit=Misfit(1.2, 1.0, 0.01))
+    assert not_needed(result, missed) == ""
+    warned = result | {"drift_watch": {"warning": "stickers are not where they should be"}}
+    assert not_needed(warned, missed).startswith("stickers are not where they should be: this")
 
 
 def test_a_folder_without_a_result_is_not_diagnosed(tmp_path, capsys):

@@ -29,7 +29,7 @@ from identify.reporting.goals import check_goals, within_tolerance
 from identify.reporting.number_format import interval, number, rounded, typographic, with_deviation
 from identify.reporting.pictures import pictures
 from identify.reporting.report import render, write_report
-from identify.reporting.report_sections import SECTIONS
+from identify.reporting.report_sections import SECTIONS, frames_due
 from identify.reporting.run_data import read_run
 from identify.reporting.verdict import cameras_consistent, key_numbers, verdict
 from identify.scenario import load_scenario
@@ -138,6 +138,30 @@ def test_words_of_the_figures_of_a_run_stand_within_their_files(result):
     for name, draw in figures.items():
         image = imread(io.BytesIO(figure_bytes(style.drawn(draw), ".png")))
         assert not edges_with_ink(image), name
+
+
+def test_rows_that_a_log_lacks_count_as_frames_without_a_pose():
+    """600 frames of 60 Hz, of which the log has 593, and whose clock is slightly slow."""
+    time = np.delete(np.arange(600) / 60.001, [50, 51, 180, 333, 334, 335, 480])
+    assert frames_due(time, 60.0) == 600
+    assert frames_due(np.arange(600) / 66.0, 60.0) == 600
+
+
+@pytest.mark.slow
+def test_words_stand_within_their_file_where_a_layout_changes_the_ticks(result):
+    """Ticks of 10 become ticks of 12.5 in the second layout, and move the words to the left."""
+    errors = zip(([11.5, 10.9, 11.1], [12.0, 14.2, 11.7]), result["validation"], strict=False)
+    runs = [
+        run
+        | {
+            "true": run["true"] | {"orientation_rms_urad": [3.6, 6.4, 3.0]},
+            "measured": run["measured"] | {"orientation_rms_urad": measured},
+        }
+        for measured, run in errors
+    ]
+    figure = style.drawn(lambda: fit.validation_figure(result | {"validation": runs}))
+    for axes in figure.axes:
+        assert axes.yaxis.label.get_window_extent().x0 >= 0
 
 
 SIZES = """

@@ -209,15 +209,24 @@ def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> Non
 HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
 
 
-def budget_figure(budget: Budget) -> Figure:
+def budget_figure(budget: Budget, identified: Mapping[str, bool]) -> Figure:
     """Draw the share of each source in the variance of poses, predictions and parameters.
 
-    Quantities are rows. The number beside a row is the combined standard uncertainty. Shares that
-    are negative, by correlations, are left out.
+    Quantities are rows: poses and predictions, and the parameters that are ``identified``, those
+    with the largest share of the main source first. The number beside a row is the combined
+    standard uncertainty. Shares that are negative, by correlations, are left out.
     """
-    shown = [k for k in range(len(budget.quantities)) if budget.std[k] > 0]
+    names = budget.quantities
+    shown = [k for k, name in enumerate(names) if budget.std[k] > 0 and identified.get(name, True)]
     shares = 100 * np.maximum(budget.shares[shown], 0)
     order = np.argsort(-shares.mean(axis=0), kind="stable")
+    # Poses and predictions keep their order.
+    main = [
+        shares[row, order[0]] if names[k] in identified else np.inf for row, k in enumerate(shown)
+    ]
+    rank = np.argsort(-np.array(main), kind="stable")
+    shown = [shown[row] for row in rank]
+    shares = shares[rank]
     colours = list(PALETTE.values())[4:]
     figure = Figure(figsize=(WIDTH, 1.1 + 0.15 * len(shown)), layout="constrained")
     axes = figure.subplots()

@@ -85,8 +85,8 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
         figure = draw()
         # Layout engines move the axes at every drawing, and files would differ.
         if figure.get_layout_engine():
-            # The first layout can change the ticks, and the second makes room for their labels.
-            for _ in range(2):
+            # A layout can change the ticks, and the next one makes room for their labels.
+            for _ in range(3):
                 figure.draw_without_rendering()
             # The engine "none" would still have every file drawn twice.
             figure.set_layout_engine(None)
