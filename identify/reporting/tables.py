@@ -369,6 +369,8 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note
     )
+    if said := common_scale_sentence(result.get("identification") or {}):
+        typer.echo(said)
     for goal in goals:
         if goal.passed and goal.widened:
             typer.echo(f"{goal.name}: {goal.widened}")
