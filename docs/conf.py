@@ -9,8 +9,6 @@ DOCS = Path(__file__).parent
 sys.path[:0] = [str(DOCS / "_ext"), str(DOCS.parent)]
 os.environ.setdefault("MPLBACKEND", "agg")
 
-import kept_figures  # noqa: E402  (found in _ext)
-
 project = "cmmsim"
 author = "the authors of cmmsim"
 copyright = "the authors of cmmsim; MIT licence"
@@ -23,7 +21,7 @@ extensions = [
     "sphinx.ext.napoleon",  # Parameters, Returns and Raises as NumPy writes them
     "sphinx_gallery.gen_gallery",
     "mathml",  # formulas without a script from outside
-    # commands, file formats, figures and the API, from the code and from .readme/*.json
+    # commands, file formats and the API, from the code
     "generated_pages",
 ]
 exclude_patterns = [
@@ -41,11 +39,9 @@ myst_enable_extensions = [
     "amsmath",
     "deflist",
     "colon_fence",
-    "substitution",
     "attrs_inline",
 ]
 myst_heading_anchors = 4
-myst_substitutions = kept_figures.substitutions(DOCS.parent / ".readme")
 smartquotes = False  # two dashes begin an option
 default_role = "literal"  # single backquotes in docstrings are code
 napoleon_use_ivar = True  # Attributes of a docstring may also be members, which autodoc documents

@@ -2,6 +2,7 @@
 and files do.
 """
 
+import importlib
 import json
 import re
 import shlex
@@ -24,6 +25,13 @@ TEXTS = {
     path: path.read_text(encoding="utf-8")
     for path in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md")
 }
+
+
+@pytest.fixture
+def page_blocks(monkeypatch):
+    """The module that writes the blocks of pages."""
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_ext")
+    return importlib.import_module("page_blocks")
 
 
 def commands(text):
@@ -109,17 +117,15 @@ def test_each_equation_of_the_paper_names_code_and_a_test_and_each_exhibit_a_com
 
 
 def test_every_link_and_every_file_that_is_named_exists():
-    """Links into what the build writes are checked by the build itself."""
+    """What a page includes from the build is checked by the build itself."""
     wrong = []
     for path, text in TEXTS.items():
-        targets = re.findall(r"\]\(([^)#\s]+)", text) + re.findall(
-            r"^```\{(?:literal)?include\} (\S+)", text, re.MULTILINE
-        )
+        targets = re.findall(r"\]\(([^)#\s]+)", text)
+        targets += re.findall(r"^```\{include\} (\S+)", text, re.MULTILINE)
         wrong += [
             f"{path.relative_to(ROOT)}: {target}"
             for target in targets
-            if not target.startswith("http")
-            and "generated/" not in target
+            if not target.startswith(("http", "../generated/"))
             and not (path.parent / target).exists()
         ]
         named = re.findall(
@@ -131,8 +137,44 @@ def test_every_link_and_every_file_that_is_named_exists():
     assert [one for one in wrong if not one.endswith("tests/FILE.py")] == []
 
 
+def test_a_page_can_be_read_where_nothing_builds_it(page_blocks):
+    """Only lists of the reference, which each name a command, come from the build. All else that a
+    page shows of kept figures and files stands in it: `python docs/_ext/page_blocks.py` renews it.
+    """
+    raw = r"\{\{|^:::|\{literalinclude\}|generated/(?!tour/index\n|(?:\w+)\.md\n```)"
+    wrong = []
+    for path in PAGES:
+        text = TEXTS[path]
+        wrong += [f"{path}: {found[0]}" for found in re.finditer(raw, text, re.MULTILINE)]
+        wrong += [f"{path}: a link into the build" for _ in re.finditer(r"\]\(\S*generated/", text)]
+        if "../generated/" in text and path.parent.name != "reference":
+            wrong.append(f"{path}: what the build writes")
+        if page_blocks.renewed(path, text) != text:
+            wrong.append(f"{path}: a block that differs from what it shows")
+    for path, content in page_blocks.answer_pictures().items():
+        if page_blocks.drawn_from(path) != page_blocks.digest(content):
+            wrong.append(f"{path}: a picture of other figures")
+    assert wrong == []
+
+
+def test_an_old_block_and_an_old_picture_are_found(page_blocks, tmp_path):
+    """The oracle is a page that was changed by hand."""
+    path = ROOT / "docs" / "explanation" / "results.md"
+    text = TEXTS[path]
+    figure = re.search(r"<!-- begin robots -->.*?\| `rss6` \| ([\d.]+)", text, re.DOTALL)
+    old = text[: figure.start(1)] + "9.99" + text[figure.end(1) :]
+    assert page_blocks.renewed(path, old) == text
+    code = tmp_path / "mine.py"
+    code.write_text("new = 1\n", encoding="utf-8")
+    page = "<!-- begin mine.py -->\nold\n<!-- end -->\n"
+    assert "```python\nnew = 1\n```" in page_blocks.renewed(tmp_path / "page.md", page)
+    assert page_blocks.drawn_from(tmp_path / "none.png") is None
+
+
 def test_every_page_can_be_reached():
-    """From the first one, by the tables of contents."""
+    """From the first one, by the tables of contents, whose names are hidden and have links beside
+    them.
+    """
     reached, waiting = set(), [ROOT / "docs" / "index.md"]
     while waiting:
         path = waiting.pop()
@@ -149,6 +191,8 @@ def test_every_page_can_be_reached():
                 if not name.startswith("generated/")
             ]
             waiting += [one for one in found if one not in reached]
+            links = re.findall(r"\]\(([\w/.]+)\.md\)", TEXTS[path])
+            assert {name for name in names if not name.startswith("generated/")} <= set(links), path
     assert sorted(set(PAGES) - reached) == []
 
 

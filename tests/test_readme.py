@@ -1,8 +1,7 @@
 """README, CONTRIBUTING and the samples of the documentation are true: figures are those of kept
 runs, names exist.
 
-The documentation takes its figures from the same files when it is built, so they are not checked
-again. The commands that it names `tests/test_docs.py` parses.
+The tables of the documentation and the commands that it names are in `tests/test_docs.py`.
 """
 
 import json
@@ -99,7 +98,9 @@ def test_the_headline_figures_are_those_of_kept_runs():
     predicted = [point["figures"]["poses_covered_percent"]["mean"] for point in points]
     assert len(predicted) == 8
     in_a_run = result["sensor"]["stereo_frames_per_second"]
-    alone = [frames[f"{renderer}_frames_a_second"] for renderer in ("pyrender", "analytic")]
+    alone = {
+        renderer: frames[f"{renderer}_frames_a_second"] for renderer in ("pyrender", "analytic")
+    }
     together = frames["images_together_frames_a_second"]
     paper, quick_one = load_scenario(result["scenario"]), load_scenario("quick")
     assert {paper.renderer, quick_one.renderer} == {"auto"}
@@ -122,8 +123,12 @@ def test_the_headline_figures_are_those_of_kept_runs():
         f"`{DEFAULT}`, 1 record | `sh .ci/thorough`, {robots_on} |",
         f"| {in_a_run:.0f} | `{paper.robot}`, images by the default renderer `{DEFAULT}`, in the "
         f"loop | `cmmsim run`, {result['date']} |",
-        f"| {alone[0]:.0f}, {alone[1]:.0f}, {together:.0f} | images by `pyrender` and by `analytic`"
-        f" in one process; by `{GOALS['images together'][0]}` many at once on "
+        *(
+            f"| {rate:.0f} | images by `{renderer}`, one after the other in one process | "
+            f"`sh .ci/thorough`, {frames_on} |"
+            for renderer, rate in alone.items()
+        ),
+        f"| {together:.0f} | images by `{GOALS['images together'][0]}`, many at once on "
         f"{kept('speeds')['cores']} cores | `sh .ci/thorough`, {frames_on} |",
         f"| {min(faster):.1f} to {max(faster):.1f} | each of {len(faster)} robots, Pinocchio {pin},"
         f" no images | `sh .ci/thorough`, {faster_on} |",
@@ -135,6 +140,39 @@ def test_the_headline_figures_are_those_of_kept_runs():
     missing = [row for row in [*rows, undated] if row not in README]
     assert not missing, "the README wants these ends of rows:\n" + "\n".join(missing)
     assert len(re.findall(r"\d{4}-\d\d-\d\d", README)) == len(rows), "a figure that nobody checks"
+
+
+def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
+    noise = kept("result")["identification"]
+    thorough = kept("thorough")
+    proved, proved_on = figures(thorough, "test_interval_coverage.py")
+    covered = f"{100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} %"
+    entries = thorough["tests"].values()
+    passed = sum(entry["outcome"] == "passed" for entry in entries)
+    latest = max(entry["date"] for entry in entries)
+    reached = min(entry["figures"].get("starts_reaching_the_optimum", 25) for entry in entries)
+    faster, _ = figures_of_each(kept("speeds"), "forward_dynamics_over_lcaba")
+    wanted = {
+        "explanation/results": [
+            f"variance is {noise['noise_ratio']:.3f} times that which the sensor states",
+            f"the identified model give {noise['expected_noise_ratio']:.3f} on average",
+            f"with images, {covered} of the 95 % intervals contained the truth",
+            f"from {reached} of 25 initial guesses",
+            f"on {latest}, {passed} of {len(entries)} proofs passed",
+            f"computed {min(faster):.0f} to {max(faster):.0f} times as fast",
+        ],
+        "explanation/intervals": [
+            f"with images, {covered} of the 95 % intervals contained the truth ({proved_on})",
+            f"{reached} of 25 searches end in the same optimum",
+        ],
+    }
+    missing = [
+        f"{name}: {sentence}"
+        for name, sentences in wanted.items()
+        for sentence in sentences
+        if sentence not in " ".join(page(name).split())
+    ]
+    assert not missing, "the documentation wants these words:\n" + "\n".join(missing)
 
 
 def test_kept_speeds_are_within_their_limits_and_no_search_ended_elsewhere():

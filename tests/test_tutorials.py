@@ -45,14 +45,16 @@ class Step(NamedTuple):
 
 
 def steps_of(page):
-    """The steps of a page in their order. Files of which only a part is shown are not saved."""
+    """The steps of a page in their order."""
     found = [Step("sh", AFTER[page])] if page in AFTER else []
     text = (TUTORIALS / f"{page}.md").read_text(encoding="utf-8")
-    blocks = r"(?:as `([\w.]+)`:\n\n)?^```(\S+)(?: (\S+))?\n(.*?)^```$"
-    for saved_as, language, file, body in re.findall(blocks, text, re.MULTILINE | re.DOTALL):
+    blocks = (
+        r"(?:as `([\w.]+)`:\n\n|<!-- begin (\S+) -->\n\n)?^```(\S+)\n(.*?)^```$"  # with its name
+    )
+    for saved_as, file, language, body in re.findall(blocks, text, re.MULTILINE | re.DOTALL):
         if language == "toml" and saved_as:
             found.append(Step("sh", f"cat >{saved_as} <<'END'\n{body}END"))
-        if language == "{literalinclude}" and ":start-at:" not in body:
+        elif file:
             found.append(Step("file", file))
         elif language == "sh":
             lines = [line for line in body.splitlines() if line not in SETTING_UP]

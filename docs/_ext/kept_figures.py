@@ -1,7 +1,5 @@
-"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, and
-none is out of date.
-
-Pages take single figures as substitutions; the tables of the page of results are written whole.
+"""Tables of the figures of kept runs, which are in .readme/*.json. `page_blocks.py` puts them into
+the pages.
 """
 
 import json
@@ -46,32 +44,6 @@ def figures_of(content: dict[str, Any], part: str = "") -> dict[str, float]:
 def date_of(content: dict[str, Any], part: str = "") -> str:
     """Date of the last of the tests whose name holds ``part``."""
     return max(entry["date"] for test, entry in content["tests"].items() if part in test)
-
-
-def substitutions(folder: Path) -> dict[str, str]:
-    """Single figures as text, by the name that pages use."""
-    result, speeds, thorough = (kept(folder, name) for name in ("result", "speeds", "thorough"))
-    proved = figures_of(thorough)
-    faster = [
-        entry["figures"]["forward_dynamics_over_lcaba"]
-        for entry in speeds["tests"].values()
-        if "forward_dynamics_over_lcaba" in entry["figures"]
-    ]
-    reached = [
-        entry["figures"].get("starts_reaching_the_optimum", 25)
-        for entry in thorough["tests"].values()
-    ]
-    outcomes = [entry["outcome"] for entry in thorough["tests"].values()]
-    identification = result["identification"]
-    return {
-        "covered": f"{100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} %",
-        "starts_reached": f"{min(reached)} of 25",
-        "thorough_date": date_of(thorough),
-        "thorough_passed": f"{outcomes.count('passed')} of {len(outcomes)}",
-        "faster_than_recursion": f"{min(faster):.0f} to {max(faster):.0f} times",
-        "noise_found": f"{identification['noise_ratio']:.3f}",
-        "noise_expected": f"{identification['expected_noise_ratio']:.3f}",
-    }
 
 
 def goals(folder: Path) -> str:

@@ -13,4 +13,6 @@ for name in ("ctrack780", "my_sensor.toml"):
     poses = sensor.home + np.hstack([path, tilt])
     errors = np.array([sensor.measure(pose).pose - pose for pose in poses])
     rms = 1e6 * np.sqrt(np.mean(errors**2, axis=0))
-    print(f"{sensor.name:10s} position {rms[:3].max():6.2f} um, orientation {rms[3:].max():6.2f} urad")
+    print(
+        f"{sensor.name:10s} position {rms[:3].max():6.2f} um, orientation {rms[3:].max():6.2f} urad"
+    )
