@@ -193,7 +193,7 @@ def read_description(path: Path, log: Path) -> Description:
     Raises RecordError or ScenarioError if there is no such file, it is not TOML, or its content is
     not valid.
     """
-    if not log.exists():
+    if log.suffix.lower() in TABLES and not log.exists():
         raise RecordError(f"there is no record {log}")
     if not is_file(path):
         raise RecordError(

@@ -103,7 +103,8 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
     scenario = quick(**{"identification.method": method})
     record, _, drawn = experiment(1, scenario)
     result = identify(record, rss6(), scenario)
-    assert not result.warnings
+    # So short a record shows the common scale badly, and that alone is said.
+    assert all("the scale anchor" in one for one in result.warnings)
     assert result.identifiable.sum() >= 20
     z = ((result.estimate - truth()) / result.std)[result.identifiable]
     assert np.sqrt(np.mean(z**2)) < 1.5

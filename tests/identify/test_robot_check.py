@@ -24,7 +24,7 @@ from tests.identify.commands import command, one_line
 def _found(path):
     content = json.loads(path.read_text(encoding="utf-8"))
     assert all(
-        set(entry) == {"check", "ok", "value", "limit", "unit", "leg", "text"}
+        set(entry) == {"check", "ok", "value", "limit", "unit", "leg", "text", "relation"}
         for entry in content["findings"]
     )
     assert content["ok"] == all(entry["ok"] for entry in content["findings"])
