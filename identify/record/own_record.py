@@ -193,9 +193,10 @@ def read_description(path: Path, log: Path) -> Description:
     Raises RecordError or ScenarioError if there is no such file, it is not TOML, or its content is
     not valid.
     """
-    if log.suffix.lower() in TABLES and not log.exists():
-        raise RecordError(f"there is no record {log}")
     if not is_file(path):
+        # The description may name other files in place of the table beside it.
+        if log.suffix.lower() in TABLES and not log.exists():
+            raise RecordError(f"there is no record {log}")
         raise RecordError(
             f"there is no file {path}, which must describe the record {log.name}; cmmsim new "
             "record writes both"

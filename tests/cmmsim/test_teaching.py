@@ -90,7 +90,7 @@ def test_teaching_is_repeatable_and_unbiased(seed, frames, moving_path):
             r"rig.target was \[0.3, 0.0, 0.18\], is \[0.3, 0.0, 0.185\]",
         ),
         ({"rig.distance": 1.5}, r"rig.position was \[1.44, 0.0, 1.28\], is \[1.37"),
-        ({"rig.left": LEFT}, "rig.left.centre_px was nothing"),
+        ({"rig.left": LEFT}, "rig.left.centre_px was not stated"),
         ({"stickers.placement_seed": 781}, "stickers.placement_seed was 780, is 781"),
         ({"base.planes.A.point": [0.0, 0.0, 0.181]}, "base.planes.A.point"),
         ({"stickers.per_plane": 4}, "platform.planes.A.stickers .* platform.planes.C.stickers"),

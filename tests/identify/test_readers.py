@@ -604,3 +604,8 @@ def test_a_covariance_of_a_log_follows_its_poses_into_the_frame_of_the_robot(tmp
         RecordError, match=r"take\.csv line 5: a covariance of a measured pose is em"
     ):
         telemetry_of(tmp_path / "take.csv")
+
+
+def test_a_table_that_is_missing_is_named_and_not_its_description(tmp_path):
+    with pytest.raises(RecordError, match=r"there is no record .*gone\.csv"):
+        telemetry_of(tmp_path / "gone.csv")
