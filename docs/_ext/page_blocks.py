@@ -148,6 +148,7 @@ TABLES: dict[str, Callable[[Path], str]] = {
         "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
     ),
     "answer_calibration_full": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
+    "answer_calibration_off_grid": kept_figures.answer("calibration_off_grid", {}, UNIFORM | POSES),
     "answer_full_bodies": kept_figures.answer("full_bodies", {}, UNCENTRED),
     **{f"answer_{name}": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws": kept_figures.answers(
