@@ -22,6 +22,9 @@ SHORTEST_S = 0.5
 LEAST_GROWTH = 1.05
 """Smallest ratio of the lengths of consecutive windows."""
 
+MOST_WINDOWS = 30
+"""Largest number of windows that are searched."""
+
 MISSED = 2.0
 """Mean squared residual above which the model misses a window."""
 
@@ -38,7 +41,7 @@ def over_growing_window(
     reached_s = SHORTEST_S / 2.0
     growth = 2.0
     every_good = [run.ok for run in problem.runs]
-    while True:
+    for _ in range(MOST_WINDOWS):
         window_s = growth * reached_s
         runs = tuple(run.beginning(window_s) for run in known.runs)
         whole = all(map(np.array_equal, [run.ok for run in runs], every_good))
@@ -49,9 +52,10 @@ def over_growing_window(
         known = known.having([run.errors_had for run in part.runs])
         parameters = found
         if whole:
-            return known.with_common_errors(parameters), parameters
+            break
         reached_s = window_s
         growth = min(growth**2, 2.0)
+    return known.with_common_errors(parameters), parameters
 
 
 def _searched(part: OutputErrorProblem, start: Array) -> tuple[OutputErrorProblem, Array]:

@@ -122,8 +122,11 @@ def search_with_common_errors(
     solution = search(problem, start, advance)
     if bent and Search(problem, solution).missed:
         # Far from the right errors, the parameters can have gone to a wrong minimum.
-        other, start = over_growing_window(first, begin) if in_motion else _warm_again(problem)
-        again = search(other, start, lambda n=1: None)
+        try:
+            other, start = over_growing_window(first, begin) if in_motion else _warm_again(problem)
+            again = search(other, start, lambda n=1: None)
+        except DynamicsError:
+            other, again = problem, solution  # unstable from there, so the first result stays
         if again.costs[-1] < solution.costs[-1]:
             problem = other
             solution = again

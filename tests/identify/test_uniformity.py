@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 from scipy.stats import kstest, truncnorm
 
-from dynamics import load_robot
+from dynamics import DynamicsError, load_robot
 from identify.errors import StudyError
+from identify.estimation import output_error_search
 from identify.estimation.bounds import parameter_bounds
 from identify.estimation.intervals import bounded_estimate
 from identify.estimation.prior import starting_guess
@@ -100,11 +101,8 @@ def test_a_record_without_its_beginning_is_what_the_reader_of_such_a_log_makes()
         log_of_moving_robot(record, 4.0, rss6())
 
 
-@pytest.mark.thorough
-def test_a_lightly_damped_truth_is_found_in_a_record_that_begins_in_motion():
-    """Its joints oscillate at 13 rad/s with a damping ratio of 0.13. A search over the whole record
-    alone ended at 44,000 times the noise.
-    """
+def lightly_damped_row():
+    """Row whose joints oscillate at 13 rad/s with a damping ratio of 0.13, from 1.5 s on."""
     scenario = quick(
         **{
             "renderer": "statistical",
@@ -113,8 +111,24 @@ def test_a_lightly_damped_truth_is_found_in_a_record_that_begins_in_motion():
             "identification.start_std": 0.3,
         }
     )
-    row = compute(scenario, np.random.SeedSequence([7, 8]), CalibrationOptions(log_from_s=1.5))
-    assert row["noise_ratio"] < 1.1
+    return compute(scenario, np.random.SeedSequence([7, 8]), CalibrationOptions(log_from_s=1.5))
+
+
+@pytest.mark.thorough
+def test_a_lightly_damped_truth_is_found_in_a_record_that_begins_in_motion():
+    """A search over the whole record alone ended at 44,000 times the noise."""
+    assert lightly_damped_row()["noise_ratio"] < 1.1
+
+
+@pytest.mark.thorough
+def test_the_first_result_stays_if_a_growing_window_makes_the_model_unstable(monkeypatch):
+    def unstable(problem, start):
+        raise DynamicsError("unstable")
+
+    monkeypatch.setattr(output_error_search, "over_growing_window", unstable)
+    row = lightly_damped_row()
+    assert row["noise_ratio"] > 1.2
+    assert row["intervals"] == 0
 
 
 def probabilities(**figures):
