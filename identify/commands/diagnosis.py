@@ -63,7 +63,7 @@ def diagnose(
       cmmsim diagnose mine --add my_module:backlash
     """
     with interruptible_imports():
-        from identify.diagnosis.diagnose import own_cause
+        from identify.diagnosis.catalogue import own_cause
         from identify.stages.explain import diagnose as diagnose_run
 
     RunFolder(run).require("scenario.toml", "experiment.nc", "result.json")

@@ -1,13 +1,7 @@
-"""Diagnosis of records: the causes of the misfit that remains after an identification.
-
-A user's own cause, ``module:function``, is a function (run, size) that returns the `LoopModel` of a
-run with the cause, of the one without. The function may carry a `unit` and, in that unit, a `step`
-for differences.
-"""
+"""Diagnosis of records: the causes of the misfit that remains after an identification."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,16 +9,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from dynamics import DynamicsError, Robot
+from dynamics import Robot
 from identify.arrays import Array
 from identify.diagnosis.asking import ask_first
-from identify.diagnosis.body_causes import body_causes
-from identify.diagnosis.cause import Cause, in_each_run
-from identify.diagnosis.command_causes import command_causes
+from identify.diagnosis.catalogue import catalogue, check_columns
+from identify.diagnosis.cause import Cause
 from identify.diagnosis.diagnosis import Diagnosis, diagnosis_of
-from identify.diagnosis.geometry_causes import geometry_causes
-from identify.diagnosis.loop_causes import loop_causes
-from identify.diagnosis.measurement_causes import measurement_causes
 from identify.diagnosis.ranking import Rows
 from identify.diagnosis.selection import select
 from identify.errors import EstimationError
@@ -39,8 +29,6 @@ from identify.estimation.identification import (
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
-from identify.model.loop_model import LoopModel
-from identify.own_parts import PluginFunction, own_function
 from identify.progress import SilentProgress
 from identify.runtime import one_thread
 from identify.scenario import Scenario
@@ -162,69 +150,3 @@ def _with_errors(problem: OutputErrorProblem, errors: Mapping[str, float]) -> Ou
         return problem
     drawn = np.linalg.pinv(first.common.whole_factor) @ np.array([*errors.values()])
     return replace(problem, runs=(first.having(drawn[: len(first.errors_had)]), *others))
-
-
-def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
-    """Return all causes that are possible for a problem with the optimum `parameters` (p,).
-
-    Companions of other causes come after all others.
-    """
-    runs = [run.simulate(parameters) for run in problem.runs]
-    causes = (
-        *command_causes(problem),
-        *geometry_causes(problem),
-        *loop_causes(problem, parameters, runs),
-        *body_causes(problem, parameters, runs),
-        *measurement_causes(problem, runs),
-    )
-    return (*causes, *(one.companion for one in causes if one.companion is not None))
-
-
-STEP = 1e-4  # step of a cause that carries none
-
-
-def own_cause(name: str) -> Cause:
-    """Return a user's own cause. Raises EstimationError if it cannot be had."""
-    function = own_function(name, "cause", EstimationError)
-    step = getattr(function, "step", STEP)
-    if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < math.inf:
-        raise EstimationError(f"cause {name!r} has step = {step!r}, must be a number > 0")
-    known = (EstimationError, DynamicsError)
-    told = PluginFunction(f"cause {name!r}", function, EstimationError, known, _check_run)
-    return Cause(
-        name=name,
-        unit=str(getattr(function, "unit", "1")),
-        group=name,
-        change=in_each_run(told),
-        step=float(step),
-        remedy=lambda size: f"see {name}",
-    )
-
-
-def _check_run(part: str, found: object, run: LoopModel, size: float) -> None:
-    """Raise EstimationError unless a user's own cause has returned a run with the same frames."""
-    if not isinstance(found, LoopModel):
-        raise EstimationError(f"{part} must return a LoopModel, returned {type(found).__name__}")
-    for name in ("measured", "ok", "logged"):
-        shape = np.shape(getattr(run, name))
-        if np.shape(getattr(found, name)) != shape:
-            raise EstimationError(
-                f"{part} must keep the shape {shape} of {name}, returned "
-                f"{np.shape(getattr(found, name))}"
-            )
-
-
-def check_columns(causes: tuple[Cause, ...], columns: Array) -> None:
-    """Raise EstimationError for a user's own cause that has no column.
-
-    columns (m, k): derivatives of the residuals with respect to the sizes of the causes.
-    """
-    for one, column in zip(causes, columns.T, strict=True):
-        if not np.isfinite(column).all():
-            raise EstimationError(
-                f"cause {one.name!r} gives a model that does not run at sizes of ± {one.step:g}"
-            )
-        if not column.any():
-            raise EstimationError(
-                f"cause {one.name!r} changes no pose of the model at sizes of ± {one.step:g}"
-            )

@@ -51,7 +51,8 @@ def deviations(estimate: Array, covariance: Array, gain: int) -> tuple[Array, Ar
     relative = covariance / np.outer(size, size)
     own = np.diag(relative)
     ratio = np.maximum(own + own[gain] - 2 * relative[gain], 0.0)
-    return tuple(np.nan_to_num(np.sqrt(one), nan=np.inf) for one in (own, ratio))  # type: ignore[return-value]
+    stds = np.nan_to_num(np.sqrt([own, ratio]), nan=np.inf)
+    return stds[0], stds[1]
 
 
 def found_errors(identification: Mapping[str, Any]) -> tuple[float, float] | None:

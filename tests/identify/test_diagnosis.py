@@ -12,8 +12,9 @@ from scipy.stats import binom
 import identify
 from dynamics.geometry import RobotGeometry
 from identify.diagnosis.candidate_fits import shown_sizes
+from identify.diagnosis.catalogue import own_cause
 from identify.diagnosis.cause import Cause, InList, in_each_run
-from identify.diagnosis.diagnose import diagnosis_from, own_cause
+from identify.diagnosis.diagnose import diagnosis_from
 from identify.diagnosis.diagnosis import Diagnosis, Finding, Size, remedies_of
 from identify.diagnosis.fit import SETTLED, Point
 from identify.diagnosis.linearisation import Linearisation
