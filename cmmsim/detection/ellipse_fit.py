@@ -5,6 +5,7 @@ pixel that the ellipse covers, blurred by the point spread and, if known, by the
 exposure. Gauss-Newton solves for the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast,
 ground]. The weight of a grey value is the inverse of the camera's noise variance at the fitted
 value. The inverse of the normal matrix is the covariance of the parameters.
+``ellipse_fit_kernels`` computes the fit.
 """
 
 import threading
@@ -22,7 +23,7 @@ from cmmsim.geometry.pose import Array, frozen
 from cmmsim.radiometry.noise import CameraNoise
 
 if TYPE_CHECKING:
-    from cmmsim.detection.fit_kernels import FitSettings
+    from cmmsim.detection.ellipse_fit_kernels import FitSettings
 
 # Pixels beyond this many sticker radii can lie outside the dark ring and are not fitted.
 RING_REACH = 2.4
@@ -93,7 +94,7 @@ def fit_ellipses(
     fitted too. Raises CmmError for a point spread that is too narrow to be modelled.
     """
     require_psf(psf_px)
-    from cmmsim.detection.fit_kernels import LIT_UNKNOWNS, UNKNOWNS, fit_windows
+    from cmmsim.detection.ellipse_fit_kernels import LIT_UNKNOWNS, UNKNOWNS, fit_windows
 
     n = len(windows)
     inner = np.empty((n, 2))
@@ -131,7 +132,7 @@ def fit_ellipses(
 @lru_cache(maxsize=16)
 def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
     """Return the settings of the fit for windows with a noise and a point spread."""
-    from cmmsim.detection.fit_kernels import FitSettings
+    from cmmsim.detection.ellipse_fit_kernels import FitSettings
 
     scale = noise.white_level / 255.0
     greys = scale * _GREYS

@@ -17,7 +17,7 @@ from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.matrix_kernels import solve_factored
 
 if TYPE_CHECKING:
-    from cmmsim.detection.fit_kernels import FitSettings
+    from cmmsim.detection.ellipse_fit_kernels import FitSettings
 
 EVEN_UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 LIT_UNKNOWNS = 9  # the same, then g_x and g_y

@@ -8,7 +8,7 @@ image coordinates (x, y) = (X/Z, Y/Z). With s = x² + y²:
 
 The model is valid up to the radius at which the radial part stops growing. Beyond this radius the
 image folds back onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric
-Engineering 37 (1971).
+Engineering 37 (1971). ``lens_distortion_kernels`` computes the distortion and its inverse.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Distortion:
     def _distorted(self, points: Array) -> tuple[Array, Array]:
         """Return the distorted points (..., 2), and their derivatives (..., 2, 2)."""
         # Imported late, because importing numba takes time.
-        from cmmsim.geometry.camera_kernels import distort_points
+        from cmmsim.geometry.lens_distortion_kernels import distort_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
         distorted = np.empty_like(flat)
@@ -94,7 +94,7 @@ class Distortion:
         is then finite but meaningless.
         """
         # Imported late, because importing numba takes time.
-        from cmmsim.geometry.camera_kernels import undistort_points
+        from cmmsim.geometry.lens_distortion_kernels import undistort_points
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
         undistorted = np.empty_like(flat)

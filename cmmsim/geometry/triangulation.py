@@ -1,7 +1,7 @@
 """Triangulation: points in space, with covariances, from their pixels in both images of a rig.
 
 The start values come from OpenCV's linear method. Weighted Gauss-Newton steps follow, which are in
-``camera_kernels``.
+``triangulation_kernels``.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def triangulate(
             f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}"
         )
     # Imported late, because importing numba takes time.
-    from cmmsim.geometry.camera_kernels import triangulate_all
+    from cmmsim.geometry.triangulation_kernels import triangulate_all
 
     if near is None:
         near = linear_triangulation(rig, rig.left.undistort(left)[0], rig.right.undistort(right)[0])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.detection.fit_kernels import (
+from cmmsim.detection.ellipse_fit_kernels import (
     UNKNOWNS,
     FitSettings,
     accumulate,

@@ -12,15 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.camera_kernels import (
-    Cameras,
-    faces,
-    length_of,
-    light_at,
-    project,
-    signed_distance,
-    triangulate_point,
-)
+from cmmsim.geometry.camera_kernels import Cameras, faces, length_of, light_at, project
 from cmmsim.geometry.disc_kernels import disc_ellipse, distorted_root
 from cmmsim.geometry.matrix_kernels import from_entries
 from cmmsim.geometry.transform_kernels import (
@@ -30,6 +22,7 @@ from cmmsim.geometry.transform_kernels import (
     transform_point,
     transform_pose,
 )
+from cmmsim.geometry.triangulation_kernels import signed_distance, triangulate_point
 from cmmsim.measuring.outline_kernels import Outlines
 from cmmsim.measuring.solver_kernels import (
     MEASURED,

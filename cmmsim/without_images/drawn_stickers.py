@@ -35,7 +35,7 @@ from cmmsim.without_images.sticker_scene import CentreErrors, StickerScene
 from cmmsim.without_images.verified import NAME, require_short
 
 if TYPE_CHECKING:
-    from cmmsim.detection.fit_kernels import FitSettings
+    from cmmsim.detection.ellipse_fit_kernels import FitSettings
     from cmmsim.without_images.drawn_fit_kernels import Ellipses, Fits, Windows
 
 THIN_PX = 0.885

@@ -5,6 +5,7 @@ joints, and e is the error of the pose at the time of exposure. The pose rate is
 the last two measurements divided by the time between them. The start state has the measurement
 before the first frame. The integral is the sum of the errors times the frame period. At a lost
 frame, the servo does not run: its last measurement, integral and command stay as they are.
+`issue_command` in `frame_kernels` skips it.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, dot

@@ -11,7 +11,7 @@ from identify.diagnosis.cause import Cause, with_causes
 from identify.diagnosis.fit import Point
 from identify.diagnosis.linearisation import each_residuals, linearisation
 from identify.diagnosis.score import score
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from dynamics.parameters import passive_parameters
 from dynamics.spatial_inertia import FIRST_MOMENTS, PRODUCTS
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, InList, OnTorques, prior_std
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.body_torques import (
     RunMotion,
     body_wrenches,

@@ -17,7 +17,7 @@ from identify.diagnosis.cause import Cause
 from identify.diagnosis.fit import Point, fit, with_last_columns
 from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import NEAR, Ranked, Rows, indistinguishable, misfit_of
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 
 # Share of the best statistic from which on a cause that is tried at a size is fitted, too.
 CLOSE = 0.8

@@ -18,7 +18,7 @@ from identify.diagnosis.geometry_causes import geometry_causes
 from identify.diagnosis.loop_causes import loop_causes
 from identify.diagnosis.measurement_causes import measurement_causes
 from identify.errors import EstimationError
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.own_parts import PluginFunction, own_function
 

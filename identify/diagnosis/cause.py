@@ -14,7 +14,7 @@ import numpy as np
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
 # Function that returns the problem with a cause of a given size. It changes nothing else.

@@ -10,7 +10,7 @@ import numpy as np
 from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, OnCommands, in_each_run, prior_std
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
 

@@ -26,7 +26,7 @@ from identify.estimation.identification import (
     identified,
     output_error_problem,
 )
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.output_error_search import search_with_common_errors
 from identify.estimation.result import IdentificationResult
 from identify.progress import SilentProgress

@@ -12,7 +12,7 @@ from identify.diagnosis.cause import Cause, with_causes
 from identify.diagnosis.linearisation import Linearisation, allowed, linearisation, residuals
 from identify.diagnosis.score import OrthogonalComplement, Score, score
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 
 # Criteria of one search.
 STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=5)

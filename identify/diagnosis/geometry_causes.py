@@ -13,7 +13,7 @@ from identify.diagnosis.cause import (
     prior_std,
     with_geometry,
 )
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
 STEPS = {"m": 1e-5, "rad": 1e-4}  # change of a number for differences, by its unit

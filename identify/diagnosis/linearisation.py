@@ -36,7 +36,7 @@ from identify.diagnosis.cause import (
     OnTorques,
     with_causes,
 )
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.error_modes import differentiated
 from identify.model.loop_model import LoopModel
 from identify.model.unequal_gains import UnequalGains, with_unequal_gains

@@ -18,7 +18,7 @@ from dynamics.closed_loop.drives import READS, DriveName
 from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, Change, OnCommands, OnGain, in_each_run
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.filtering import interpolated
 from identify.model.body_torques import joint_rates
 from identify.model.loop_model import LoopModel

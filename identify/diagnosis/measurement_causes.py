@@ -22,7 +22,7 @@ from scipy.special import chdtri
 from dynamics.closed_loop import ClosedLoopRun
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, OnPoses, in_each_run
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.files.dataset import POSE
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import kind_of

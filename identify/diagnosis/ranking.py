@@ -30,7 +30,7 @@ from identify.estimation.explanation import (
     score_covariance,
     spectral_density,
 )
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 
 # Size of the cosine between two projected columns from which on they cannot be told apart.
 ALIKE = 0.99

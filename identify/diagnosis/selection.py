@@ -42,7 +42,7 @@ from identify.diagnosis.ranking import (
 )
 from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 
 CHANCE = 0.01  # probability that a right model is accused of any cause in the catalogue
 MOST = 3  # largest number of causes or groups that are selected

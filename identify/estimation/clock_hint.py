@@ -10,7 +10,7 @@ import numpy as np
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.common_error_estimates import errors_of_run
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel

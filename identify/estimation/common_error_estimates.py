@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from identify.arrays import Array
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET
 

@@ -45,7 +45,7 @@ from identify.estimation.common_error_estimates import (
     shared_draws,
 )
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.progress import Advance
 from identify.runtime import in_threads

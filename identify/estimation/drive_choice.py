@@ -23,7 +23,7 @@ from dynamics import DynamicsError
 from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.output_error_search import Search, output_error_searches
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import Progress, SilentProgress

@@ -32,7 +32,7 @@ from scipy.special import chdtrc, ndtri
 
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(ndtri(0.999))

@@ -13,7 +13,7 @@ import numpy as np
 
 from dynamics import DynamicsError
 from identify.arrays import Array
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.simultaneous_search import with_likely_errors
 
 SHORTEST_S = 0.5

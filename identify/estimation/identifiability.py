@@ -47,7 +47,7 @@ from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.full_bodies import full_body_warnings
 from identify.estimation.intervals import BoundedEstimate, bounded_estimate, combined_std
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.prior import (
     StartingGuess,
     asymmetry,

@@ -32,7 +32,7 @@ from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.prior import model_guess
 from identify.estimation.result import IdentificationResult

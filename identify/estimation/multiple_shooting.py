@@ -29,7 +29,7 @@ from dynamics.closed_loop import (
 )
 from dynamics.kinematics.platform import Chart
 from identify.arrays import Array
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.filtering import filtered_derivatives
 from identify.model.loop_model import LoopModel

@@ -19,7 +19,7 @@ from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.common_error_estimates import errors_in_models
 from identify.estimation.growing_window import over_growing_window
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.search_in_coordinates import minimise_in_coordinates
 from identify.estimation.simultaneous_search import with_likely_errors
 from identify.estimation.warm_start import linear_warm_start

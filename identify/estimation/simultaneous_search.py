@@ -18,7 +18,7 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounded_least_squares import Linearisation, minimise
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import Marginal
 

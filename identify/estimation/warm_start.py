@@ -38,7 +38,7 @@ from dynamics.closed_loop.command_schedule import acting_times
 from dynamics.closed_loop.drives import JointLaw, gain_columns
 from identify.arrays import Array, triangular_factor
 from identify.estimation.bounds import SMALLEST_SHARE, least_values
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter

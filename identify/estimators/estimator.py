@@ -15,7 +15,7 @@ import xarray as xr
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.own_parts import ESTIMATORS, PluginFunction, check_choice, chosen, is_plugin_name
 

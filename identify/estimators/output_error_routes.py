@@ -11,7 +11,7 @@ import numpy as np
 
 from identify.errors import EstimationError
 from identify.estimation.covariance import estimate_uncertainty
-from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.estimator import Estimate, Evidence, estimator

@@ -13,8 +13,8 @@ from identify.excitation.constraints import WorstCase
 from identify.excitation.criteria import log_observability, observability_index
 from identify.excitation.design import Design
 from identify.excitation.information import Knowledge, log_information
-from identify.excitation.motion import sample_times
 from identify.excitation.search import FEWEST_MEMBERS, SEARCHES
+from identify.excitation.trajectory_unknowns import sample_times
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import SEARCH, child

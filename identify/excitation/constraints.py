@@ -33,7 +33,7 @@ from dynamics.rigid_body.jacobians import joint_coordinates, pose_jacobian, sing
 from dynamics.workspace import check_motion, measure
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.excitation.motion import is_whole_periods
+from identify.excitation.trajectory_unknowns import is_whole_periods
 from identify.loop_parameters import of_actuators
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, box_of

@@ -37,7 +37,13 @@ from dynamics import Robot
 from identify.arrays import Array, agreed
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import structure
-from identify.excitation.motion import Unknowns, log_determinant, motion, regressor, run_times
+from identify.excitation.trajectory_unknowns import (
+    Unknowns,
+    log_determinant,
+    motion,
+    regressor,
+    run_times,
+)
 from identify.own_parts import CRITERIA, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory

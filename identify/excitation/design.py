@@ -11,8 +11,8 @@ from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
 from identify.excitation.criteria import Criterion, log_observability, observability_index
-from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, unknowns
 from identify.excitation.search import SEARCHES, SearchProblem
+from identify.excitation.trajectory_unknowns import SAMPLES_PER_HARMONIC, Unknowns, unknowns
 from identify.loop_parameters import of_actuators
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child

@@ -54,7 +54,7 @@ from identify.errors import TrajectoryError
 from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.scale_anchor import MEASURING, default_std, measured_parameter
 from identify.excitation.criteria import Criterion, smoothing_of
-from identify.excitation.motion import (
+from identify.excitation.trajectory_unknowns import (
     RESPONSE_BITS,
     Unknowns,
     log_determinant,

@@ -16,7 +16,12 @@ from identify.arrays import Array, agreed
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, WorstCase
 from identify.excitation.criteria import Criterion
-from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, motion, sample_times
+from identify.excitation.trajectory_unknowns import (
+    SAMPLES_PER_HARMONIC,
+    Unknowns,
+    motion,
+    sample_times,
+)
 from identify.progress import Progress
 from identify.runtime import interruptible, one_thread, raise_interrupt
 from identify.scenario import Excitation

@@ -27,7 +27,7 @@ from identify.model.body_errors import body_errors, body_modes, fed_forward
 from identify.model.common_error_prior import lowest_errors, settings_with_errors
 from identify.model.error_modes import error_modes
 from identify.model.joint_torques import equivalent_commands
-from identify.model.residuals import Residuals
+from identify.model.output_error_residuals import Residuals
 from identify.record.checks import long_gap_warnings
 from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Marginal
 

@@ -56,7 +56,7 @@ def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
     assert run_copy(copied, {}) == PROBED
     assert kept() == first
     # any kernel counts, whether called or not
-    callee = copied / "cmmsim" / "detection" / "fit_kernels.py"
+    callee = copied / "cmmsim" / "detection" / "ellipse_fit_kernels.py"
     callee.write_text(callee.read_text() + "\n")
     # nor is an index read that names a module which is gone
     for index in first:

@@ -35,7 +35,7 @@ from identify.estimation.warm_start import joint_balance
 from identify.excitation.constraints import condition_number
 from identify.excitation.criteria import log_observability
 from identify.excitation.information import harmonics, sensitivity_spectrum
-from identify.excitation.motion import unknowns
+from identify.excitation.trajectory_unknowns import unknowns
 from identify.loop_parameters import loop_settings
 from identify.model.from_record import identified_model
 from identify.scenario import load_scenario

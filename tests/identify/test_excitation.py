@@ -26,7 +26,7 @@ from identify.excitation.design import (
     design_trajectories,
     unseen_trajectories,
 )
-from identify.excitation.motion import unknowns
+from identify.excitation.trajectory_unknowns import unknowns
 from identify.scenario import load_scenario, scenario_from_toml
 from identify.setup import Setup
 from identify.trajectory import (

@@ -27,8 +27,8 @@ from identify.excitation.information import (
     log_linear_information,
     sensitivity_spectrum,
 )
-from identify.excitation.motion import sample_times, unknowns
 from identify.excitation.search import climb
+from identify.excitation.trajectory_unknowns import sample_times, unknowns
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory

@@ -22,7 +22,7 @@ from dynamics import load_robot
 from identify.errors import EstimationError, ScenarioError
 from identify.estimators.estimator import Estimate, find_estimators
 from identify.excitation.criteria import Criterion, criterion_of
-from identify.excitation.motion import unknowns
+from identify.excitation.trajectory_unknowns import unknowns
 from identify.scenario import load_scenario
 from identify.studies.runner import compute
 from identify.studies.study_design import Case, prepare

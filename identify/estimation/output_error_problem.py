@@ -5,9 +5,9 @@ around it and follows the reference. Its ideal sensor has the same sampling, del
 loses the same frames as the real sensor. Driven by commands, the joints of the model get the logged
 commands, which contain the effect of the sensor's noise on the plant.
 
-The residuals are the pose differences of all records, whitened by the sensor's covariance
-(`model/residuals.py` computes them), and a row for each piece of prior knowledge: the initial
-guess of each parameter and the scale anchor.
+The residuals are the pose differences of all records, whitened by the sensor's covariance, and a
+row for each piece of prior knowledge: the initial guess of each parameter and the scale anchor.
+`model/output_error_residuals.py` computes those of a record.
 """
 
 from collections.abc import Sequence
