@@ -267,36 +267,61 @@ def _noise(
     """Return the covariance (q, q) of the scores due to noise, and the misfit.
 
     The third result is the number of unstable repetitions. found: linearisation of each run, with
-    rows in the units of the scores. No experiment is repeated if the model's error causes most of
-    the residuals, or if the residuals are white.
+    rows in the units of the scores. No experiment is repeated if the residuals are white. If the
+    model's error causes most of the residuals, only a few are. If the servo of such a model is
+    unstable with noise, the residuals of noise alone count as white.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))
-    if white.decides or all(run.driven for run in problem.runs):
+    as_white = np.asarray(sum(_information(one.rows) for one in found))
+    if all(run.driven for run in problem.runs):
         advance(DRAWS)
-        return np.asarray(sum(_information(one.rows) for one in found)), white, 0
-    scores, squares = _repeated_scores(problem, parameters, found, rng, advance)
-    unstable = DRAWS - len(scores)
-    if len(scores) < FEWEST:
+        return as_white, white, 0
+    # Each draw has its own generator, so results do not depend on the order of threads.
+    draws = rng.spawn(DRAWS)
+    results: list[tuple[Array, float]] = []
+    if white.decides:
+        # Noise alone can make residuals of this size where the servo amplifies it. A few
+        # repetitions tell whether it does.
+        results = _repeated(problem, parameters, found, draws[:LANES], advance)
+        few = _misfit_of(white.found, results) if len(results) > 1 else white
+        if few.decides and few.significant:
+            advance(DRAWS - LANES)
+            return as_white, few, 0
+        draws = draws[LANES:]
+    results += _repeated(problem, parameters, found, draws, advance)
+    unstable = DRAWS - len(results)
+    if len(results) < FEWEST and white.decides:
+        return as_white, white, 0
+    if len(results) < FEWEST:
         raise EstimationError(
             f"{unstable} of {DRAWS} repeated experiments on the identified model ended in an "
             "unstable loop: the servo is unstable with the sensor's noise, and no interval can be "
             "given"
         )
-    misfit = Misfit(white.found, float(np.mean(squares)), float(np.std(squares, ddof=1)))
-    return np.cov(scores.T), misfit, unstable
+    rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
+    drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
+    # A single product for all draws reads the rows only once.
+    return np.cov((drawn @ rows).T), _misfit_of(white.found, results), unstable
 
 
-def _repeated_scores(
+def _misfit_of(found: float, repeated: Sequence[tuple[Array, float]]) -> Misfit:
+    """Return the misfit of a mean squared residual among those of repeated experiments."""
+    squares = [square for _, square in repeated]
+    return Misfit(found, float(np.mean(squares)), float(np.std(squares, ddof=1)))
+
+
+def _repeated(
     problem: OutputErrorProblem,
     parameters: Array,
     found: list[_Linear],
-    rng: np.random.Generator,
+    generators: Sequence[np.random.Generator],
     advance: Advance,
-) -> tuple[Array, list[float]]:
-    """Return scores and mean squared residuals of the stable repeated experiments.
+) -> list[tuple[Array, float]]:
+    """Return residuals (n, 6) and mean squared residual of each stable repeated experiment.
 
-    The scores J^T r (draws, q) are for noise alone. The residuals are for noise and common errors.
+    The residuals are for noise alone. The mean square is for noise and common errors. There is one
+    experiment for each generator.
     """
 
     def judged(
@@ -320,16 +345,11 @@ def _repeated_scores(
         ]
 
     results = []
-    # Each draw has its own generator, so results do not depend on the order of threads.
-    each = rng.spawn(DRAWS)
-    for some in in_threads(repeat, [each[k : k + LANES] for k in range(0, DRAWS, LANES)]):
+    batches = [generators[k : k + LANES] for k in range(0, len(generators), LANES)]
+    for some in in_threads(repeat, batches):
         results += [result for result in some if result]
         advance(len(some))
-    rows = np.concatenate([one.rows.reshape(-1, one.rows.shape[2]) for one in found])
-    drawn = np.array([noise.ravel() for noise, _ in results]).reshape(len(results), len(rows))
-    squares = [square for _, square in results]
-    # A single product for all draws reads the rows only once.
-    return drawn @ rows, squares
+    return results
 
 
 def repeated_experiments(

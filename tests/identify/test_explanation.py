@@ -7,10 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import kstest
+from scipy.stats import chi2, kstest
 
+from dynamics import Robot
+from dynamics.closed_loop import FrameTiming, LoopSettings, ServoGains
+from dynamics.parameter_set import ParameterSet
+from dynamics.parameters import LANES
+from dynamics.robot_file import RobotDescription
+from dynamics.robot_lengths import robot_of_lengths
 from identify.errors import EstimationError
-from identify.estimation.covariance import estimate_uncertainty
+from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.explanation import (
     Misfit,
     coloured_score_covariance,
@@ -19,7 +25,8 @@ from identify.estimation.explanation import (
 )
 from identify.estimation.identification import identify
 from identify.record.stored_common_errors import NONE
-from tests.identify.synthetic import quick, rss6, run_plant
+from identify.setup import Setup
+from tests.identify.synthetic import problem_of, quick, rss6, run_plant
 
 
 def noise(rng, frames=600, memory=0.0):
@@ -125,6 +132,88 @@ def test_of_information_that_no_computer_inverts_the_variances_are_right_and_pos
     assert eigenvalues[0] > -1e-9 * eigenvalues[-1]
     assert np.all(np.diag(unseen.T @ wrong_model.covariance @ unseen) > 0.98)
     assert np.all(np.diag(wrong_model.covariance) > 0)
+
+
+@pytest.mark.parametrize("model_error", [0.0, 10.0])
+def test_a_residual_far_above_white_noise_is_judged_by_what_the_servo_makes_of_noise(model_error):
+    """A servo that doubles the noise leaves four times its variance. A few repeated experiments
+    tell that a residual of 104 times the variance is none of it.
+    """
+    rng, frames, asked = np.random.default_rng(0), 400, []
+    missed = 2 * rng.standard_normal((frames, 6)) + model_error
+
+    def simulate_repeats(parameters, noises):
+        asked.append(len(noises))
+        return [SimpleNamespace(measured=2 * noise) for noise in noises]
+
+    run = SimpleNamespace(
+        noise_linearised=lambda parameters: (missed, rng.standard_normal((frames, 6, 2))),
+        without_common=lambda rows: rows,
+        whiten=lambda rows: rows,
+        whitened_modes=np.zeros((frames, 6, 0)),
+        common=NONE,
+        covariance=np.eye(6),
+        measured=-missed,
+        simulate_repeats=simulate_repeats,
+        driven=False,
+        ok=np.ones(frames, dtype=bool),
+        payload_errors=np.zeros((2, 7)),
+    )
+    guess = SimpleNamespace(rows=np.eye(2))
+    problem = SimpleNamespace(
+        runs=(run,), known=lambda parameters: (np.zeros(2), np.eye(2)), guess=guess
+    )
+    misfit = estimate_uncertainty(problem, np.zeros(2), np.random.default_rng(0)).misfit
+    assert misfit.expected == pytest.approx(4.0, rel=0.05)
+    assert misfit.decides == misfit.significant == (model_error > 0)
+    assert sum(asked) == (LANES if model_error else DRAWS)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_explains_a_stiff_robot_at_29_hz_whose_servo_amplifies_it(seed):
+    """A 6-RSS with bodies of the paper, four times its gains and other lengths, and a sensor with
+    a latency of one frame. Model and plant are equal.
+
+    The oracle is the plant, which is repeated with noise. Its true motion differs from the one
+    without noise by so much that the truth leaves more than three times the noise in a closed loop.
+    """
+    paper = rss6()
+    loops = [
+        LoopSettings(ServoGains(0.3, 0.001, 2.4), FrameTiming(rate, latency))
+        for rate, latency in ((60.0, 0.0), (29.0, 1 / 29))
+    ]
+    lengths = {"base_radius": 0.25, "crank": 0.08, "link": 0.25}
+    geometry = robot_of_lengths("stiff", paper, lengths, loops)[0].geometry
+    sets = {
+        name: ParameterSet(values.dynamic, 4 * values.joint_pid)
+        for name, values in paper.parameter_sets.items()
+    }
+    robot = Robot(RobotDescription("stiff", geometry, sets))
+    scenario = quick(sensor="ctrack780_29hz", renderer="statistical")
+    setup = Setup(scenario, seed, robot)
+    record = setup.run()
+    run = problem_of([record], scenario, robot).runs[0]
+    calm = setup.plant.run(run.reference).pose
+    root = np.linalg.cholesky(run.covariance)
+
+    def repeated(draws):
+        plant = setup.plant.run(
+            run.reference, lambda frame, time, pose: pose + root @ draws.standard_normal(6)
+        )
+        return np.mean(run.whiten(plant.measured - calm) ** 2)
+
+    squares = [repeated(np.random.default_rng([seed, number])) for number in range(20)]
+    assert np.mean(squares) > 3.0
+    result = identify(record, robot, scenario)
+    assert result.expected_noise_ratio == pytest.approx(np.mean(squares), abs=3 * np.std(squares))
+    assert not result.misfit.significant
+    assert result.driven_misfit.found == pytest.approx(1.0, abs=4 * result.driven_misfit.std)
+    assert not any("explain" in warning for warning in result.warnings)
+    own = slice(robot.layout.coulomb.start, None)  # frictions and gains
+    assert result.identifiable[own].all()
+    errors = ((result.estimate - sets["truth"].vector) / result.std)[own]
+    assert chi2.sf(np.sum(errors**2), len(errors)) > 1e-3
 
 
 def test_frames_marked_as_lost_afterwards_leave_nothing_identified():
