@@ -10,6 +10,9 @@ Functions
     differentiate_servo, differentiate_commands              one run with derivatives
     repeat_servo, repeat_commands                            runs that differ only in their noise
     simulate_batch                                           many runs of the servo on all cores
+    equilibrium                                              start state at rest
+    most_directions                                          limit of directions for derivatives
+    prepare                                                  compilation before the first run
 
 The loop is implemented once, in modules named `*_kernels`. Numba compiles them, and they also run
 as plain Python. The simulated plant and the identified model use the same code.

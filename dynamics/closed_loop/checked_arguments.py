@@ -12,7 +12,7 @@ from dynamics.robot import Robot
 
 
 def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
-    """Return the number of directions of commands along which one run can be differentiated.
+    """Return the largest number of directions along which one run can be differentiated.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ def most_directions(robot: Robot, groups: RigidGroups | None = None) -> int:
     """
     check_type("robot", robot, Robot, SimulationError)
     layout = robot.layout
-    shown = len(layout.names)
+    parameter_columns = len(layout.names)
     if groups is not None:
-        shown -= len(layout.rigid_names) - len(groups.pivots)
-    # one column is for the derivative of the length of a step that an event shortens
-    return layout.derivatives(len(robot.geometry.chart.freedoms)) - shown - 1
+        parameter_columns -= len(layout.rigid_names) - len(groups.pivots)
+    # one column is for the length of a step that an event shortens
+    return layout.derivatives(len(robot.geometry.chart.freedoms)) - parameter_columns - 1
 
 
 def checked_directions(
@@ -52,7 +52,7 @@ def checked_directions(
     """Checked directions: (frames, n, k) for the run, and (n, k) for the commands before it.
 
     `shape` is (frames, n). If `directions` is None, k is 0. If `before` is None, the commands
-    before the run do not change. Raises SimulationError, also for k above `most`.
+    before the run do not change. Raises SimulationError, also if k exceeds `most`.
     """
     directions = np.zeros((*shape, 0)) if directions is None else directions
     given = np.asarray(directions)
@@ -68,9 +68,9 @@ def checked_directions(
 def checked_times(times: object, frames: int) -> np.ndarray:
     """Checked times (frames,) of frames, s, which must increase. Raises SimulationError."""
     checked = floats("times", times, (frames,), error=SimulationError)
-    back = np.flatnonzero(np.diff(checked) <= 0)
-    if len(back):
-        first = int(back[0])
+    not_later = np.flatnonzero(np.diff(checked) <= 0)
+    if len(not_later):
+        first = int(not_later[0])
         raise SimulationError(
             f"times must increase, but frame {first + 1} is at {checked[first + 1]:.9g} s and "
             f"frame {first} at {checked[first]:.9g} s"
@@ -81,9 +81,10 @@ def checked_times(times: object, frames: int) -> np.ndarray:
 def held_commands(
     commands: object, shape: tuple[int, int], before: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Commands (frames, n), with rows of NaN replaced by the command before, and a mask (frames,).
+    """Commands (frames, n) with the previous command in rows of NaN, and a mask (frames,).
 
-    The mask is False for rows of NaN. Raises SimulationError for a row that is only partly NaN.
+    The mask is False for rows of NaN. `before` (n,) is the command before the first row. Raises
+    SimulationError for a row that is neither finite nor all NaN.
     """
     given = floats("commands", commands, shape, error=SimulationError, finite=False)
     missing = np.isnan(given)

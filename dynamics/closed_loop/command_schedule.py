@@ -1,9 +1,9 @@
 """Schedule of the joint commands: each is issued at its frame and arrives after a latency.
 
-Commands keep their order. A command that would overtake the one before it waits, and arrives
-together with it. If several commands arrive together, only the last one acts. With the linear hold,
-the command ramps from the previous one over one frame period, and then remains constant. A command
-that arrives during the ramp of the previous one starts at the end value of that ramp.
+Commands keep their order. A command that would overtake an earlier one waits, and arrives together
+with it. If several commands arrive together, only the one issued last acts. With the linear hold, a
+command ramps from the value of the command issued before it over one frame period, and then remains
+constant. If it arrives during the ramp of that command, it jumps to the end of that ramp first.
 """
 
 from functools import lru_cache
@@ -39,8 +39,8 @@ class CommandSchedule(NamedTuple):
 def command_schedule(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run.
 
-    Commands issued before the run have the latencies of the start state. If it has none, they have
-    the latency of `FrameTiming`.
+    Commands issued before the run have the latencies of the start state, or the latency of
+    `FrameTiming` if the start state has none.
     """
     if problem.times is not None:
         return _schedule_at_times(problem)
@@ -87,7 +87,7 @@ def _schedule(
     duration = []
     newest = 0
     for begin, end in zip(begins, [*begins[1:], (frames, 0.0)], strict=True):
-        # if several commands arrive together, only the last one acts
+        # if several commands arrive together, only the one issued last acts
         while newest + 1 < len(arrivals) and arrivals[newest + 1] <= begin:
             newest += 1
         command.append(oldest + newest)
@@ -112,15 +112,15 @@ def _schedule(
     )
 
 
-# Largest difference, s, of instants that count as one. It is used if `times` are given.
+# Instants that differ by at most this time, s, count as one in a run with given `times`.
 SAME_S = 1e-9
 
 
 def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     """Schedule of a run whose frames are at given times.
 
-    It is assumed that commands from before the run are one period apart, and that the last of them
-    was issued one period before the run.
+    It is assumed that commands from before the run were issued one period apart, the newest of them
+    one period before the first frame.
     """
     timing = problem.settings.timing
     times = problem.frame_times
@@ -130,11 +130,11 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
     before = np.array([timing.latency_s]) if start_latencies is None else start_latencies
     late = np.full(len(times), timing.latency_s) if problem.latencies is None else problem.latencies
     # the oldest command from before the run also stands for all earlier ones
-    old = np.arange(-len(before), 0)
-    new = np.flatnonzero(problem.written)
-    numbers = np.concatenate([old, new])
-    issued = np.concatenate([times[0] + old * period, times[new]])
-    arrivals = acting_times(issued, np.concatenate([before, late[new]]))
+    old_numbers = np.arange(-len(before), 0)
+    new_numbers = np.flatnonzero(problem.written)
+    numbers = np.concatenate([old_numbers, new_numbers])
+    issued = np.concatenate([times[0] + old_numbers * period, times[new_numbers]])
+    arrivals = acting_times(issued, np.concatenate([before, late[new_numbers]]))
     nearest = np.clip(np.searchsorted(times, arrivals - SAME_S), 0, len(times) - 1)
     at_frame = np.abs(times[nearest] - arrivals) <= SAME_S
     arrivals = np.where(at_frame, times[nearest], arrivals)
@@ -160,7 +160,10 @@ def _schedule_at_times(problem: LoopProblem) -> CommandSchedule:
 
 
 def acting_times(issued: np.ndarray, latencies: np.ndarray) -> np.ndarray:
-    """Times (frames,) at which commands begin to act, s, from their times of issue, s."""
+    """Times (N,) at which commands begin to act, in the unit of their times of issue (N,).
+
+    No command acts before an earlier one. The unit of `latencies` (N,) is the same.
+    """
     return np.array(_in_order((issued + latencies).tolist()), dtype=float)
 
 

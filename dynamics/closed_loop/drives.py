@@ -6,8 +6,8 @@ is, up to the limit,
     torque = lp (U - theta) + li z - lx theta + ld (c U_dot - theta_dot),    z_dot = U - theta
 
 `drive_kernels.drive` computes the torque. At the limit, li z - lx theta is kept constant while it
-would otherwise grow further (conditional integration). The laws differ in the gains that they use,
-in c, and in lx:
+would otherwise change in the direction of the torque (conditional integration). The laws differ in
+the gains that they use, in c, and in lx:
 
     pid            c = 1, lx = 0                  law of the paper (eq. 31)
     pd             c = 1, lx = 0                  no li
@@ -20,13 +20,13 @@ The cascade is a proportional controller of the position around a PI controller 
     torque = kv (w - theta_dot) + ki integral(w - theta_dot),    w = kp (U - theta)
 
 The integral of theta_dot is theta except for a constant, which is a part of z. Hence kp = lp / ld,
-kv = ld and ki = lx. In every law, a common factor of lp, li and ld is a factor of the torque.
+kv = ld and ki = lx. In every law, the torque is proportional to a common factor of lp, li and ld.
 
 A law without an integral balances a load by an error: at rest, its command is the coordinate of the
 joint plus the torque divided by lp.
 
-A drive can receive another command U than the one that was sent. Causes are a wrong scale s, a
-wrong zero z0 of the joint, steps q of a digital interface, and the limits of its range:
+The command U that a drive receives can differ from the one that was sent. Causes are a wrong scale
+s, a zero error z0 of the joint, steps q of a digital interface, and a limited range of commands:
 
     U = s clip(q round(sent / q), lowest, highest) + z0
 """
@@ -62,9 +62,9 @@ ABOVE_ZERO: Mapping[str, tuple[str, ...]] = {
     "cascade": JOINT_PID,
     "pid_filtered": ("li",),
 }
-"""Gains that must be > 0.
+"""Gains that must be > 0 in each law.
 
-Without them, the law could not balance a load, or would be another law.
+If one of them were zero, the law could not balance a load, or would be another law.
 """
 
 
@@ -92,7 +92,10 @@ class JointLaw(NamedTuple):
         return bool(self.reads[JOINT_PID.index("li")])
 
     def held(self, torque: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Command (n,) and integral z (n,) that hold joints at an angle (n,) with a torque (n,)."""
+        """Received command (n,) and integral z (n,) that hold joints at rest.
+
+        The joints are at an `angle` (n,) and need a `torque` (n,).
+        """
         if self.integrates:
             return angle, (torque + self.lx * angle) / self.li
         return angle + torque / self.lp, np.zeros_like(torque)
@@ -102,8 +105,8 @@ class JointLaw(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (n, p) of both results of `held` with respect to all parameters.
 
-        `by_dynamic` has the derivatives of the torque with respect to the dynamic parameters.
-        `own_gains` is True if each joint has its own gains among the parameters.
+        The gains come last. `by_dynamic` has the derivatives of the torque with respect to the
+        dynamic parameters. `own_gains` is True if each joint has its own gains.
         """
         command, integral = self.held(torque, angle)
         by_gains = np.zeros((len(torque), len(JOINT_PID)))
@@ -120,7 +123,7 @@ class JointLaw(NamedTuple):
 
 
 def gain_columns(by_gains: np.ndarray, own_gains: bool) -> np.ndarray:
-    """Columns of all gains, from derivatives (..., n, 3) with respect to the gains of each joint.
+    """Columns of all gains, from derivatives (..., n, 3) with respect to a joint's own gains.
 
     The columns are (..., n, 3) if all joints share their gains. Otherwise, they are (..., n, 3 n),
     with zeros for the gains of other joints.
@@ -143,13 +146,13 @@ class Drives:
     torques : bool
         True for drives that take torques. The default is drives that take joint commands.
     torque_limit : float, optional
-        Largest torque or force, N m or N. The default is no limit.
+        Largest magnitude of a torque or force, N m or N. The default is no limit.
     law : {"pid", "pd", "pi", "cascade", "pid_filtered"}
         Law by which drives follow joint commands.
     filter_time : float, optional
-        Time constant of the filter of the law `pid_filtered`, s.
+        Time constant of the filter of the law `pid_filtered`, s. Only this law has one.
     command_scale : float
-        Ratio s of the received to the sent commands.
+        Ratio s of received to sent commands, > 0.
     joint_zeros : tuple of float
         Zero error z0 of each joint, rad or m: its true coordinate minus its reading. The default is
         no error.
@@ -161,7 +164,8 @@ class Drives:
     friction_offset : tuple of float
         Half the difference of the Coulomb friction of each joint in its positive and its negative
         direction, N m or N. It is a constant torque against the joint, which the integral of the
-        drive balances. The torques of a run do not include it. The default is none.
+        drive balances. The torques that a run records are those of the motors minus this offset.
+        The default is no offset.
 
     Raises
     ------
@@ -240,9 +244,9 @@ class Drives:
         return _of_joints("friction offsets", self.friction_offset, joints)
 
     def interface(self, joints: int) -> dict[str, float | np.ndarray]:
-        """Scale, step (0: none), limits and zeros (n,) of the received commands, for kernels.
+        """Scale, step (0: none), limits (infinite: none) and zeros (n,) of commands, for kernels.
 
-        Drives that take torques receive them unchanged.
+        Drives that take torques receive their commands unchanged.
         """
         received = PID if self.torques else self
         low, high = received.command_limits or (-np.inf, np.inf)
@@ -255,11 +259,14 @@ class Drives:
         }
 
     def sent(self, received: np.ndarray) -> np.ndarray:
-        """Commands (n,) that were sent, from those that the drives received, without steps."""
+        """Commands (n,) that must be sent so that the drives receive the given commands (n,).
+
+        The steps and the limits of commands are ignored.
+        """
         return (received - self.zeros(len(received))) / self.command_scale
 
     def check_limits(self, sent: np.ndarray) -> None:
-        """Check that commands (n,) at rest are within the limits. Raises SimulationError."""
+        """Raise SimulationError if a sent command (n,) at rest is beyond the limits."""
         if self.command_limits is None or self.torques:
             return
         low, high = self.command_limits
@@ -277,7 +284,10 @@ class Drives:
 
 
 def _of_joints(what: str, values: tuple[float, ...], joints: int) -> np.ndarray:
-    """Values (n,) of all joints, zero if none are given. Raises SimulationError for others."""
+    """Values (n,) of all joints, or zeros if none are given.
+
+    Raises SimulationError for values of another number of joints.
+    """
     if values and len(values) != joints:
         raise SimulationError(f"there are {what} of {len(values)} joints, the robot has {joints}")
     return np.array(values) if values else np.zeros(joints)
@@ -290,7 +300,8 @@ PID = Drives()
 def joint_law(name: DriveName, gains: np.ndarray, filter_time: float | None = None) -> JointLaw:
     """Law `name` with the gains lp, li, ld of each joint (n, 3), or of all joints (3,).
 
-    `filter_time` is the time constant of its filter, s.
+    Shared gains give a law whose arrays have no axis of joints. `filter_time` is the time constant
+    of the filter of `pid_filtered`, s.
     """
     reads = np.array([float(gain in READS[name]) for gain in JOINT_PID])
     lp, li, ld = np.moveaxis(np.where(reads, gains, 0.0), -1, 0)
@@ -313,7 +324,10 @@ class CascadeGains(NamedTuple):
 
 
 def cascade_gains(gains: np.ndarray) -> tuple[CascadeGains, np.ndarray]:
-    """Gains of the cascade for lp, li, ld (3,), and their derivatives (3, 3)."""
+    """Gains kp, kv, ki of the cascade for lp, li, ld (3,), and their derivatives (3, 3).
+
+    Each row of the derivatives belongs to kp, kv or ki.
+    """
     lp, li, ld = gains
     by_gains = np.array(
         [[1 / ld, 0.0, -lp / ld**2], [0.0, 0.0, 1.0], [-li * ld / lp**2, ld / lp, li / lp]],

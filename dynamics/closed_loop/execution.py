@@ -1,8 +1,8 @@
 """Execution of a run: the kernels process its frames in the memory that is set up here.
 
 The kernels run compiled. Tests also run the same code as plain Python, to compare both. If a sensor
-or a controller is a Python function, the kernels process one frame at a time. The error of a run
-that ends early states the reason that the kernels found.
+or a controller is a Python function, the kernels process one frame at a time. They return a status,
+which the error of a run that ends early puts into words.
 """
 
 from dataclasses import replace
@@ -54,16 +54,15 @@ FAILURES = {
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
-    """Do one run and return its record. Raises LoopFailure."""
+    """Do one run. Raises LoopFailure, or the exception of a user's sensor or controller."""
     frames = problem.frames
-    # A controller's commands are written to this array frame by frame. The kernels read them in the
-    # same way as given commands.
+    # a controller's commands are written here frame by frame, and read like given commands
     commands = problem.commands
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
     memory, record, plan, *_kept = _set_up(problem, commands, compiled)
     run_kernel = chosen(run_frames, compiled)
-    # The kernel gets arrays instead of records, because passing a record takes 8 us in each call.
+    # arrays of one record each, because passing a record takes 8 us in each call
     arrays = [part if part.ndim else part.base for part in memory]
     measured = np.full((frames, 6), np.nan)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
@@ -85,7 +84,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
 def run_repeats(
     problem: LoopProblem, noises: np.ndarray, compiled: bool = True
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do one run for each noise (runs, frames, 6) of the ideal sensor."""
+    """Do one run for each noise (runs, frames, 6) of the ideal sensor, LANES runs at a time."""
     results: list[ClosedLoopRun | LoopFailure] = []
     for group in np.split(noises, range(LANES, len(noises), LANES)):
         results += _run_together(problem, group, compiled)
@@ -95,12 +94,12 @@ def run_repeats(
 def _run_together(
     problem: LoopProblem, noises: np.ndarray, compiled: bool
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do runs that differ in their noise (runs, frames, 6), one in each lane (`lane_kernels`)."""
+    """Do at most LANES runs that differ in their noise (runs, frames, 6), as in `lane_kernels`."""
     sizes = problem.sizes
     frames = problem.frames
     runs = len(noises)
     commands = np.zeros((0, sizes.joints)) if problem.commands is None else problem.commands
-    # the noise of all runs is in one array, of which each run reads its own rows
+    # the noise of all runs is in one array, and each run reads its own rows
     stacked = _with_noise(problem, noises.reshape(-1, 6))
     memory, record, plan, functions, *_kept = _set_up(stacked, commands, compiled, runs)
     for name in ("motion_in_lanes", "acceleration_in_lanes"):
@@ -151,7 +150,7 @@ def _result(problem: LoopProblem, record: Any, measured: np.ndarray, now: Any) -
 
 
 def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
-    """Poses, rates and sensitivities for the coordinates that the kernels have recorded."""
+    """Poses, pose rates and sensitivities, from the coordinates that the kernels have recorded."""
     chart = problem.robot.geometry.chart
     poses = {
         "pose": chart.pose(recorded["pose"]),
@@ -162,6 +161,7 @@ def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray)
         noise = problem.ideal.noise
         poses["measured"] = chart.pose(recorded["measured"])
         poses["measured"][~recorded["measured_ok"]] = np.nan
+        # noise in directions in which the platform cannot move is not among the coordinates
         if noise is not None and problem.sizes.coordinates < 6:
             poses["measured"] += chart.forbidden(
                 chart.pose(np.zeros(problem.sizes.coordinates)) + noise
@@ -181,7 +181,7 @@ def _consult(
     commands: np.ndarray,
     measured: np.ndarray,
 ) -> None:
-    """Call the sensor for the measured pose of a frame, and the controller for the command."""
+    """Measure the pose of a frame, and call the controller, if there is one, for the command."""
     sensor = problem.sensor
     size = problem.sizes.coordinates
     time = frame * problem.period
@@ -336,7 +336,7 @@ def _fill(
     )
     now.servo_integral = start.servo_integral
     now.last_measured = chart.coordinates(start.last_measured)
-    # At the start, a feedforward is the whole command, and the servo's part is zero.
+    # with a feedforward, the servo's part of the command is zero at the start
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     # with the same geometry, the servo can use the Jacobian computed for the motion
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
@@ -349,10 +349,10 @@ def _fill(
         (now.stopping.inputs, functions["stop_derivatives"], rigid),
         (now.pose_and_rate, functions["rate_map_derivative"], rigid[:0]),
     ):
-        last = np.concatenate([constants, function.constants])
+        trailing = np.concatenate([constants, function.constants])
         end = sum(function.inputs)
-        inputs[end - len(last) : end].T[...] = last
-    # the motors come last in the state
+        inputs[end - len(trailing) : end].T[...] = trailing
+    # rigid joints do not use the motors, which come last in the state
     now.unknowns = len(now.state) - (0 if settings.elasticity else 2 * sizes.joints)
     now.parameters = len(columns)
     now.start_moves = problem.start_sensitivities
@@ -374,25 +374,25 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
 
 
 def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
-    """Error of a run that ended early. It names the leg if a pose is out of reach."""
+    """Error of a run that ended with a status. The message names a leg that is out of reach."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
-        last = now.known.inputs[: problem.sizes.coordinates]
-        at = problem.robot.pose(last if status == LEFT_REACH else record.measured[frame])
-        margin = problem.robot.reach_margin(at)
+        evaluated = now.known.inputs[: problem.sizes.coordinates]
+        pose = problem.robot.pose(evaluated if status == LEFT_REACH else record.measured[frame])
+        margin = problem.robot.reach_margin(pose)
         leg = int(np.argmin(margin))
         why += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
     return stopped(problem, frame, record, why)
 
 
 def stopped(problem: LoopProblem, frame: int, record: Any, why: str) -> LoopFailure:
-    """Error of a run that ended early. It counts the frames with actuators at the torque limit."""
+    """Error of a run that ended early. The message counts the frames with saturated actuators."""
     limit = problem.settings.drives.torque_limit
     unit = problem.robot.layout.unit("joint1.coulomb")
     run = "closed loop" if problem.commands is None else "run under commands"
     saturated = saturated_frames(record.torque[:frame], limit)
     when = f"t = {problem.frame_times[frame]:.3f} s"
-    # with weak actuators, the robot can leave its reach although the loop is stable
+    # saturated actuators or given commands can take a robot out of reach in a stable loop, too
     if saturated or problem.commands is not None:
         why = why.replace(UNSTABLE, "")
     if saturated:

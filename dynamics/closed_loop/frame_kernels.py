@@ -1,7 +1,7 @@
 """Kernels for the frames of a run: measurement, command and record.
 
-The visual servo computes the command at a frame that is measured. At a lost frame, its command of
-the frame before is used again. The feedforward is added at every frame. The arguments `task`,
+Without given commands, the visual servo computes the command at a measured frame. At a lost frame,
+it repeats its previous command. The feedforward is added at every frame. The arguments `task`,
 `now`, `at`, `d`, `plan` and `record` are explained in `run_memory`.
 """
 
@@ -27,7 +27,7 @@ from dynamics.compiled.kernel import Array, Record, entry, invoke, kernel
 
 @kernel
 def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> None:
-    """Set joint modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
+    """Set joint modes and derivatives at frame 0. Joints not faster than NO_MARGIN are at rest."""
     size = len(at[0].bias)
     count = len(now.mode)
     copy(now.state[:], at[0].state[:])
@@ -44,9 +44,9 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_command_sensitivity, issued, now.parameters)
         further = plan.start_directions
         copy_rows(further, issued[:, now.parameters :], further.shape[1])
-        last = plan.start_commands[len(plan.start_commands) - 1]
-        scale_received(task, last, issued, now.width)
-        # at a start at rest, the command comes from the integral of the servo
+        newest = plan.start_commands[len(plan.start_commands) - 1]
+        scale_received(task, newest, issued, now.width)
+        # the servo's command at rest comes from its integral
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
     if now.start_moves:
@@ -113,7 +113,10 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 def issue_command(
     task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
 ) -> int:
-    """Measure the pose, unless Python has done so, and record the command that is issued."""
+    """Measure the pose, unless Python has done so, and record the command that is issued.
+
+    Returns MEASURED_OUT_OF_REACH if the command is not finite.
+    """
     if not task.measured:
         measure_ideally(now, plan, record, k)
     now.elapsed += task.period
@@ -138,7 +141,7 @@ def issue_command(
 
 @kernel
 def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
-    """Command of a joint by number. Negative numbers are commands from before the start."""
+    """Command of a joint by number. -1 is the newest command from before the start."""
     return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
 
 
@@ -155,7 +158,7 @@ def received(task: Record, command: float, joint: int) -> float:
 def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
     """Turn derivatives of sent commands (n,) into those of received commands, by their scale.
 
-    The derivatives of a command that is cut at a limit are zero.
+    The derivatives of a command that is cut at a limit are zero. Rounding to steps is ignored.
     """
     for i in range(len(rows)):
         inside = task.command_low <= sent[i] <= task.command_high
@@ -169,7 +172,7 @@ def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
-    """Set the command that acts from now on.
+    """Set the command that acts from now on: the command `number`.
 
     `ramp` is the fraction of the ramp from the previous command that is already done. At 1, the
     command is constant.
@@ -201,10 +204,13 @@ def apply_command(
 def next_span(
     task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record
 ) -> int:
-    """Go on to the next span of a frame, or to the next frame, which begins with a measurement."""
+    """Go on to the next span of a frame, or to the next frame, which begins with a measurement.
+
+    No motion follows the last frame, whose spans are only evaluated.
+    """
     spans = plan.spans
     k = now.frame
-    last = now.frame + 2 == len(plan.spans.first)
+    final = now.frame + 2 == len(plan.spans.first)
     commands = record.command[now.first_row :]
     if now.span == spans.first[k + 1]:
         now.frame = k + 1
@@ -229,7 +235,7 @@ def next_span(
     status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
     if span == spans.first[k]:
         copy(at[0].torque[:], record.torque[now.first_row + k])
-    if status == OK and not last:
+    if status == OK and not final:
         begin_span(task, now, at, d, spans.duration[span], spans.steps[span])
     return status
 
@@ -247,9 +253,9 @@ def run_frames(
 ) -> tuple[int, int]:
     """Run the frames from `first` up to, but not including, `last`.
 
-    Returns the status, and the frame at which it arose. The memory is passed as arrays of one
-    record each, because passing a record from Python takes 8 us, and a run with a sensor in Python
-    calls this function at every frame.
+    Returns the status, and the frame at which it arose, or `last`. The memory is passed as arrays
+    of one record each, because passing a record from Python takes 8 us, and a run with a sensor in
+    Python calls this function at every frame.
     """
     task = tasks[0]
     now = nows[0]

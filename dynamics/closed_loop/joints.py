@@ -1,6 +1,6 @@
 """Joints: laws of dry and viscous friction, and springs between motors and cranks.
 
-The friction of a joint with the velocity theta_dot is, in N m (eq. 24, where dry is the sign),
+The friction of a joint with the velocity theta_dot is, in N m or N (in eq. 24, dry is the sign),
 
     torque = coulomb * dry(theta_dot) + viscous * theta_dot
 
@@ -12,7 +12,7 @@ bias, phi the motor angles referred to the cranks, and theta(q) the crank angles
     M q_ddot + b = J_theta^T spring torque
     motor inertia phi_ddot = motor torque - friction(phi_dot) - spring torque
 
-Encoder, joint PID and friction act at the motor. The inertia of the motor is subtracted from the
+Encoder, joint PID and friction are at the motor. The inertia of the motor is subtracted from the
 Izz of the crank, or from the mass of the slider. In the limit of stiff springs, the robot is thus
 the rigid robot with the same parameters.
 """
@@ -30,7 +30,7 @@ from dynamics.robot import Robot
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
 
-# Type of a friction law as kernels read it. `law` is the position of its name in `LawName`.
+# Type of a friction law as kernels read it. `law` is the index of its name in `LawName`.
 FRICTION = np.dtype(
     (
         np.record,
@@ -56,16 +56,17 @@ class FrictionLaw:
         static_ratio times the Coulomb torque. When the joint slips, the excess over the Coulomb
         torque fades as exp(-(theta_dot / stribeck_velocity)^2).
     smoothing_velocity : float, optional
-        Velocity over which the smoothed law changes its sign, rad/s.
+        Velocity scale in the tanh of the smoothed law, rad/s or m/s.
     static_ratio : float, optional
         Ratio of the static torque to the Coulomb torque, at least 1.
     stribeck_velocity : float, optional
-        Velocity over which the excess fades, rad/s.
+        Velocity at which the excess has faded to 1/e, rad/s or m/s.
 
     Raises
     ------
     SimulationError
-        If the name is unknown, or if a constant is missing, not allowed or out of range.
+        If the name is unknown, or if a constant of the law is missing or out of range, or if a
+        constant of another law is given.
 
     Examples
     --------
@@ -133,7 +134,7 @@ class FrictionLaw:
         return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
-# Largest product of eigenvalue and step length. The Runge-Kutta method is unstable above 2.8.
+# Largest magnitude of eigenvalue times step length. The Runge-Kutta method is unstable above 2.8.
 LARGEST_STEP = 1.0
 
 
@@ -171,19 +172,19 @@ class JointElasticity:
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
     def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the bodies that the springs drive, without the inertia of the motors.
+        """Parameters of the rigid bodies, less the inertia of its motor for each driven body.
 
         Raises SimulationError if the actuator of a leg drives more than one body.
         """
         carried = np.array(rigid)
-        for leg, row in enumerate(layout.of_leg):
-            body = layout.kinds[row[0]]
+        for leg, bodies in enumerate(layout.of_leg):
+            body = layout.kinds[bodies[0]]
             if body.driven is None:
                 raise SimulationError(
                     f"joints cannot be elastic: the actuator of leg {leg + 1} drives more than "
                     "one body"
                 )
-            driven = f"{layout.bodies[row[0]]}.{body.driven}"
+            driven = f"{layout.bodies[bodies[0]]}.{body.driven}"
             carried[layout.rigid_names.index(driven)] -= self.motor_inertia
         return carried
 
@@ -197,9 +198,10 @@ class JointElasticity:
     ) -> int:
         """Number of integration steps per frame that resolves the fastest motion near a pose (6,).
 
-        The rate of the fastest motion is the magnitude of the largest eigenvalue of the joints and
-        motors under joint PID and friction, linearised at rest. Raises SimulationError if the
-        inertia of a motor is not below that of the body that it drives.
+        The rate of the fastest motion is the largest magnitude of an eigenvalue of the joints and
+        motors under joint PID and friction, linearised at rest. Gravity and the integral of the PID
+        are neglected. Raises SimulationError if the inertia of a motor is not below that of the
+        body that it drives.
         """
         self._check_motors(robot, parameters)
         basis = robot.geometry.chart.basis
@@ -212,7 +214,7 @@ class JointElasticity:
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
         _, coulomb, viscous, gains = robot.layout.split(parameters)
         lp, _, ld = gains.T
-        # ratio of the slope of dry friction at rest to the Coulomb torque
+        # slope of dry friction at rest, per Coulomb torque; a law that sticks has none
         slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0
         stiffness = _coupled(self.stiffness, lp)
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)
@@ -234,13 +236,13 @@ class JointElasticity:
             leg.driven_inertia(bodies[rows[0]])
             for leg, rows in zip(robot.geometry.legs, layout.of_leg, strict=True)
         ]
-        least = int(np.argmin(driven))
-        if self.motor_inertia >= driven[least]:
-            name = layout.bodies[layout.of_leg[least][0]]
+        lightest = int(np.argmin(driven))
+        if self.motor_inertia >= driven[lightest]:
+            name = layout.bodies[layout.of_leg[lightest][0]]
             unit = "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
                 f"motor inertia is {self.motor_inertia:g} {unit}, must be below the "
-                f"{driven[least]:.3g} {unit} of {name} including its motor"
+                f"{driven[lightest]:.3g} {unit} of {name} including its motor"
             )
 
 
@@ -250,5 +252,5 @@ def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
     `spring` is the value between each body and its motor, and `at_motor` (n,) are the values
     between the motors and the base.
     """
-    one = spring * np.eye(len(at_motor))
-    return np.block([[one, -one], [-one, one + np.diag(at_motor)]])
+    block = spring * np.eye(len(at_motor))
+    return np.block([[block, -block], [-block, block + np.diag(at_motor)]])

@@ -1,4 +1,4 @@
-"""Kernels for several runs of one model at once, each in one lane of the processor's vectors.
+"""Kernels for several runs of one model at once, each in one lane of the vector registers.
 
 Every run has its own measurements, modes, events and steps. The equation of motion takes most of
 the time, and is computed for all lanes together.
@@ -27,7 +27,7 @@ from dynamics.parameters import LANES
 def evaluate_lanes(
     task: Record, now: Record, at: Record, d: Record, lanes: Record, asked: Array, k: int
 ) -> None:
-    """Do the same as `evaluate` at stage `k`, for the lanes in `asked`.
+    """Do the same as `evaluate` at stage `k`, for the lanes in `asked` whose status is OK.
 
     Within a step in which no joint sticks, only the slope is needed. The other results are stored
     at the end of a step, where they are needed again.
@@ -81,10 +81,10 @@ def evaluate_lanes(
 @kernel
 def has_factor(lanes: Record, lane: int) -> bool:
     """Return True if the mass matrix of a lane is positive definite and finite."""
-    has = True
+    valid = True
     for i in range(lanes.factor.shape[0]):
-        has = has and 0 < lanes.factor[i, i, lane] < np.inf
-    return has
+        valid = valid and 0 < lanes.factor[i, i, lane] < np.inf
+    return valid
 
 
 @kernel
@@ -132,8 +132,8 @@ def run_lanes(
 ) -> None:
     """Run all frames of several runs, one in each lane.
 
-    In `record`, and in the noise of `plan`, the rows of each run follow those of the run before.
-    Each run has its own status and frame.
+    In `record`, and in the noise of `plan`, the rows of the runs follow one after the other. Each
+    run has its own status and frame. A run whose status is not OK has ended early.
     """
     frames = len(plan.spans.first) - 1
     asked = lanes.asked

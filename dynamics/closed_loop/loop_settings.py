@@ -19,8 +19,8 @@ Hold = Literal["zero", "linear"]
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None if it is lost
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
 
-# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint
-# command (n,), rad or m.
+# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> command
+# (n,): joint coordinates, rad or m, or torques, N m or N, if the drives take torques
 Controller = Callable[[int, float, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -77,7 +77,7 @@ class EveryFrame:
     Parameters
     ----------
     command : callable
-        Function (frame, time s, measured pose (6,) or None) -> joint command (n,).
+        Function (frame, time s, measured pose (6,) or None) -> command (n,), as from a Controller.
 
     Examples
     --------
@@ -118,8 +118,8 @@ class ServoGains:
     def demand(self, error: np.ndarray, rate_error: np.ndarray, integral: np.ndarray) -> np.ndarray:
         """Demand (m,) of the servo, eq. 30: the command before the Jacobian maps it to the joints.
 
-        The arguments are the error (m,) of the coordinates, its rate and its integral. The compiled
-        loop has the same law in `visual_servo_kernels.serve`.
+        The arguments are the error (m,) of the coordinates, desired minus measured, its rate and
+        its integral. The compiled loop has the same law in `visual_servo_kernels.serve`.
         """
         return self.kp * error + self.kd * rate_error + self.ki * integral
 
@@ -143,7 +143,8 @@ class FrameTiming:
     Raises
     ------
     SimulationError
-        If the rate is not > 0, or if the latency is negative or more than 60 frames.
+        If the rate is not > 0, if the latency is negative or more than 60 frames, or if the hold is
+        unknown.
 
     Examples
     --------

@@ -40,8 +40,8 @@ def repeat_servo(
 ) -> list[ClosedLoopRun | LoopFailure]:
     """Run the servo's loop once for each noise of the ideal sensor.
 
-    The results are equal to those of `simulate_servo` up to rounding. The runs take about half the
-    time, because the equation of motion is computed for eight runs at once.
+    The results are equal to those of `simulate_servo` up to rounding. They take about half the time
+    of separate runs, because the equation of motion is computed for eight runs at once.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def simulate_batch(
     start_sensitivities : bool
         True returns derivatives with respect to the parameters and the start state.
     workers : int, optional
-        Number of threads. The default is one per core. Results do not depend on it.
+        Number of threads, which has no effect on results. The default is one per core.
 
     Returns
     -------
@@ -170,7 +170,7 @@ def simulate_batch(
     Raises
     ------
     LoopFailure
-        For the first run that ends early.
+        For the first run, in order, that ends early.
     UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
         As for `closed_loop.simulate_servo`.
 

@@ -12,15 +12,16 @@ from dynamics.closed_loop.drive_kernels import drive, winds_up
 from dynamics.closed_loop.linear_algebra_kernels import copy, dot, factorise, fill, solve
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
-# positions of the friction laws in `joints.LawName`
+# indices of the friction laws in `joints.LawName`
 SMOOTHED = 1
 STRIBECK = 2
+# status of a kernel; a run ends early with any other than OK
 OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
 
 
 @kernel
 def dry_level(friction: Record, velocity: float, mode: int) -> float:
-    """Ratio of a slipping joint's dry friction to its Coulomb torque, at a velocity, rad/s."""
+    """Ratio of slipping dry friction to Coulomb torque, at a velocity in rad/s or m/s."""
     if friction.law == SMOOTHED:
         return np.tanh(velocity / friction.smoothing_velocity)
     if friction.law == STRIBECK:
@@ -31,7 +32,7 @@ def dry_level(friction: Record, velocity: float, mode: int) -> float:
 
 @kernel
 def dry_slope(friction: Record, velocity: float, mode: int) -> float:
-    """Derivative of `dry_level` with respect to the velocity, s/rad."""
+    """Derivative of `dry_level` with respect to the velocity, s/rad or s/m."""
     if friction.law == SMOOTHED:
         dry = np.tanh(velocity / friction.smoothing_velocity)
         return (1 - dry * dry) / friction.smoothing_velocity
@@ -50,13 +51,13 @@ def has_events(task: Record, joint: int) -> bool:
 
 @kernel
 def breakaway(task: Record, joint: int) -> float:
-    """Largest friction torque, N m, of a joint at rest."""
+    """Largest friction torque of a joint at rest, N m or N."""
     return task.friction.static_level * task.coulomb[joint]
 
 
 @kernel
 def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float:
-    """Friction torque, N m, of a joint that slips in the direction `mode`."""
+    """Friction torque of a joint that slips in the direction `mode`, N m or N."""
     return (
         task.coulomb[joint] * dry_level(task.friction, velocity, mode)
         + task.viscous[joint] * velocity
@@ -88,7 +89,7 @@ def all_finite(matrix: Array) -> bool:
 def know_motion(task: Record, known: Record, state: Array) -> int:
     """Compute the equation of motion at a state, unless `known` already has its terms there.
 
-    It often has them, because consecutive steps and frames share a state.
+    `known` often has them, because consecutive steps and frames share a state.
     """
     size = len(known.bias)
     same = known.valid
@@ -160,7 +161,7 @@ def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Arr
 
 @kernel
 def push(task: Record, now: Record, at: Record) -> None:
-    """Compute the net torques in the present modes, without the torques that hold stuck joints.
+    """Compute the net torques in the present modes, without those that hold stuck rigid joints.
 
     The slope is the time derivative of the state. All its entries are set, except for the
     acceleration of the platform.
@@ -269,7 +270,7 @@ def all_hold(task: Record, now: Record, at: Record) -> bool:
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Decide which of the joints at rest (mode 0) stick, and in which direction the others start.
 
-    The friction torques are found by projected Gauss-Seidel iterations.
+    Projected Gauss-Seidel iterations give the friction torques of rigid joints.
     """
     joints = now.stuck[: count_stuck(now)]
     # the motors of elastic joints are not coupled, so each mode is decided by itself
@@ -312,7 +313,8 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
     """Return the least margin of the modes, at most 1, and the joint that has it.
 
-    The margin is >= 0 as long as all modes hold. The joint is -1 if no margin is less than 1.
+    A margin is a speed, rad/s or m/s, or the unused fraction of a breakaway torque. The least
+    margin is >= 0 as long as all modes hold. The joint is -1 if no margin is less than 1.
     """
     least = 1.0
     joint = -1

@@ -40,10 +40,10 @@ class Sizes:
     """Sizes for which kernels are compiled.
 
     `joints` and `coordinates` are the numbers of joints and coordinates of the robot, and `rigid`
-    is the number of parameters of the rigid bodies. `geometry` is the space for geometric numbers,
-    the last inputs of the robot's functions (see `Robot.moved`). Most robots need the same space,
-    and so share kernels. `filters` is the number of joints whose drives filter a rate. `gains` is
-    the number of gains of the joint PID.
+    is the number of parameters of the rigid bodies. `geometry` is the number of entries reserved
+    for geometric numbers, the last inputs of the robot's functions (see `Robot.moved`). It is the
+    same for most robots, which thus share kernels. `filters` is the number of joints whose drives
+    filter a rate. `gains` is the number of gains of the joint PID.
     """
 
     joints: int
@@ -99,7 +99,7 @@ class LoopProblem:
 
     @property
     def further_columns(self) -> int:
-        """Number of columns of derivatives with respect to the start state, or to directions."""
+        """Number of columns after those of the parameters: of the start state, or of directions."""
         return self.sizes.start if self.start_sensitivities else self.directions.shape[2]
 
     @property
@@ -109,7 +109,7 @@ class LoopProblem:
 
     @property
     def period(self) -> float:
-        """Time between two frames, s."""
+        """Inverse of the frame rate, s. With `times`, ramps, command rates and steps refer to it."""
         return 1.0 / self.settings.timing.frame_rate_hz
 
     @property
@@ -124,7 +124,7 @@ class LoopProblem:
 
     @property
     def asked(self) -> bool:
-        """True if the sensor or the controller is a Python function, called at every frame."""
+        """True if a sensor or controller in Python is called, so that frames run one by one."""
         return self.ideal is None or self.controller is not None
 
     @cached_property
@@ -158,7 +158,7 @@ def servo_problem(
 ) -> LoopProblem:
     """Problem of a run under the servo.
 
-    Raises the same errors as `simulate_servo` before the run.
+    Raises the errors of `simulate_servo` that arise before the run.
     """
     given = robot, parameters, reference, settings, sensor, start, latencies
     problem = _problem(*given, servo_robot, feedforward)
@@ -182,7 +182,7 @@ def commands_problem(
 ) -> LoopProblem:
     """Problem of a run under commands.
 
-    Raises the same errors as `simulate_commands` before the run.
+    Raises the errors of `simulate_commands` that arise before the run.
     """
     problem = _problem(robot, parameters, reference, settings, sensor, start, latencies)
     shape = problem.frames, robot.layout.joints
@@ -207,7 +207,7 @@ def controller_problem(
 ) -> LoopProblem:
     """Problem of a run under a control law.
 
-    Raises the same errors as `simulate_controller` before the run.
+    Raises the errors of `simulate_controller` that arise before the run.
     """
     if not callable(controller) and not isinstance(controller, EveryFrame):
         raise SimulationError(f"controller must be a function, got {shown(controller)}")
@@ -224,9 +224,9 @@ def with_derivatives(
 ) -> LoopProblem:
     """Problem of a run that also computes derivatives.
 
-    `directions` (frames, n, k) are k directions of the commands of the run. `start_directions` (n,
-    k) are those of the commands before the run. Raises SimulationError for elastic joints, and for
-    directions of a wrong shape or number.
+    `directions` (frames, n, k) are k directions of the commands of the run. Those of the commands
+    before the run are `start_directions` (n, k). Raises SimulationError for elastic joints, for
+    directions of a wrong shape or number, and for directions together with `by_start`.
     """
     if groups is not None:
         check_type("groups", groups, RigidGroups, SimulationError)
@@ -257,7 +257,7 @@ def _problem(
     servo_robot: Robot | None = None,
     feedforward: np.ndarray | None = None,
 ) -> LoopProblem:
-    """Problem with the arguments that are common to servo, commands and controllers."""
+    """Problem with the checked arguments that servo, commands and controllers have in common."""
     check_type("robot", robot, Robot, SimulationError)
     check_type("reference", reference, Reference, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
@@ -356,7 +356,7 @@ def _check_start(
 
 @lru_cache(maxsize=64)
 def _check_reach(robot: Robot, reference: Reference) -> None:
-    """Raise UnreachablePoseError, with frame and leg, for a pose that the robot cannot reach."""
+    """Raise UnreachablePoseError, with frame and leg, for a reference pose out of reach."""
     robot.check_reach(reference.poses, "reference pose", "frame")
 
 
@@ -382,7 +382,7 @@ def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:
 
 
 def _check_elasticity(problem: LoopProblem) -> None:
-    """Raise SimulationError for elastic joints if motor states are missing or steps too long."""
+    """Raise SimulationError if elastic joints have no motor states, or too few steps per frame."""
     settings = problem.settings
     elasticity = settings.elasticity
     start = problem.start

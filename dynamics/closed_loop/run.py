@@ -14,9 +14,10 @@ from dynamics.errors import SimulationError
 class ClosedLoopRun:
     """Record of a run, one row per frame.
 
-    The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). The start state has s =
-    3 m + n entries, in the order of `StartState`. Fields that were not requested, or that the robot
-    does not have, are None. Poses are in m and rad, joints in rad or m.
+    The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). With groups of inertial
+    parameters, p counts only the parameters that `differentiate_servo` then has. The start state
+    has s = 3 m + n entries, in the order of `StartState`. Fields that were not requested, or that
+    the robot does not have, are None. Poses are in m and rad, joints in rad or m.
 
     Attributes
     ----------
@@ -25,7 +26,7 @@ class ClosedLoopRun:
     pose, pose_rate : ndarray, shape (frames, 6)
         True pose and its time derivative.
     torque : ndarray, shape (frames, n)
-        Actuator torque or force, N m or N.
+        Actuator torque or force, N m or N. A command that arrives at the frame already acts.
     command : ndarray, shape (frames, n)
         Issued command, rad or m. If the drives take torques, it is a torque, N m or N.
     measured : ndarray, shape (frames, 6)
@@ -43,13 +44,13 @@ class ClosedLoopRun:
     command_sensitivity : ndarray, shape (frames, 6, k)
         Derivatives of the poses along k directions of the commands.
     end_sensitivity, end_start_sensitivity : ndarray, shapes (s, p) and (s, s)
-        Derivatives of the state at the last frame with respect to parameters and start state.
+        Derivatives of the state at the last frame with respect to parameters, and to start state.
     motor_angle, motor_rate : ndarray, shape (frames, n)
         Coordinate of the motors of elastic joints, and its rate.
     filtered_rate : ndarray, shape (frames, n)
         Filtered rate of the error of each drive, rad/s or m/s.
     events : int
-        Number of stick-slip events.
+        Number of stick-slip events, at which a joint comes to rest or breaks away.
     start : StartState
         State at the first frame.
 
@@ -96,9 +97,9 @@ class ClosedLoopRun:
     def state_at(self, frame: int) -> StartState:
         """State at a frame, from which a new run repeats the remaining frames of this run.
 
-        If each frame has its own latency, the new run also needs the latencies of the earlier
-        commands. Raises SimulationError if the run does not have the frame, or if the measurement
-        before it was lost.
+        After frame 0, the state has neither derivatives nor latencies of its commands. Set
+        `latencies` if they differ from the one of `FrameTiming`. Raises SimulationError if the run
+        does not have the frame, or if the measurement of the previous frame was lost.
         """
         frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
         if frame == 0:
@@ -124,9 +125,9 @@ class ClosedLoopRun:
 
 
 class LoopFailure(SimulationError):
-    """Early end of a run at a frame.
+    """Error that ends a run early, at the frame `frame`.
 
-    `saturated` is the number of frames before the end in which an actuator was saturated.
+    `saturated` is the number of frames before this one in which an actuator was at its limit.
     """
 
     def __init__(self, message: str, frame: int, saturated: int = 0) -> None:
@@ -138,7 +139,7 @@ class LoopFailure(SimulationError):
 def saturated_frames(torque: np.ndarray, limit: float | None) -> int:
     """Number of frames in which a torque (frames, n) is at the limit, N m or N.
 
-    None means no limit.
+    A limit of None means that there is none, and the number is 0.
     """
     # the kernels limit torques only to within rounding errors
     return 0 if limit is None else int((np.abs(torque) >= limit * (1 - 1e-12)).any(axis=1).sum())

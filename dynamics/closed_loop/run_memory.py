@@ -26,7 +26,7 @@ CACHE_LINE = 64  # bytes in a line of the processor's cache
 
 
 class Plan(NamedTuple):
-    """Arrays that a run reads at its frames, with one row per frame.
+    """Arrays that a run reads. Most have one row per frame; those named start_* are for its start.
 
     Optional arrays that are missing have no rows.
     """
@@ -68,7 +68,7 @@ class Record(NamedTuple):
 
 
 def empty_record(problem: LoopProblem, runs: int = 1) -> Record:
-    """Record of several runs, one after the other.
+    """Record of several runs, filled with zeros. The rows of the runs follow one after the other.
 
     Arrays of results that are not requested have no rows or no columns.
     """
@@ -107,9 +107,9 @@ class Memory(NamedTuple):
     `task` does not change during a run. It has laws, parameters, gains, and addresses of compiled
     functions. `now` is the state of the integrator. `evaluations` (5,) have the values computed at
     the four stages of a step and at its end. Their rows for stuck joints are in the order of
-    `now.stuck`. `tangent` has derivatives, with a row for each unknown. Its columns are for the
+    `now.stuck`. `tangent` has derivatives, with a row for each unknown. Its columns belong to the
     parameters, then the start state or directions, then the length of a step that an event
-    shortens. In kernels, `at` is `evaluations` or one of them, and `d` is `tangent`.
+    shortens. In kernels, `at` is `evaluations` or one of its entries, and `d` is `tangent`.
     """
 
     task: Any
@@ -149,7 +149,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         integers("response stage_derivatives stop_derivatives rate_map_derivative"),
         integers("slope_derivative servo_jacobian"),
         integers("evaluate_terms evaluate decide_modes stop_joints slope_tangent stop_tangent"),
-        # switches: derivatives, servo with the robot's geometry, measurements from Python
+        # switches: compute derivatives, servo has the robot's geometry, Python has measured
         integers("sensitivities servo_knows measured"),
         # law of the drives, with its gains
         reals("lp li ld lx", "joint"),
@@ -159,7 +159,7 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         # commands as the drives receive them
         reals("command_scale command_step command_low command_high"),
         reals("joint_zero", "joint"),
-        # number of columns from the gains of a joint to those of the next
+        # number of columns from the gains of a joint to those of the next (0: shared gains)
         integers("gain_step"),
         # servo, elastic joints, timing, limits
         reals("kp kd ki stiffness damping motor_inertia period"),

@@ -1,9 +1,9 @@
 """Kernels for sensitivities: exact derivatives of what the integrator computes.
 
-Each derivative is a row whose columns belong to variables. The variables are the parameters, then
-the start state or directions of the commands if requested. The length of a step that an event
-shortens is the last variable, until its derivative is known. If inertial parameters are in groups,
-only the pivots of the groups have a column.
+The derivatives of a quantity are a row whose columns belong to variables. The variables are the
+parameters, then the start state or directions of the commands if requested. The length of a step
+that an event shortens is the final variable, until its derivative is known. If inertial parameters
+are in groups, only the pivots of the groups have a column.
 
 A Runge-Kutta step is differentiated stage by stage, and the equation of motion at each stage is
 differentiated implicitly. A step that an event shortens ends where a margin is zero. The derivative
@@ -44,7 +44,7 @@ from dynamics.parameters import LANES
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 END = 4
-# rate of the margin, rad/s^2 or N m/s, below which the time of an event has no derivative
+# rate of a margin, rad/s^2 or N m/s, up to which the time of an event is taken as constant
 NO_APPROACH = 1e-9
 
 
@@ -69,7 +69,7 @@ def differentiate_stages(task: Record, now: Record) -> None:
 
 @kernel
 def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
-    """Copy the values, besides derivatives of the motion, that all columns of a slope need."""
+    """Copy the values that all columns of a slope need, besides derivatives of the motion."""
     stages = now.stages
     size = len(at.bias)
     for i in range(size):
@@ -79,11 +79,11 @@ def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
     for i in range(len(now.mode)):
         mode = now.mode[i]
         slips = now.mode[i] != 0
-        law = follows_law(task, at, i)
-        stages.by_error[i, k] = law * (task.lp[i] + task.lx[i])
-        stages.by_integral[i, k] = law * task.li[i]
-        stages.by_command_rate[i, k] = 0.0 if filtering else law * task.rate_weight * task.ld[i]
-        stages.damping[i, k] = 0.0 if filtering else law * task.ld[i]
+        active = follows_law(task, at, i)
+        stages.by_error[i, k] = active * (task.lp[i] + task.lx[i])
+        stages.by_integral[i, k] = active * task.li[i]
+        stages.by_command_rate[i, k] = 0.0 if filtering else active * task.rate_weight * task.ld[i]
+        stages.damping[i, k] = 0.0 if filtering else active * task.ld[i]
         if slips:
             stages.damping[i, k] += task.viscous[i] + task.coulomb[i] * dry_slope(
                 task.friction, at.velocity[i], mode
@@ -110,23 +110,23 @@ def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage:
         lp = rigid + 2 * count + task.gain_step * i
         mode = now.mode[i]
         row = d.direct[i]
-        law = follows_law(task, at, i)
+        active = follows_law(task, at, i)
         rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
         if task.lx[i] > 0 or task.filter_time > 0:
             fill(row, 0.0)
             # `by_error` is lp + lx, but lx does not act on the command: its effect is subtracted
-            add_row(-law * task.lx[i], d.acting[i], row, now.width)
+            add_row(-active * task.lx[i], d.acting[i], row, now.width)
         if task.filter_time > 0:
             rate = at.state[first + count + i]
-            add_row(law * task.ld[i], d.filtered[i], row, now.width)
+            add_row(active * task.ld[i], d.filtered[i], row, now.width)
         for k in (lp, lp + 1, lp + 2, rigid + i, rigid + count + i):
             if task.lx[i] == 0 and task.filter_time == 0:
                 row[k] = 0.0
-        row[lp] += law * task.reads[0] * at.error[i]
-        row[lp + 1] += law * task.reads[1] * at.state[first + i]
-        row[lp + 2] += law * task.reads[2] * rate
+        row[lp] += active * task.reads[0] * at.error[i]
+        row[lp + 1] += active * task.reads[1] * at.state[first + i]
+        row[lp + 2] += active * task.reads[2] * rate
         for k in range(3):
-            row[lp + k] -= law * task.lx_by[i, k] * at.angle[i]
+            row[lp + k] -= active * task.lx_by[i, k] * at.angle[i]
         row[rigid + i] -= dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
         row[rigid + count + i] -= at.velocity[i] if mode != 0 else 0.0
 
@@ -142,7 +142,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
     torque = d.k[k, first + count :]
     copy_rows(slopes, torque, width)
     clear(slopes, width)
-    # `crank_by_rate` is d(acceleration)/d(rate), which is twice d(velocity)/d(pose)
+    # `crank_by_rate` is d(joint acceleration)/d(rate), twice d(joint velocity)/d(pose)
     for i in range(count):
         for j in range(size):
             add_row(
@@ -159,7 +159,7 @@ def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -
 
 @kernel
 def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
-    """Differentiate the slopes lx / li * velocity of integrals of drives at their limit."""
+    """Differentiate the slopes lx / li * velocity of the integrals that `winds_up` holds."""
     size = len(at.bias)
     width = now.width
     stages = now.stages
@@ -293,7 +293,7 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         d.margin[task.shown + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
-    # if the margin hardly changes, the derivative of the length is meaningless
+    # if the margin hardly changes, the derivative of the length is meaningless, and set to zero
     if abs(approach) > NO_APPROACH:
         add_row(-1 / approach, d.margin[:], d.length[:], width)
     d.length[column] = 0.0
@@ -305,7 +305,7 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
 
 @kernel
 def whole_vectors(columns: int) -> int:
-    """Round a number of columns up to whole vectors of the processor. Added columns are zero."""
+    """Round a number of columns up to a multiple of LANES. Added columns are zero."""
     return -(-columns // LANES) * LANES
 
 
@@ -315,9 +315,9 @@ def step_tangent(
 ) -> None:
     """Differentiate the step whose stages are in `at`.
 
-    A step that ends at a planned time becomes shorter if its start becomes later. A step that is
-    `cut` by an event has the length that the event determines. Until the derivative of this length
-    is known, the length is a variable of its own.
+    A step without an `event` ends at a planned time. The length of a step that is `cut` by an event
+    is determined by the event. Until the derivative of this length is known, the length is a
+    variable of its own. A step that ends at an event without being cut has a constant length.
     """
     fill(d.length[:], 0.0)
     if cut:
@@ -387,7 +387,7 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
 
 @kernel
 def rest_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
-    """Correct the derivatives of the pose rate at the start for stuck joints, which cannot move."""
+    """Remove the part of the derivatives of the start's pose rate that would move stuck joints."""
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
     if len(stuck) == size:

@@ -1,8 +1,8 @@
 """Closed-loop runs, with one function for each source of the joint commands.
 
-In `simulate_servo` it is the visual servo, in `simulate_commands` a log of commands, and in
-`simulate_controller` a control law that is called at every frame. `differentiate_servo` and
-`differentiate_commands` also return derivatives. They use the ideal sensor.
+The source is the visual servo in `simulate_servo`, a log in `simulate_commands`, and a control law
+in `simulate_controller`. `differentiate_servo` and `differentiate_commands` also return
+derivatives, and accept only an ideal sensor.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def simulate_servo(
     latencies: np.ndarray | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the closed loop of the visual servo.
+    """Run the closed loop of the visual servo, whose drives must take joint commands.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def simulate_servo(
         State at the first frame. The default is rest at the first reference pose.
     feedforward : ndarray, shape (frames, n), optional
         Joint commands, rad or m, to which the servo adds its own commands. The default start
-        assumes that the first row alone is the command that holds the robot at rest.
+        assumes that the first row alone holds the robot at rest.
     latencies : ndarray, shape (frames,), optional
         Latency of each frame's command, s. The default is `settings.timing.latency_s`.
     compiled : bool
@@ -126,10 +126,11 @@ def simulate_commands(
         As for `simulate_servo`. The reference determines the number of frames and the pose at rest.
     commands : ndarray, shape (frames, n)
         Command of each frame: rad or m, or N m or N if the drives take torques. With `times`, a row
-        of NaN issues no command.
+        of NaN issues no command. If the first row is NaN, `start` is required.
     times : ndarray, shape (frames,), optional
-        Increasing times of the frames, s. The default is equal periods from zero on. In any case,
-        the rate of the command in the drives is the change of the command divided by that period.
+        Increasing times of the frames, s. The default is equal periods from zero on, at the frame
+        rate. In any case, the command rate in the drives is the change of the command divided by
+        this period.
 
     Returns
     -------
@@ -232,8 +233,8 @@ def differentiate_servo(
     groups : RigidGroups, optional
         Groups of inertial parameters on which the motion depends. Derivatives are then computed
         only for the pivots (one parameter of each group) and for the parameters that are not
-        inertial, which is faster. `groups.of_all` extends the derivatives to all parameters. If the
-        start has sensitivities of its own, they must depend only on the groups, too.
+        inertial, which is faster. `groups.of_all` extends the derivatives to all parameters. A
+        start with derivatives of its own must depend on these parameters only through the groups.
     directions : ndarray, shape (frames, n, k), optional
         Directions of the feedforward along which the poses are also differentiated. Their number k
         is at most `most_directions`. They cannot be combined with `by_start`.
@@ -294,7 +295,7 @@ def differentiate_commands(
         at most `most_directions`. They cannot be combined with `by_start`. With `times`, the
         direction of a row of NaN must be that of the command before.
     start_directions : ndarray, shape (n, k), optional
-        Directions of the commands from before the start, which are the same for all of them. The
+        Directions of the commands from before the start. All of these have the same directions. The
         default is zero.
 
     Returns

@@ -1,10 +1,13 @@
 """Stability of the sampled loop near rest, from the linear map of its state from frame to frame.
 
 Small deviations of the robot under its joint PID (eq. 31) obey a linear differential equation. As
-long as one command acts, the matrix exponential solves it exactly. The servo (eq. 30), with the
-latency of its commands, closes the loop once per frame. The loop is stable if all eigenvalues of
-the map are inside the unit circle. Dry friction and elasticity of the joints are neglected. Near
-rest, dry friction only makes the loop more stable.
+long as one command acts, the matrix exponential solves this equation exactly. The servo (eq. 30),
+with the latency of its commands, closes the loop once per frame. The loop is stable if all
+eigenvalues of the map are inside the unit circle. Limits of the drives, and dry friction and
+elasticity of the joints, are neglected. Near rest, dry friction only makes the loop more stable.
+
+The servo's error e is the desired minus the measured pose. The map uses the negative of e, the
+deviation of the measured from the desired coordinates.
 """
 
 from __future__ import annotations
@@ -23,8 +26,8 @@ from dynamics.closed_loop.start_state import check_start_pose, checked_loop_para
 from dynamics.robot import Robot
 
 SLOWEST_HZ = 0.5  # lowest frame rate, Hz, in the search for the limit of stability
-MOST_GAIN = 100.0  # largest factor of the gains in the search for the limit of stability
-SEARCH_RATIO = 1.1  # ratio of consecutive values in both searches, before bisection finds the limit
+MOST_GAIN = 100.0  # largest factor of the gains in the search; the smallest is 1 / MOST_GAIN
+SEARCH_RATIO = 1.1  # ratio of consecutive values in a search, before bisection finds the limit
 
 
 def frame_map(
@@ -33,9 +36,9 @@ def frame_map(
     """Map (s, s) of small deviations from rest at a pose (6,), from frame to frame.
 
     The state consists of the coordinates, their rates, the joint integrals, the filtered rates if
-    the drives have them, the coordinates measured at the last frame, the servo integrals, and the
-    past commands that can still act, the latest first. Raises the same errors as
-    `closed_loop.equilibrium`.
+    the drives have them, the coordinates measured at the previous frame, the servo integrals, and
+    the past commands that can still act, the newest first. The integrals have the signs of
+    `drive_kernels` and `visual_servo_kernels`. Raises the same errors as `closed_loop.equilibrium`.
     """
     return _state_map(_near_rest(robot, parameters, pose, settings.drives), settings)
 
@@ -43,7 +46,7 @@ def frame_map(
 def fastest_rate(robot: Robot, parameters: np.ndarray, drives: Drives, pose: np.ndarray) -> float:
     """Largest magnitude, 1/s, of the eigenvalues of the robot under its drives at a pose (6,).
 
-    Raises the same errors as `closed_loop.equilibrium`.
+    The commands are constant. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, drives)
     return float(np.abs(np.linalg.eigvals(near.motion)).max())
@@ -55,7 +58,8 @@ def pose_response(
     """Frequency response from the desired to the true coordinates, near rest at a pose (6,).
 
     Returns a function of the angular frequency, rad/s. Its result is the complex matrix (m, m) for
-    values at the frames. Raises the same errors as `closed_loop.equilibrium`.
+    values at the frames. The desired rate is the difference of the desired coordinates of two
+    frames, divided by the period. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
@@ -76,10 +80,10 @@ def _state_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 
 
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """Map (s, s) of `frame_map`, then the effect (s, m) of the desired coordinates at the frame.
+    """Map (s, s) of `frame_map`, beside the effect (s, m) of the frame's desired coordinates.
 
-    Every quantity in this function, such as `state` or `commands`, is a matrix. It maps the state
-    and the desired coordinates at the beginning of the frame to that quantity.
+    In this function, a quantity such as `state` or `commands` is the matrix that maps the state and
+    the desired coordinates at the beginning of the frame to this quantity.
     """
     joints, size = robot.jacobian.shape
     timing = settings.timing
@@ -93,15 +97,15 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     states = inner + 2 * size + held_count * joints
     start = np.eye(states, states + size)
     desired = np.eye(size, states + size, states)
-    coordinates = start[:size] - desired
+    deviation = start[:size] - desired
     integral = start[inner + size : inner + 2 * size]
-    servo_inputs = np.vstack([coordinates, start[inner : inner + size], integral])
-    # without an integral, the demand of the servo at rest is zero, and so is its derivative
+    servo_inputs = np.vstack([deviation, start[inner : inner + size], integral])
+    # without an integral, the servo demands nothing at rest, and turning the Jacobian has no effect
     turning = robot.turning if settings.servo.ki else 0 * robot.turning
-    turned = turning @ start[:size]
-    commands = [servo @ servo_inputs + turned, *np.split(start[inner + 2 * size :], held_count)]
+    by_turning = turning @ start[:size]
+    commands = [servo @ servo_inputs + by_turning, *np.split(start[inner + 2 * size :], held_count)]
     state = start[:inner]
-    # within a frame, the older command acts until the newer one arrives after `late_s`
+    # within a frame, the older command acts for `late_s`, until the newer one arrives
     for age, begin, end in ((late_frames + 1, 0.0, late_s), (late_frames, late_s, period)):
         newer = commands[age]
         older = commands[age + 1] if age + 1 <= held_count else commands[age]
@@ -112,12 +116,12 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
         )
         slope = (newer - older) / period
         at_begin = older + ramp * (newer - older)
-        moving = slope if timing.hold == "linear" else 0 * slope
+        acting_slope = slope if timing.hold == "linear" else 0 * slope
         scale = settings.drives.command_scale
         state = expm(robot.motion * (end - begin))[:inner] @ np.vstack(
-            [state, scale * at_begin, scale * moving, scale * slope]
+            [state, scale * at_begin, scale * acting_slope, scale * slope]
         )
-    return np.vstack([state, coordinates, integral - period * coordinates, *commands[:held_count]])
+    return np.vstack([state, deviation, integral - period * deviation, *commands[:held_count]])
 
 
 def spectral_radius(
@@ -130,7 +134,11 @@ def spectral_radius(
 def gain_margin(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> float:
-    """Factor of the servo gains at the limit of stability."""
+    """Factor of the servo gains at the limit of stability.
+
+    For a stable loop, it is above 1, and MOST_GAIN if no factor up to that is unstable. For an
+    unstable loop, it is below 1, and NaN if no factor down to 1 / MOST_GAIN is stable.
+    """
     near = _near_rest(robot, parameters, pose, settings.drives)
 
     def radius(factor: float) -> float:
@@ -144,10 +152,12 @@ def gain_margin(
 def lowest_frame_rate(
     robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
 ) -> float:
-    """Lowest frame rate, Hz, at which the loop is stable. The latency in s is not changed.
+    """Lowest frame rate, Hz, down to which the loop is stable. The latency in s is not changed.
 
-    If the loop is unstable at the rate of the settings, the result is above that rate. It is NaN if
-    the loop is stable at no rate.
+    The search begins at the rate of the settings. If the loop is stable there, the result is lower,
+    and SLOWEST_HZ if all rates down to that are stable. If it is unstable there, the result is the
+    next higher rate at which the loop becomes stable, or NaN if none is found. The highest rate in
+    the search is 100 times the first, or the rate at which the latency is 50 frames.
     """
     rate = settings.timing.frame_rate_hz
     near = _near_rest(robot, parameters, pose, settings.drives)
@@ -156,7 +166,7 @@ def lowest_frame_rate(
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
-    # the size of the map grows with the number of frames in the latency, here at most fifty
+    # the size of the map grows with the number of frames in the latency, which is at most 50 here
     fastest = min(
         100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
     )
@@ -164,7 +174,7 @@ def lowest_frame_rate(
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
-    """Text on a run that ended early: the largest eigenvalue, and a frame rate that is stable."""
+    """Text on a run that ended early: the largest eigenvalue, and from which frame rate it is < 1."""
     arguments = robot, parameters, settings, pose
     radius = spectral_radius(*arguments)
     hz = settings.timing.frame_rate_hz
@@ -183,8 +193,8 @@ class _NearRest(NamedTuple):
     """Robot near rest, without the gains and the timing of the servo.
 
     `motion` is the matrix of `_joint_loop`. `jacobian` (n, m) is the Jacobian of the joints with
-    respect to the coordinates. `turning` (n, m) is the derivative of the Jacobian times the demand
-    of the servo, with respect to the coordinates. The demand is the one that holds the joints.
+    respect to the coordinates. `turning` (n, m) is the derivative, with respect to the coordinates,
+    of the Jacobian times the servo's demand that holds the joints.
     """
 
     motion: np.ndarray
@@ -206,7 +216,7 @@ def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: D
 
 
 def _radius(robot: _NearRest, settings: LoopSettings) -> float:
-    """Largest magnitude of the eigenvalues of the map from frame to frame."""
+    """Spectral radius of the map from frame to frame."""
     return float(np.abs(np.linalg.eigvals(_state_map(robot, settings))).max())
 
 
@@ -216,9 +226,9 @@ def _joint_loop(
     """Matrix of the linear differential equation of the joints under their drives.
 
     The state consists of q, q_dot, joint integrals, filtered rates if there are any, the command,
-    its slope, and U_dot in the law of the drive. The slope is the true rate of the command, and can
-    differ from U_dot. An integral that the law does not use is made to decay. Otherwise its
-    eigenvalue would be at the limit of stability.
+    its slope, and U_dot in the law of the drive. The slope is the true rate of the command, which
+    is zero under the zero hold, unlike U_dot. Slope and U_dot are constant. An integral that the
+    law does not use is made to decay. Otherwise its eigenvalue would be at the limit of stability.
     """
     q = robot.coordinates(pose)
     joints = robot.layout.joints
@@ -227,36 +237,40 @@ def _joint_loop(
     li = law.li
     ld = law.ld
     filtering = law.filter_time > 0
-    at_rest = np.zeros(len(q))
+    zero_rate = np.zeros(len(q))
     size = len(q)
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
-    mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, at_rest, rigid)
-    by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, at_rest, at_rest, holding, rigid)
+    mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, zero_rate, rigid)
+    by_pose, by_rate, *_ = _values(
+        robot, "motion_derivatives", q, zero_rate, zero_rate, holding, rigid
+    )
     push = np.linalg.solve(mass, jacobian.T)
     inner = 2 * size + joints * (1 + filtering)
     system = np.zeros((inner + 3 * joints, inner + 3 * joints))
-    at = slice(0, size)
-    moving = slice(size, 2 * size)
-    summed = slice(2 * size, 2 * size + joints)
+    coordinates = slice(0, size)
+    rates = slice(size, 2 * size)
+    integrals = slice(2 * size, 2 * size + joints)
     filtered = slice(2 * size + joints, inner)
-    command, slope, rate = (slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3))
-    system[at, moving] = np.eye(size)
-    system[moving, at] = -np.linalg.solve(mass, by_pose) - (lp + law.lx) * push @ jacobian
-    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ (
+    command, slope, command_rate = (
+        slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3)
+    )
+    system[coordinates, rates] = np.eye(size)
+    system[rates, coordinates] = -np.linalg.solve(mass, by_pose) - (lp + law.lx) * push @ jacobian
+    system[rates, rates] = -np.linalg.solve(mass, by_rate) - push @ (
         (ld * (not filtering) + viscous)[:, None] * jacobian
     )
-    system[moving, summed] = li * push
-    system[moving, command] = lp * push
+    system[rates, integrals] = li * push
+    system[rates, command] = lp * push
     if filtering:
-        system[moving, filtered] = ld * push
-        system[filtered, moving] = -jacobian / law.filter_time
-        system[filtered, rate] = np.eye(joints) / law.filter_time
+        system[rates, filtered] = ld * push
+        system[filtered, rates] = -jacobian / law.filter_time
+        system[filtered, command_rate] = np.eye(joints) / law.filter_time
         system[filtered, filtered] = -np.eye(joints) / law.filter_time
     else:
-        system[moving, rate] = law.rate_weight * ld * push
-    system[summed, at] = -jacobian
-    system[summed, command] = np.eye(joints)
-    system[summed, summed] = 0.0 if law.integrates else -np.eye(joints)
+        system[rates, command_rate] = law.rate_weight * ld * push
+    system[integrals, coordinates] = -jacobian
+    system[integrals, command] = np.eye(joints)
+    system[integrals, integrals] = 0.0 if law.integrates else -np.eye(joints)
     system[command, slope] = np.eye(joints)
     return system
 
@@ -264,8 +278,8 @@ def _joint_loop(
 def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     """Matrix from the inputs of the servo to the command of a frame.
 
-    The inputs are the errors of the coordinates at this frame and at the previous frame, and the
-    servo integral before this frame.
+    The inputs are the measured minus the desired coordinates at this frame and at the previous one,
+    and the servo integral before this frame. This sign of the deviations makes `by_now` negative.
     """
     gains = settings.servo
     period = 1 / settings.timing.frame_rate_hz
@@ -279,8 +293,8 @@ def torque_motion(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Linear motion near rest at a pose (6,), for drives that take torques.
 
-    Returns the matrix (2 m, 2 m) of the differential equation of coordinates and rates. The second
-    result is the acceleration (m, n) per torque added to those that hold the robot.
+    Returns the matrix (2 m, 2 m) of the differential equation of coordinates and rates, and the
+    acceleration (m, n) per torque added to those that hold the robot.
     """
     q = robot.coordinates(pose)
     rest = np.zeros(len(robot.coordinate_names))
@@ -295,7 +309,7 @@ def torque_motion(
 
 
 def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
-    """Outputs of a function of the robot for one set of inputs."""
+    """Outputs of a function of the robot for a single state."""
     return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
 
 
@@ -307,6 +321,7 @@ def last_stable(
     The limit is the first value at which the radius passes 1. If the loop is stable at the start,
     the search goes to `stable_end`, and returns that end if the loop is stable all the way. If it
     is unstable at the start, the search goes to `other_end`, and returns NaN if it finds no limit.
+    The search can miss a narrow range of values, because it proceeds in steps of SEARCH_RATIO.
     """
     stable = radius(start) < 1
     value = start

@@ -28,13 +28,14 @@ class StartState:
     servo_integral : array_like, shape (m,)
         Integral of the servo's error, m s and rad s.
     commands : array_like, shape (k, n)
-        Commands issued before this frame, rad or m, the oldest first. The oldest also stands for
-        all earlier commands.
+        Commands issued before this frame, the oldest first. They are in rad or m, or in N m or N if
+        the drives take torques. The oldest also stands for all earlier commands.
     last_measured : array_like, shape (6,)
         Pose measured one frame before, m and rad.
     joint_integral_sensitivity, command_sensitivity : array_like, shape (n, p), optional
-        Derivatives of the joint integral and of the commands with respect to the parameters. The
-        default is zero. The derivatives of the servo integral follow from those of the commands.
+        Derivatives of the joint integral and of the commands with respect to the parameters. All
+        commands have the same. The default is zero. The derivatives of the servo integral follow
+        from those of the commands.
     motor_angle, motor_rate : array_like, shape (n,), optional
         Coordinate of the motors of elastic joints, rad or m, and its rate.
     filtered_rate : array_like, shape (n,), optional
@@ -115,7 +116,7 @@ def checked_loop_parameters(
     """Dynamic parameters of a robot, then its gains, checked for the law of its drives.
 
     Raises ParameterError for an invalid dynamic parameter, and SimulationError for an invalid gain
-    or a wrong shape.
+    or a wrong shape. A gain that the law does not use can have any finite value.
     """
     layout = robot.layout
     values = floats(
@@ -162,13 +163,14 @@ def equilibrium(
     pose : array_like, shape (6,)
         Pose of the platform.
     servo : ServoGains
-        Gains of the servo. At rest, its integral gives the command.
+        Gains of the servo. Its integral gives the command at rest. If ki is 0, this integral is 0,
+        and the first command of the servo moves the robot.
     servo_robot : Robot, optional
         Robot whose kinematics the servo uses. The default is `robot`.
     elasticity : JointElasticity, optional
         Springs of the joints.
     fed_forward : bool
-        True if a feedforward commands the joint coordinates, so that the servo adds nothing.
+        True if a feedforward gives the command at rest, so that the integral of the servo is 0.
     drives : Drives
         Law of the drives.
 

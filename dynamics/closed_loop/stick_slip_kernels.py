@@ -28,10 +28,10 @@ from dynamics.closed_loop.sensitivity_kernels import (
 )
 from dynamics.compiled.kernel import Record, entry, invoke, kernel
 
-MAX_EVENTS_PER_SPAN = 400
-# margin that counts as zero, in rad/s or as a fraction of the breakaway torque
+MAX_EVENTS_PER_SPAN = 400  # a run with more events in one span ends early
+# a margin up to this counts as zero; it is in rad/s or m/s, or a fraction of the breakaway torque
 NO_MARGIN = 1e-12
-# rounding error of the margin of a stuck joint, as a fraction of the breakaway torque
+# margin of a stuck joint, as a fraction of the breakaway torque, up to which it is rounding error
 TORQUE_ROUNDING = 1e-13
 
 
@@ -207,8 +207,8 @@ def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: flo
         now.high = tried
     remember(now, tried, margin)
     better = crossing(now, min(now.trials, len(now.tried)))
-    holds = now.mode[mode_margin(task, now, at[END])[1]] == 0
-    negligible = TORQUE_ROUNDING if holds else 0.0
+    stuck = now.mode[mode_margin(task, now, at[END])[1]] == 0
+    negligible = TORQUE_ROUNDING if stuck else 0.0
     # because of rounding, a bracket cannot become shorter than this
     near = min(abs(better - tried), now.high - now.low) <= 1e-15 + 1e-13 * now.cut
     now.trials += 1
@@ -248,7 +248,7 @@ def judge(task: Record, now: Record, at: Record, d: Record) -> int:
 def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Remove the velocities of stuck joints from the state, as an impulse would.
 
-    The compliance of the joints must have been computed.
+    The compliance of rigid joints must have been computed.
     """
     size = len(at.bias)
     stuck = now.stuck[: count_stuck(now)]
@@ -297,7 +297,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
     invoke(task.stop_joints, task, now, end, d, 0)
     copy(now.state[:], end.state[:])
     status = invoke(task.evaluate_terms, task, now, end, d, 0)
-    # the impulse that stops a joint can break other joints away, so modes are decided again
+    # the impulse that stops a joint can break other joints away: the modes are decided again
     if status == OK and held:
         invoke(task.decide_modes, task, now, end, d, 0)
     return status

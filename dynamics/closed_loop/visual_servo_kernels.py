@@ -1,11 +1,11 @@
 """Visual servo (eq. 30), and its derivatives.
 
 The joint command is U = J_theta [kp e + kd e_dot + ki integral(e)]. J_theta is the Jacobian of the
-joints, and e is the error of the pose at the time of exposure. The pose rate is the difference of
-the last two measurements divided by the time between them. The start state has the measurement
-before the first frame. The integral is the sum of the errors times the frame period. At a lost
-frame, the servo does not run: its last measurement, integral and command stay as they are.
-`issue_command` in `frame_kernels` skips it.
+joints, and e is the desired minus the measured pose of the frame. The measured pose rate is the
+difference of the newest two measurements divided by the time between them. The start state has the
+measurement before the first frame. The integral is the sum of the errors, up to this frame, times
+the frame period. At a lost frame, `issue_command` in `frame_kernels` does not call the servo: its
+last measurement, integral and command stay as they are.
 """
 
 from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, dot

@@ -1,8 +1,9 @@
 """Control laws that use a model of the robot, and the design of their gains.
 
 A law is given an `Assignment`: a motion, a model and the settings of the loop. It returns a
-`LawInLoop`: a feedforward of joint commands for the servo, or a controller. Each law has its own
-file, and `law_interface` has the types that they share. The laws of the joints' drives are in
+`LawInLoop`, with a feedforward of joint commands for the servo, or with a controller, or, for the
+law `pid`, with neither. `law_interface` has the law `pid` and the types that the laws share. The
+other laws have files of their own. The laws of the joints' drives are in
 `dynamics.closed_loop.drives`.
 """
 

@@ -3,19 +3,20 @@
     torque = mean over a frame of ID(p, p_dot, p_ddot),   p = r - e,   e_ddot + Kd e_dot + Kp e = 0
     Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-ID is the inverse dynamics, r is the desired motion, and e is the error. p is the recovery motion:
-it leads from the present pose of the robot into r. The torque is the mean over a frame period,
-because it acts for that time.
+ID is the inverse dynamics, r is the desired motion, and p is the recovery motion, which leads from
+the present pose of the robot into r. e is the desired minus the recovery motion. The torque is the
+mean over a frame period, because it acts for that time.
 
 With an observer, the recovery motion begins at the state predicted for the arrival of the torque.
 The estimated disturbance is subtracted. The signs of dry friction are those of the recovery motion.
 Near rest, joints often move against the desired motion, whose signs would then make the torque
 wrong by twice the Coulomb torque.
 
-Without an observer, the recovery motion begins at the last measured pose. Its rate is the
-difference of the last two poses divided by the time between them. An integral of the error replaces
-the disturbance. The signs of dry friction are those of the desired motion, because the measured
-rates are half a frame old, and their signs would chatter.
+Without an observer, the recovery motion begins at the newest measured pose. Its rate is the
+difference of the newest two poses divided by the time between them. An integral of the error, and
+the error of the modelled torque at the start, replace the disturbance. The signs of dry friction
+are those of the desired motion, because the measured rates are half a frame old, and their signs
+would chatter.
 """
 
 from collections.abc import Callable
@@ -32,8 +33,8 @@ from dynamics.control.observer import Estimate
 from dynamics.kinematics.platform import Chart
 
 INTEGRAL_FACTOR = 0.2  # factor of the gain Ki = INTEGRAL_FACTOR bandwidth^3 without an observer
-# Rate at which the subtracted disturbance follows the estimate, divided by the bandwidth. A higher
-# rate would mainly pass noise on to the robot.
+# Rate, 1/s, at which the subtracted disturbance follows the estimate, divided by the bandwidth,
+# rad/s. A higher rate would mainly pass noise on to the robot.
 FOLLOWING_RATE = 1.0
 
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
@@ -49,8 +50,9 @@ def error_map(feedback: Feedback) -> np.ndarray:
 class DecayingErrors:
     """Recovery motion, along which errors (m,) decay.
 
-    `error` and `rate` are the errors, m and rad, and their rates at the time `begin`, s. `map` is
-    that of `error_map`. `correction` is an additional acceleration (m,), m/s^2 and rad/s^2.
+    `error` and `rate` are the errors, desired minus actual, m and rad, and their rates at the time
+    `begin`, s. `map` is that of `error_map`. `correction` is an additional acceleration (m,) of the
+    platform, m/s^2 and rad/s^2.
     """
 
     desired: Motion
@@ -71,8 +73,10 @@ class DecayingErrors:
 
     def pose_acceleration(self, t: np.ndarray) -> np.ndarray:
         """Pose accelerations (N, 6)."""
-        back = np.einsum("i,nij->nj", self.map[1], self._errors(t))
-        return self.desired.pose_acceleration(t) - self.chart.lifted(back - self.correction)
+        error_acceleration = np.einsum("i,nij->nj", self.map[1], self._errors(t))
+        return self.desired.pose_acceleration(t) - self.chart.lifted(
+            error_acceleration - self.correction
+        )
 
     def _errors(self, t: np.ndarray) -> np.ndarray:
         """Errors and their rates (N, 2, m)."""
@@ -85,7 +89,8 @@ class DecayingErrors:
 def computed_torque(assignment: Assignment) -> LawInLoop:
     """Law for drives that take torques.
 
-    Its controller raises the same errors as `Robot.inverse_dynamics`.
+    Its controller raises the same errors as `Robot.inverse_dynamics`, and SimulationError if the
+    observer diverges.
     """
     drives = replace(assignment.settings.drives, torques=True)
     expected: list[Estimate] = []
@@ -100,7 +105,7 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
     """Controller with an observer, whose estimates are appended to `expected`."""
     observer = assignment.watched(drives)
-    # fraction of the difference by which `subtracted` approaches the estimate in a frame
+    # fraction of its difference from the estimate that `subtracted` loses in a frame
     fraction = 1 - np.exp(-FOLLOWING_RATE * assignment.feedback.bandwidth * assignment.period)
     subtracted = observer.disturbance
 
@@ -110,8 +115,8 @@ def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) 
         arrival = observer.arrival(frame)
         predicted = observer.ahead(arrival)
         subtracted = subtracted + fraction * (observer.disturbance - subtracted)
-        way = _decaying_errors(assignment, arrival, predicted.coordinates, predicted.rates)
-        torque = _torque(assignment, way, way, observer.viscous) - subtracted
+        recovery = _decaying_errors(assignment, arrival, predicted.coordinates, predicted.rates)
+        torque = _torque(assignment, recovery, recovery, observer.viscous) - subtracted
         observer.issue(frame, torque)
         return torque
 
@@ -165,8 +170,8 @@ def _torque(
 ) -> np.ndarray:
     """Mean torque (n,) over the first frame of a recovery motion, N m or N.
 
-    The signs of dry friction are those of the motion `dry`. `viscous` (n,) is viscous friction in
-    addition to that of the model.
+    The signs of dry friction are those of the motion `dry`. `viscous` (n,) are coefficients of
+    viscous friction, N m s/rad or N s/m, in addition to those of the model.
     """
     span = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
     return np.asarray(span.torque[0] + viscous * (span.end[0] - span.begin[0]) / assignment.period)

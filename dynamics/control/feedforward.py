@@ -5,9 +5,9 @@ The drives need not accept torques. While a command U acts, the torque of a driv
     lp (U - theta) + ld (c U_dot - theta_dot) + li z - lx theta,    z_dot = U - theta
 
 as in `closed_loop.drives`. Along the desired motion, everything except U is known, and each command
-follows from the previous one. With the zero hold, the mean torque of the drive during a command is
-equal to the torque of the inverse dynamics. With the linear hold, the torque of the drive at the
-end of the ramp is equal to it. The servo adds its correction.
+follows from the previous one. With the zero hold, the mean torque of the drive while a command acts
+is equal to the mean torque of the inverse dynamics. With the linear hold, the torque of the drive
+at the end of the ramp is equal to it. The servo adds its correction.
 
 Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
 at rest. A constant error of the modelled torque thus has no effect.
@@ -74,8 +74,9 @@ def joint_commands(
 def feedforward(assignment: Assignment) -> LawInLoop:
     """Law in which the servo corrects the commands of `joint_commands`.
 
-    With an observer, the servo corrects the pose predicted for the arrival of its correction.
-    Raises the same errors as `joint_commands`.
+    With an observer, a controller takes the place of the servo. It corrects the pose predicted for
+    the arrival of its command, and raises SimulationError if the observer diverges. The law itself
+    raises the same errors as `joint_commands`.
     """
     settings = assignment.settings
     model = assignment.model

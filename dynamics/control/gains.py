@@ -21,11 +21,11 @@ from dynamics.control.law_interface import Feedback
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
-# Ratio of the error to the desired motion at the frequency that is the bandwidth.
+# Ratio of the error to the desired motion at the bandwidth.
 HALF_POWER = 2**-0.5
 DECAYED = 1e-3  # magnitude of eigenvalues below which a motion has decayed within a frame
-SLOWEST = 1e-2  # lowest frequency, rad/s, in the search for a bandwidth
-# Tolerance of a design, both for the ratio of its error to HALF_POWER and for its damping.
+SLOWEST = 1e-2  # bandwidth, rad/s, at which the search for a stable lower one ends
+# Largest relative deviation of a designed error from HALF_POWER, and largest lack of damping.
 DESIGN_TOLERANCE = 0.02
 
 
@@ -33,8 +33,9 @@ DESIGN_TOLERANCE = 0.02
 class LoopFigures:
     """Characteristic values of a loop near rest.
 
-    `bandwidth` is in rad/s, and `damping` has no unit. `radius` is the largest magnitude of an
-    eigenvalue. `gain_margin` is the factor of the gains at the limit of stability.
+    `bandwidth` is in rad/s, or NaN if the servo is unstable. `damping` has no unit. `radius` is the
+    largest magnitude of an eigenvalue. `gain_margin` is the factor of the gains at the limit of
+    stability, from 0.01 to 100, or NaN (see `stability.last_stable`).
     """
 
     bandwidth: float
@@ -78,7 +79,7 @@ def design_servo(
 
     def cost(logs: np.ndarray) -> float:
         error, reached_damping = figures(logs)
-        # the last term selects one of the many gains that meet both requirements
+        # many gains meet both requirements, and the third term selects those nearest to 1
         return (
             100 * (error / HALF_POWER - 1) ** 2
             + 100 * max(damping - reached_damping, 0.0)
@@ -86,7 +87,7 @@ def design_servo(
         )
 
     period = 1 / settings.timing.frame_rate_hz
-    # A servo that is stable on most robots. The logarithms are varied, because gains are positive.
+    # This servo is stable on most robots. The logarithms are varied, because gains are positive.
     start = np.log([0.3, 0.06 * period, bandwidth])
     best = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600}
@@ -108,7 +109,7 @@ DRIVE_FREQUENCIES = 17.0 * 1.15 ** np.array([0, 1, -1, 2, -2, 3, 4, 5, -3])
 # Damping ratios at the lowest natural frequency of designed drives, in the order of trial.
 DRIVE_DAMPINGS = (0.35, 0.5, 0.7)
 INTEGRAL_RATE = 1.1  # ratio li / lp of designed drives, 1/s, as in the paper
-WANTED_MARGIN = 1.5  # gain margin of the servo at which the search for drives ends
+WANTED_MARGIN = 1.5  # smallest gain margin of the servos at which the search for drives ends
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class DesignedDrives:
     `gains` (3,) are lp, li and ld. `inertias` are the smallest and the largest eigenvalue of the
     inertia matrix at the joints, kg m^2 or kg. `frequencies` are the highest and the lowest natural
     frequency with lp, rad/s, and `damping` is the damping ratio at the lowest. `margin` is the
-    smallest `gain_margin` of a servo.
+    smallest `gain_margin` of the servos.
     """
 
     gains: np.ndarray
@@ -134,9 +135,10 @@ def design_drives(
     """Gains of the joint PID that all joints share, for which the servo of each loop is stable.
 
     The first gains give the largest inertia at home the natural frequency and the damping of the
-    built-in robots. Others are tried if the gain margin of a servo is below `WANTED_MARGIN`.
-    `dynamic` are sets of dynamic parameters (p,). The inertia is that of the first set, and margins
-    are found for all. Raises SimulationError, with the largest margin, if no gains are stable.
+    built-in robots. Others are tried if the gain margin of a servo is below `WANTED_MARGIN`. If all
+    are below, the result is the gains with the largest margin. `dynamic` are sets of dynamic
+    parameters (p,). The inertia is that of the first set, and margins are computed for all. Raises
+    SimulationError, with the largest margin, if no gains are stable.
     """
     pose = robot.home_pose
     zero = np.zeros(len(robot.layout.joint_pid_names))
@@ -181,7 +183,7 @@ def torque_figures(
     """Characteristic values of the law computed_torque near rest at a pose (6,).
 
     An observer compensates the latency by prediction, and the values are then those of the loop
-    without latency. The bandwidth is always the desired one.
+    without latency. The bandwidth is not computed: it is the desired one.
     """
     period, delay = _times(settings, feedback)
 
@@ -204,8 +206,9 @@ def largest_bandwidth(
 ) -> float:
     """Largest bandwidth, rad/s, at which the law computed_torque is stable near rest.
 
-    The search begins at the bandwidth of the feedback and ends at half the frame rate, because one
-    command per frame cannot follow faster motions. The result is NaN if no bandwidth is stable.
+    The search begins at the bandwidth of the feedback. If this is stable, the search goes up to
+    half the frame rate, because one command per frame cannot follow faster motions. Otherwise, it
+    goes down to SLOWEST, and the result is NaN if no bandwidth is stable.
     """
 
     def radius(bandwidth: float) -> float:
@@ -265,8 +268,8 @@ def _torque_map(
     """Map of the law computed_torque from frame to frame.
 
     The state has coordinates and rates. Without an observer, it also has the previously measured
-    coordinates, the integral of the error, and the torques that have not yet arrived. `factor`
-    scales the gains of the law.
+    coordinates, the integral of the error (desired minus measured), and the torques that have not
+    yet arrived, the newest first. `factor` scales the gains of the law.
     """
     motion, push = stability.torque_motion(model.robot, model.parameters, pose)
     size = len(motion) // 2
@@ -274,13 +277,14 @@ def _torque_map(
     w = feedback.bandwidth
     identity = np.eye(size)
     map_ = error_map(feedback)
-    stiff = motion[size:, :size]
-    damp = motion[size:, size:]
+    by_position = motion[size:, :size]
+    by_velocity = motion[size:, size:]
     to_torque = np.linalg.pinv(push)
     # the mean acceleration along the recovery motion over a frame
     mean = np.linalg.solve(map_, expm(map_ * period) - np.eye(2)) / period
-    by_place, by_rate = (
-        to_torque @ (factor * (map_[1] @ along) * identity - along[0] * stiff - along[1] * damp)
+    by_coordinates, by_rate = (
+        to_torque
+        @ (factor * (map_[1] @ along) * identity - along[0] * by_position - along[1] * by_velocity)
         for along in mean.T
     )
     # Constant torques are part of the state, so that one exponential has their exact effect.
@@ -295,18 +299,18 @@ def _torque_map(
 
     if feedback.observer:
         moved, pushed = after(period)
-        return moved + pushed @ np.hstack([by_place, by_rate])
+        return moved + pushed @ np.hstack([by_coordinates, by_rate])
     late_frames = int(np.floor(delay / period + 1e-9))
     late_s = max(0.0, delay - late_frames * period)
     states = 4 * size + (late_frames + 1) * joints
     start = np.eye(states)
-    place = start[:size]
-    before = start[2 * size : 3 * size]
-    summed = start[3 * size : 4 * size]
-    integral = summed - period * place
+    coordinates = start[:size]
+    coordinates_before = start[2 * size : 3 * size]
+    integral_before = start[3 * size : 4 * size]
+    integral = integral_before - period * coordinates
     torque = (
-        by_place @ place
-        + by_rate @ (place - before) / period
+        by_coordinates @ coordinates
+        + by_rate @ (coordinates - coordinates_before) / period
         + factor * INTEGRAL_FACTOR * w**3 * to_torque @ integral
     )
     torques = [torque, *np.split(start[4 * size :], late_frames + 1)]
@@ -314,22 +318,26 @@ def _torque_map(
     for age, time in ((late_frames + 1, late_s), (late_frames, period - late_s)):
         moved, pushed = after(time)
         state = moved @ state + pushed @ torques[age]
-    return np.vstack([state, place, integral, *torques[: late_frames + 1]])
+    return np.vstack([state, coordinates, integral, *torques[: late_frames + 1]])
 
 
 def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
-    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`, or the Nyquist frequency."""
+    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`.
+
+    The search begins at 0.01 rad/s and ends at the Nyquist frequency, which is the result if the
+    error stays below.
+    """
     # the error may not be monotonic: a grid finds the first crossing, which Brent's method refines
-    places = np.geomspace(1e-2, np.pi * rate_hz, 60)
-    beyond = [_error_ratio(response(w)) > HALF_POWER for w in places]
+    frequencies = np.geomspace(1e-2, np.pi * rate_hz, 60)
+    beyond = [_error_ratio(response(w)) > HALF_POWER for w in frequencies]
     first = int(np.argmax(beyond))
     if not any(beyond) or first == 0:
-        return float(places[0 if any(beyond) else -1])
+        return float(frequencies[0 if any(beyond) else -1])
     return float(
         brentq(
             lambda w: _error_ratio(response(w)) - HALF_POWER,
-            places[first - 1],
-            places[first],
+            frequencies[first - 1],
+            frequencies[first],
             rtol=1e-6,
         )
     )
@@ -343,7 +351,7 @@ def _error_ratio(response: np.ndarray) -> float:
 def _damping(map_: np.ndarray) -> float:
     """Smallest damping ratio of the eigenvalues of a map."""
     values = np.linalg.eigvals(map_).astype(complex)
-    # Poles in units of the frame rate. States with an eigenvalue of about zero decay at once.
+    # poles in units of the frame rate, without those of states that decay at once
     poles = np.log(values[np.abs(values) > DECAYED])
     # a pole at zero has no damping
     return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))

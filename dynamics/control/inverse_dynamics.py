@@ -9,7 +9,7 @@ from dynamics.closed_loop.drives import Drives
 from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.robot import Robot
 
-# Nodes and weights of Gauss-Legendre quadrature over a span. The time of a reversal of friction is
+# Nodes and weights of Gauss-Legendre quadrature over a span. The time at which friction reverses is
 # resolved to about an eighth of the span.
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 GUESSED_DOUBT = 0.2  # value of `Model.doubt` for a guessed model, 1/s
@@ -64,7 +64,7 @@ class Model:
     friction : FrictionLaw
         Law of joint friction.
     doubt : float
-        Expected rate at which errors of torques change, relative to the torque at rest, 1/s.
+        Expected rate of change of the model's torque errors, relative to the torque at rest, 1/s.
 
     Examples
     --------
@@ -91,7 +91,7 @@ class Model:
         return self.robot.layout.split(self.parameters)[3]
 
     def held(self, pose: np.ndarray, drives: Drives) -> tuple[np.ndarray, np.ndarray]:
-        """Joint commands (n,) and integrals (n,) of the drives at rest at a pose (6,).
+        """Received commands (n,) and integrals (n,) of drives that hold the robot at a pose (6,).
 
         Friction torques are zero.
         """
@@ -131,8 +131,8 @@ class Spans:
     """Joint coordinates and torques of a motion over spans of time of equal length.
 
     `begin` and `end` (N, n) are joint coordinates at the ends of a span, and `mean` (N, n) is their
-    mean over the span. The integral of the joint coordinates from the beginning of the span on has
-    the mean `mean_integral` (N, n). `torque` (N, n) is the mean torque.
+    mean over the span. `mean_integral` (N, n), rad s or m s, is the mean over the span of their
+    integral since its beginning. `torque` (N, n) is the mean torque, N m or N.
     """
 
     begin: np.ndarray

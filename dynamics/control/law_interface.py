@@ -17,7 +17,7 @@ from dynamics.control.observer import Estimate, Observer
 
 @dataclass(frozen=True)
 class Feedback:
-    """Desired feedback of a law that commands torques.
+    """Desired feedback of a law. Bandwidth and damping are for laws that command torques.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Feedback:
     damping : float
         Damping ratio.
     observer : bool
-        True if an observer predicts the pose.
+        True if an observer predicts the pose. The law feedforward uses it, too.
 
     Examples
     --------
@@ -57,12 +57,12 @@ class Assignment:
     feedback : Feedback
         Desired bandwidth and damping.
     holding : ndarray, shape (n,)
-        Torque at rest at the start, as reported by drives that take torques.
+        Torque at rest at the start, as reported by drives that take torques, N m or N.
     latencies : ndarray, shape (frames,)
         Latency of each frame's command, s. A law is only allowed to use the latencies of the
         present frame and of earlier frames.
     noise : callable
-        Function frame -> covariance (6, 6) of the measured pose.
+        Function frame -> covariance (6, 6) of the noise of the measured pose.
     common : ndarray, shape (6, 6)
         Covariance of the error that all measured poses have in common.
 
@@ -102,9 +102,9 @@ class Assignment:
 
     def desired(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pose, pose rate and pose acceleration (6,) at a time, s."""
-        at = np.array([time])
+        times = np.array([time])
         motion = self.motion
-        return motion.pose(at)[0], motion.pose_rate(at)[0], motion.pose_acceleration(at)[0]
+        return motion.pose(times)[0], motion.pose_rate(times)[0], motion.pose_acceleration(times)[0]
 
     def watched(self, drives: Drives) -> Observer:
         """Observer of the run. `drives` may differ from those of the settings."""
@@ -120,7 +120,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class LawInLoop:
-    """Result of a law: a feedforward for the servo, or a controller.
+    """Result of a law: a feedforward for the servo, or a controller. With neither, the servo acts.
 
     Parameters
     ----------

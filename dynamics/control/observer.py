@@ -30,13 +30,13 @@ RATE_DOUBT = 1e-5  # standard deviation of the rates of the coordinates at the s
 TORQUE_DOUBT = 1e-3
 # Standard deviation of the unknown viscous friction, divided by the inertia at the joint, 1/s.
 VISCOUS_DOUBT = 5.0
-# Ratio of the model error with torque commands to the model error with joint commands. With torque
-# commands, an error that is a common factor of all parameters has an effect, too.
+# Ratio of the model error with torque commands to the model error with joint commands. An error by
+# a common factor of all parameters has an effect only with torque commands.
 TORQUE_COMMAND_FACTOR = 2.0
 # Time constant, s, with which information about the scales, from earlier innovations, fades. Far
 # from the solution the gradient is different, so that old information slows down convergence.
 MEMORY_TIME = 2.0
-# Prior information about the logarithms of the scales of the walk and of the noise.
+# Prior information (inverse variance) about the logarithms of the scales of walk and noise.
 PRIOR_INFORMATION = (0.3, 200.0)
 SAME_TIME = 1e-9  # difference, in frame periods, below which two instants count as the same
 
@@ -54,7 +54,7 @@ class Observer:
     """Observer of one run. All times are in s.
 
     At each frame, `see` processes the measured pose, `ahead` predicts, and `issue` stores the
-    command.
+    command. `see` and `ahead` raise SimulationError if the state is no longer finite.
 
     `model` is the law's model of the robot. `pose` (6,) is the pose at rest at the start, and
     `holding` (n,) is the command that holds it. `latencies` (frames,) are the latencies of the
@@ -100,8 +100,8 @@ class Observer:
         else:
             self._state[blocks.integral] = self._model.held(pose, self._drives)[1]
         torque_scale = np.abs(static_torque).mean()
-        # Within a frame period, the random walk changes as much as the error of the model. This
-        # error changes smoothly along a motion.
+        # Within a frame period, the random walk changes as much as the error of the model, although
+        # this error changes smoothly along a motion.
         walk = np.zeros(blocks.size)
         deviation = np.zeros(blocks.size)
         model_error = TORQUE_COMMAND_FACTOR if self._drives.torques else 1.0
@@ -133,12 +133,12 @@ class Observer:
 
     @property
     def disturbance(self) -> np.ndarray:
-        """Estimated torque (n,) at the joints, in addition to that of the model."""
+        """Estimated torque (n,) that acts at the joints in addition to those of the model."""
         return self._state[self._prediction.blocks.torque].copy()
 
     @property
     def viscous(self) -> np.ndarray:
-        """Estimated viscous friction (n,) of the joints, in addition to that of the model."""
+        """Estimated coefficients (n,) of viscous friction, in addition to those of the model."""
         return self._state[self._prediction.blocks.viscous].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
@@ -161,7 +161,7 @@ class Observer:
         return float(self._arrival[frame])
 
     def ahead(self, time: float) -> Estimate:
-        """Predict the state at a later time, s, with the commands that have been issued."""
+        """Predict coordinates and rates at a later time, s, under the commands issued so far."""
         return self._estimate(*self._moved(time, self._state, self._covariance, None))
 
     def issue(self, frame: int, command: np.ndarray) -> None:
@@ -172,14 +172,18 @@ class Observer:
         del self._arrivals[: -self._kept()], self._commands[: -self._kept()]
 
     def _kept(self) -> int:
-        """Number of stored commands that can still act."""
+        """Number of commands to keep: at least all that can still act."""
         return 4 + sum(1 for arrival in self._arrivals if arrival > self._time - 2 * self._period)
 
     def _estimate(self, state: np.ndarray, covariance: np.ndarray) -> Estimate:
         """Coordinates and rates of a state, with the covariance of the coordinates."""
         blocks = self._prediction.blocks
-        place = covariance[blocks.coordinates, blocks.coordinates]
-        return Estimate(state[blocks.coordinates].copy(), state[blocks.rates].copy(), place.copy())
+        coordinate_covariance = covariance[blocks.coordinates, blocks.coordinates]
+        return Estimate(
+            state[blocks.coordinates].copy(),
+            state[blocks.rates].copy(),
+            coordinate_covariance.copy(),
+        )
 
     def _learn(self, measured: np.ndarray, noise: np.ndarray) -> None:
         """Update the state, the covariance and the scales by measured coordinates (m,)."""
@@ -219,24 +223,27 @@ class Observer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """State and covariance at a later time, s.
 
-        The derivatives of the covariance with respect to the scales are updated in place.
+        `by_scale`, the derivatives of the covariance with respect to the scales, is updated in
+        place if given.
         """
-        at = self._time
-        while at < time - SAME_TIME * self._period:
+        now = self._time
+        while now < time - SAME_TIME * self._period:
             # a command acts from its arrival on, and a ramp ends one period later
             begins = [*self._arrivals, *(arrival + self._period for arrival in self._arrivals)]
-            later = [begin for begin in begins if at + SAME_TIME * self._period < begin < time]
-            until = min([time, *later])
+            next_begins = [
+                begin for begin in begins if now + SAME_TIME * self._period < begin < time
+            ]
+            until = min([time, *next_begins])
             # steps of equal length, none longer than LONGEST_STEP
-            end = at + (until - at) / np.ceil((until - at) / LONGEST_STEP)
-            command, rate = self._acting((at + end) / 2)
-            state, errors = self._prediction.step(state, covariance, command, rate, end - at)
-            walked = np.exp(self._log_scales[0]) * (end - at) * self._walk
+            end = now + (until - now) / np.ceil((until - now) / LONGEST_STEP)
+            command, rate = self._acting((now + end) / 2)
+            state, errors = self._prediction.step(state, covariance, command, rate, end - now)
+            walked = np.exp(self._log_scales[0]) * (end - now) * self._walk
             covariance = errors @ covariance @ errors.T + walked
             if by_scale is not None:
                 by_scale[:] = errors @ by_scale @ errors.T
                 by_scale[0] += walked
-            at = end
+            now = end
         if not np.isfinite(state).all():
             raise SimulationError(
                 f"the observer has diverged: its prediction for {time:.3f} s is not finite"

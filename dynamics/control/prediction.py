@@ -28,7 +28,7 @@ from dynamics.control.inverse_dynamics import Model
 MOST_ITERATIONS = 12
 # Ratio of a joint's friction error to the largest friction, below which the iterations end.
 FRICTION_TOLERANCE = 1e-6
-# Smallest standard deviation of a joint's velocity, rad/s or m/s. It is never known exactly.
+# Smallest standard deviation of a joint's velocity, rad/s or m/s: no velocity is known exactly.
 LEAST_WIDTH = 1e-9
 SHORTEST_HALVED = 1.5e-3  # length, s, below which no step is halved, even if a joint reverses in it
 # Smallest ratio of the velocity change by dry friction to the velocity's standard deviation. It is
@@ -64,7 +64,10 @@ class StateSlices(NamedTuple):
 
 
 class Prediction:
-    """Time steps of a robot with its drives, according to a model."""
+    """Time steps of a robot with its drives, according to a model.
+
+    The filter of the law `pid_filtered` is neglected.
+    """
 
     def __init__(self, model: Model, settings: LoopSettings) -> None:
         robot = model.robot
@@ -90,7 +93,8 @@ class Prediction:
         Also returns the map (size, size) from errors of the state before to errors after. The
         covariance (size, size) of the state determines how well the velocities of joints are known.
         A step in which a joint comes to rest or breaks away is halved until this event changes the
-        joint's velocity by less than the standard deviation of the velocity.
+        joint's velocity by less than the standard deviation of the velocity, or until the step is
+        shorter than SHORTEST_HALVED.
         """
         after, errors, too_long = self._once(state, covariance, command, command_rate, length)
         if not too_long or length < SHORTEST_HALVED:
@@ -120,29 +124,31 @@ class Prediction:
             return after, errors, False
         by_rates = jacobian @ errors[blocks.rates]
         velocity = jacobian @ after[blocks.rates]
-        # change of state and of joint velocities by a torque over the step
+        # changes of state and of joint velocities by unit torques over the step
         state_by_torque = errors[blocks.moving, blocks.torque]
         velocity_by_torque = jacobian @ state_by_torque[blocks.rates]
         width = np.sqrt(np.einsum("ij,jk,ik->i", by_rates, covariance, by_rates) + LEAST_WIDTH**2)
         largest, smooth = self._dry(velocity)
-        level, gains = expected_dry_friction(velocity, width, velocity_by_torque, largest, smooth)
+        friction, gains = expected_dry_friction(
+            velocity, width, velocity_by_torque, largest, smooth
+        )
         # friction at one joint changes the velocities, and thus the friction, of the others
         gain = np.linalg.solve(
-            np.eye(len(level))
+            np.eye(len(friction))
             + gains[:, None] * (velocity_by_torque - np.diag(np.diag(velocity_by_torque))),
             np.diag(gains),
         )
-        after[blocks.moving] -= state_by_torque @ level
+        after[blocks.moving] -= state_by_torque @ friction
         errors[blocks.moving] -= state_by_torque @ gain @ by_rates
         speed = np.maximum(
             np.abs(jacobian @ state[blocks.rates]), np.abs(jacobian @ after[blocks.rates])
         )
         # velocity that additional friction could remove
-        unused = np.diag(velocity_by_torque) * (largest - np.abs(level))
+        unused = np.diag(velocity_by_torque) * (largest - np.abs(friction))
         return after, errors, bool((np.minimum(speed, unused) > width).any())
 
     def _dry(self, velocity: np.ndarray) -> tuple[np.ndarray, float]:
-        """Largest dry friction (n,) at joint velocities, and the smoothing velocity of the law."""
+        """Largest dry friction (n,) at joint velocities, and the law's smoothing velocity or 0."""
         law = self._friction
         largest = self._coulomb
         if law.name == "stribeck":
@@ -175,7 +181,8 @@ class Prediction:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Time derivative of the moving parts, its derivatives, and the joint Jacobian (n, m).
 
-        The derivatives are with respect to the state without the offset.
+        The derivatives are with respect to the state without the offset, and ignore the torque
+        limit.
         """
         blocks = self.blocks
         law = self._law
@@ -232,10 +239,10 @@ def expected_dry_friction(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected dry friction (n,) over a step, and its gain (n,) for errors of the joint velocities.
 
-    `velocity` (n,) is the velocity after the step without dry friction. Its errors are normal, with
-    standard deviations `width` (n,). `velocity_by_torque` (n, n) is the change of the velocities by
-    a torque over the step, and `largest` (n,) is the largest torque. `smooth` is the velocity over
-    which the torque changes its sign.
+    `velocity` (n,) are the joint velocities after the step without dry friction. Their errors are
+    normal, with standard deviations `width` (n,). `velocity_by_torque` (n, n) is the change of the
+    velocities by unit torques over the step, and `largest` (n,) is the largest dry friction.
+    `smooth` is the smoothing velocity of the law, or 0.
 
     Dry friction brings a part of the distribution of velocities to rest. The gain is chosen so that
     propagated errors have the variance that remains. The slope of the expected torque would give
@@ -245,21 +252,21 @@ def expected_dry_friction(
     reach = np.maximum(own_effect * largest + smooth, LEAST_REACH * width)
     others = velocity_by_torque - np.diag(own_effect)
     # Newton's method; in its initial guess, each joint slips or rests as if it were alone
-    level = largest * np.sign(velocity) * (np.abs(velocity) > reach)
+    friction = largest * np.sign(velocity) * (np.abs(velocity) > reach)
     for _ in range(MOST_ITERATIONS):
-        saturation, slope, _ = expected_saturation(velocity - others @ level, width, reach)
-        residual = largest * saturation - level
-        level = level + np.linalg.solve(
-            np.eye(len(level)) + (largest * slope)[:, None] * others, residual
+        saturation, slope, _ = expected_saturation(velocity - others @ friction, width, reach)
+        residual = largest * saturation - friction
+        friction = friction + np.linalg.solve(
+            np.eye(len(friction)) + (largest * slope)[:, None] * others, residual
         )
         if np.abs(residual).max() <= FRICTION_TOLERANCE * largest.max():
             break
-    _, slope, variance = expected_saturation(velocity - others @ level, width, reach)
+    _, slope, variance = expected_saturation(velocity - others @ friction, width, reach)
     change = own_effect * largest
     # fraction of the variance of a velocity that remains after dry friction
     remaining = 1 - 2 * change * slope + (change / width) ** 2 * variance
     gain = (1 - np.sqrt(np.clip(remaining, 0.0, 1.0))) / own_effect
-    return np.clip(level, -largest, largest), gain
+    return np.clip(friction, -largest, largest), gain
 
 
 def expected_saturation(
@@ -267,8 +274,8 @@ def expected_saturation(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Expectation of sat(u / reach) over normal u, its derivative, and the variance of sat.
 
-    The derivative is with respect to the mean. Arrays have any shape. `deviation` and `reach` are
-    > 0.
+    The derivative is with respect to the mean of u. Arrays have any shape. The standard deviation
+    `deviation` of u and `reach` are > 0.
     """
     low = (-reach - mean) / deviation
     high = (reach - mean) / deviation
