@@ -109,7 +109,7 @@ class LoopProblem:
 
     @property
     def period(self) -> float:
-        """Inverse of the frame rate, s. With `times`, ramps, command rates and steps refer to it."""
+        """Inverse of the frame rate, s. Ramps, command rates and steps use it with `times`, too."""
         return 1.0 / self.settings.timing.frame_rate_hz
 
     @property

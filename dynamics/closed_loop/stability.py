@@ -174,7 +174,7 @@ def lowest_frame_rate(
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
-    """Text on a run that ended early: the largest eigenvalue, and from which frame rate it is < 1."""
+    """Text on a run that ended early: largest eigenvalue, and frame rate from which it is < 1."""
     arguments = robot, parameters, settings, pose
     radius = spectral_radius(*arguments)
     hz = settings.timing.frame_rate_hz
