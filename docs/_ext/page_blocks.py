@@ -63,6 +63,14 @@ COVERED = {
     "predicted_position_rms_um": "error of predicted positions, µm",
 }
 
+# Figures of single poses.
+POSE_ERRORS = {
+    "position_rms_um": "position error, µm",
+    "stated_position_rms_um": "as stated, µm",
+    "orientation_rms_urad": "orientation error, µrad",
+    "centre_rms_px": "error of a centre, px",
+}
+
 # Figures of simulation-based calibration.
 UNIFORM = {
     "intervals": "identified quantities",
@@ -149,6 +157,12 @@ TABLES: dict[str, Callable[[Path], str]] = {
     ),
     "answer_calibration_full": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
     "answer_calibration_off_grid": kept_figures.answer("calibration_off_grid", {}, UNIFORM | POSES),
+    "answer_pixel_noise": kept_figures.answers(
+        {"pixel_noise": ("`analytic`",), "pixel_noise_scene": ("`scene`",)},
+        ("renderer",),
+        {"sensor.camera.dark_noise": "dark noise, electrons"},
+        POSE_ERRORS,
+    ),
     "answer_full_bodies": kept_figures.answer("full_bodies", {}, UNCENTRED),
     **{f"answer_{name}": kept_figures.answer(name, *heads) for name, heads in ANSWERS.items()},
     "answer_control_laws": kept_figures.answers(

@@ -181,7 +181,6 @@ def show_image(axes: Axes, view: StereoView, side: int) -> None:
     )
     axes.tick_params(labelsize=7)
     axes.set_xlabel("px", fontsize=8)
-    axes.label_outer()
 
 
 def brightened(image: Array) -> Array:
