@@ -27,13 +27,14 @@ from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
 
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
 DEFAULT_DISTORTION = "brown5"
+# Number of steps after which the adjustment fails.
 MOST_STEPS = 60
-# Relative decrease of the sum of squares that ends the iteration.
+# The iteration ends when a step decreases the sum of squares by less than this fraction.
 SMALLEST_GAIN = 1e-11
 # N, scaled to a unit diagonal, counts as singular if its smallest eigenvalue is below this.
 SINGULAR = 1e-14
 POSE = 6  # number of unknowns of a pose
-# Each view has the unknowns that are common to all views, then the pose of its own board.
+# Slices of the unknowns of a view. The pose of the view's board follows the common unknowns.
 COMMON = slice(None, -POSE)
 BOARD = slice(-POSE, None)
 
@@ -41,8 +42,9 @@ BOARD = slice(-POSE, None)
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
     """Return the matrix (9, k) that maps the k free intrinsics of a camera to all nine.
 
-    ``distortion`` is the key of DISTORTIONS that names the free distortion terms. ``fix_aspect``
-    sets fx = fy. Raises UnknownOptionError for an unknown key.
+    ``distortion`` is the key of DISTORTIONS that names the free distortion terms. With
+    ``fix_aspect``, fx and fy change by the same amount. Raises UnknownOptionError for an unknown
+    key.
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
@@ -108,7 +110,10 @@ class RigState:
 
 
 def _moved(transform: Array, change: Array) -> Array:
-    """Return a transform (4, 4) after a small change [dt, dphi] (6,)."""
+    """Return a transform (4, 4) after a small change [dt, dphi] (6,).
+
+    dt is added to the translation, m. The rotation vector dphi, rad, turns the output axes.
+    """
     moved = transform.copy()
     moved[:3, 3] += change[:3]
     moved[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
@@ -120,14 +125,14 @@ class Adjustment:
     """Result of an adjustment.
 
     state                   adjusted rig and board poses
-    residuals               (m, 2) for each camera, measured minus computed pixels
+    residuals               (m, 2) for each camera, measured minus computed pixels, px
     sigma_px                estimated standard deviation of a pixel coordinate
     covariance              (24, 24), of the 9 left intrinsics, the 9 right intrinsics and the small
                             error [dt, dphi] of right_from_left
-    independent_covariance  the same matrix if all points had independent errors
+    independent_covariance  what ``covariance`` would be if all points had independent errors
     condition               condition number of N scaled to a unit diagonal
     steps                   number of iterations
-    freedom                 number of observations minus number of unknowns
+    freedom                 degrees of freedom: number of observations minus number of unknowns
     shared                  common errors of the points of a view
     """
 
@@ -148,7 +153,8 @@ class _Normal:
 
     ``matrix`` (v, s, s) and the right-hand side ``rhs`` (v, s) have s = c + 6 unknowns: first the c
     common ones, then the pose of the view's board. ``residuals`` are those of each camera (m, 2),
-    px. ``cost`` is the sum of the squared residuals of both cameras, px².
+    px. ``cost`` is the sum of the squared residuals of both cameras, px². It is inf if a point lies
+    behind a camera.
     """
 
     matrix: Array
@@ -157,7 +163,7 @@ class _Normal:
     cost: float
 
     def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
-        """Return the blocks of the matrix with its diagonal enlarged by the damping.
+        """Return the blocks of the matrix with its diagonal multiplied by 1 + ``damping``.
 
         The blocks are those of the common unknowns (v, c, c), the mixed ones (v, c, 6), and those
         of the boards (v, 6, 6).
@@ -185,8 +191,8 @@ class _Normal:
             scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * rhs, rcond=1e-15)[0]
         )
         _, mixed, boards = self.blocks(damping)
-        rest = self.rhs[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
-        return common, np.linalg.solve(boards, rest[..., None])[..., 0]
+        board_rhs = self.rhs[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
+        return common, np.linalg.solve(boards, board_rhs[..., None])[..., 0]
 
 
 def adjust(
@@ -195,7 +201,8 @@ def adjust(
     """Adjust the rig and the board poses to sightings of the board's points (n, 3), m.
 
     At least one camera must have sightings in each view. ``free`` (9, k) is the result of
-    ``free_directions``. Raises CalibrationError if the views do not determine the cameras.
+    ``free_directions``. Raises CalibrationError if there are not more observations than unknowns,
+    if the iteration does not converge, or if the views do not determine the cameras.
     """
 
     def build(state: RigState) -> _Normal:
@@ -203,9 +210,9 @@ def adjust(
 
     state, steps = _minimise(build, start, free)
     normal = build(state)
-    size = normal.rhs.shape[1] - POSE
+    common = normal.rhs.shape[1] - POSE
     observations = sum(2 * len(s.view) for s in sightings)
-    unknowns = size + POSE * len(state.left_from_boards)
+    unknowns = common + POSE * len(state.left_from_boards)
     freedom = observations - unknowns
     if freedom < 1:
         raise CalibrationError(
@@ -241,7 +248,10 @@ def adjust(
 def _minimise(
     build: Callable[[RigState], _Normal], state: RigState, free: Array
 ) -> tuple[RigState, int]:
-    """Return the state of least cost by Levenberg and Marquardt's method, and the steps taken."""
+    """Return the state of least cost by Levenberg and Marquardt's method, and the steps taken.
+
+    Raises CalibrationError after MOST_STEPS steps.
+    """
     damping = 1e-4
     normal = build(state)
     k = free.shape[1]
@@ -257,7 +267,8 @@ def _minimise(
             if gain < SMALLEST_GAIN:
                 return state, step
         elif damping > 1e6 or abs(common @ normal.rhs[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost:
-            # the linear model predicts almost no decrease, so the increase is a rounding error
+            # Either not even a tiny step decreases the cost, or the linear model predicts almost
+            # no decrease, so that the increase is a rounding error.
             return state, step
         else:
             damping *= 10.0
@@ -300,7 +311,7 @@ def _normal_equations(
 def _predict(
     points: Array, seen: Sightings, state: RigState, side: int, free: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the predicted pixels (m, 2) of one camera, and their derivatives.
+    """Return the predicted pixels (m, 2) of one camera, and the derivatives of the pixels.
 
     The derivatives are with respect to the common unknowns (m, 2, c) and to the pose of the view's
     board (m, 2, 6).
@@ -308,24 +319,24 @@ def _predict(
     k = free.shape[1]
     left_from_board = state.left_from_boards[seen.view]
     turned = np.einsum("mij,mj->mi", left_from_board[:, :3, :3], points[seen.point])
-    places = turned + left_from_board[:, :3, 3]
-    place_by_board = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2
+    camera_points = turned + left_from_board[:, :3, 3]
+    point_by_board = np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(camera_points), 3, 3)), -skew(turned)], axis=2
     )
     if side == 1:
         rotation = state.right_from_left[:3, :3]
-        turned = places @ rotation.T
-        places = apply(state.right_from_left, places)
-        place_by_board = rotation @ place_by_board
-    ahead = places[:, 2] > 1e-6
-    pixels, by_intrinsics, by_place = computed_pixels(
-        state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0])
+        turned = camera_points @ rotation.T
+        camera_points = apply(state.right_from_left, camera_points)
+        point_by_board = rotation @ point_by_board
+    ahead = camera_points[:, 2] > 1e-6
+    pixels, by_intrinsics, by_point = computed_pixels(
+        state.intrinsics[side], np.where(ahead[:, None], camera_points, [0.0, 0.0, 1.0])
     )
     # A step that puts a board behind a camera must not count as an improvement.
     pixels[~ahead] = np.inf
-    by_common = np.zeros((len(places), 2, 2 * k + POSE))
+    by_common = np.zeros((len(camera_points), 2, 2 * k + POSE))
     by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
     if side == 1:
-        by_common[:, :, 2 * k : 2 * k + 3] = by_place
-        by_common[:, :, 2 * k + 3 :] = by_place @ -skew(turned)
-    return pixels, by_common, by_place @ place_by_board
+        by_common[:, :, 2 * k : 2 * k + 3] = by_point
+        by_common[:, :, 2 * k + 3 :] = by_point @ -skew(turned)
+    return pixels, by_common, by_point @ point_by_board

@@ -4,9 +4,9 @@ The board frame has its origin at the first point. Its x axis points from column
 axis from row to row, and its z axis away from an observer who looks at the front. All points lie in
 z = 0. They are ordered row by row, and along x within a row, as in OpenCV.
 
-The points of a chessboard and of a ChArUco board are the inner corners of their squares. A ChArUco
-board has a marker in each bright square. The markers identify the corners even if a part of the
-board lies outside of the picture.
+The points of a chessboard and of a ChArUco board are the inner corners of their squares. Those of
+the other boards are the centres of their dots. A ChArUco board has a marker in each bright square.
+The markers identify the corners even if a part of the board lies outside of the picture.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Board(Section):
     spacing     distance between neighbouring points, m; for asymmetric_dots the distance between
                 rows, while dots of the same row are twice as far apart
     radius      radius of the dots, m; only for dots
-    dark        True if dots are darker than the board
+    dark        True if dots are darker than the board; without effect for boards of squares
     marker      side of the markers with their dark border, m; only for charuco
     dictionary  OpenCV's name of the markers' dictionary, such as "5X5_100" or "APRILTAG_36h11";
                 only for charuco
@@ -106,12 +106,12 @@ class Board(Section):
         """Return OpenCV's description of a ChArUco board.
 
         If the number of rows of squares is even, OpenCV before version 4.6 placed the markers in
-        the other squares. ``legacy`` describes such a board.
+        the squares of the other colour. If ``legacy`` is True, such a board is described.
         """
         squares = (self.columns + 1, self.rows + 1)
-        found = cv2.aruco.CharucoBoard(squares, self.spacing, self.marker or 0.0, self.markers)
-        found.setLegacyPattern(legacy)
-        return found
+        described = cv2.aruco.CharucoBoard(squares, self.spacing, self.marker or 0.0, self.markers)
+        described.setLegacyPattern(legacy)
+        return described
 
     @property
     def dot_radius(self) -> float:
@@ -132,11 +132,11 @@ class Board(Section):
 
     @property
     def symmetries(self) -> list[NDArray[np.int_]]:
-        """Orders (points,) of the board's points that a picture cannot tell apart.
+        """Permutations (n,) of the indices of all n points that a picture cannot distinguish.
 
-        The first is the order of ``points``. The others follow from half a turn of the board, and
-        from quarter turns if it has as many rows as columns. An asymmetric grid with an odd number
-        of rows has no others, and neither has a ChArUco board.
+        The first is the identity. The others follow from half a turn of the board, and from quarter
+        turns if it has as many rows as columns. An asymmetric grid with an odd number of rows has
+        only the identity, and so has a ChArUco board.
         """
         order = np.arange(self.rows * self.columns)
         if self.kind == "charuco":
@@ -164,9 +164,10 @@ class Board(Section):
 
 
 def read_board(path: str | Path) -> Board:
-    """Read the board of a TOML file.
+    """Read a board file (TOML).
 
-    Raises CalibrationError for an unknown key, with the valid names, and for an invalid value.
+    Raises CalibrationError for a file that cannot be read, for an unknown key, with the valid
+    names, and for an invalid value. Raises UnknownOptionError for an unknown dictionary.
     """
     source = f"board file {path}"
     content = parsed(read_text(path, source, CalibrationError), source, CalibrationError)

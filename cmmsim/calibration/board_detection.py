@@ -30,12 +30,13 @@ from cmmsim.detection.tags import find_tags
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-# Smallest fraction of a board's points that must be measured.
+# A view of a board other than ChArUco is rejected if less than this fraction of the points is
+# measured.
 FEWEST_MEASURED = 0.7
 # Smallest number of measured points of a ChArUco board, which may lie partly outside the picture.
 FEWEST_CHARUCO = 6
-# Largest distance of a measured point from the place that the homography of the board predicts. The
-# unit is the distance between neighbouring points.
+# A view is rejected if a measured point is farther than this from the pixel that the homography of
+# the board predicts. The unit is the distance between neighbouring points.
 LARGEST_POINT_GAP = 0.25
 # Largest relative difference between the measured and the given radius of the dots. A larger one
 # would make the correction of the dots' centres wrong by more than 20 %.
@@ -43,7 +44,7 @@ LARGEST_RADIUS_GAP = 0.1
 
 FIT_ITERATIONS = 5
 # Radius of the part of the image that is fitted around a dot, in dot radii. Its pixels beyond
-# GROUND_FROM dot radii belong to the ground.
+# GROUND_FROM dot radii belong to the background.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
 # Standard deviations of blur that are tried, and the number of dots on which they are tried.
@@ -55,9 +56,9 @@ LARGEST_MOVE = 0.3
 # covered area.
 FEWEST_FITTED = 0.5
 # The area of a dot is measured in its cell, a disc around it. Number of samples along each side of
-# the square that encloses the cell.
+# the square that encloses the cell:
 CELL_SIDE = 41
-# The mean of these percentiles of a cell's grey values separates ground from dot.
+# The mean of these percentiles of a cell's grey values separates background from dot.
 EXTREME_PERCENTILES = (2.0, 98.0)
 # The noise of a photograph is unknown. It is set to 5 grey values in all pixels, which then have
 # equal weight. A shape with residuals above 25 grey values rms is not an ellipse and is rejected.
@@ -65,13 +66,15 @@ PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
+# Bright spots with a smaller area are not dots.
 SMALLEST_AREA_PX = 20.0
-# Largest area of a dot, as a share of the area of the image.
+# Bright spots that fill more than this fraction of the image are not dots.
 LARGEST_AREA = 0.01
-# OpenCV first searches an image reduced to at most this size, which is faster and has less noise.
+# OpenCV first searches an image whose longer side is reduced to this length. This is faster and
+# reduces noise.
 FIND_SIDE_PX = 1600
-# Largest distance of a dot from the grid that the four corners define. The unit is the distance
-# between neighbouring dots.
+# The search with a single threshold fails if a dot is farther than this from the grid that the four
+# corners define. The unit is the distance between neighbouring dots.
 LARGEST_GRID_GAP = 0.3
 
 
@@ -79,8 +82,9 @@ LARGEST_GRID_GAP = 0.3
 class BoardView:
     """View of a board by one camera.
 
-    ``index`` (n,) identifies the points of the board, ``pixels`` (n, 2) are their places in the
-    image, and ``radius`` is the measured radius of the dots, m.
+    ``index`` (n,) are the indices of the visible points of the board in ascending order, and
+    ``pixels`` (n, 2) their pixels. ``radius`` is the measured radius of the dots, m; None for
+    squares.
     """
 
     index: NDArray[np.int_]
@@ -88,14 +92,14 @@ class BoardView:
     radius: float | None = None
 
     def read_as(self, order: NDArray[np.int_]) -> BoardView:
-        """Return the view with its points renamed by one of the board's symmetries."""
-        renamed = order[self.index]
-        by_index = np.argsort(renamed)
-        return replace(self, index=renamed[by_index], pixels=self.pixels[by_index])
+        """Return the view in which point k of the board is taken for point ``order[k]``."""
+        indices = order[self.index]
+        by_index = np.argsort(indices)
+        return replace(self, index=indices[by_index], pixels=self.pixels[by_index])
 
 
 def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
-    """Return the view of the board in a grey image, or the reason why none was found."""
+    """Return the view of the board in a grey image, or the reason why there is none, as a text."""
     radius: float | None = None
     if board.kind == "chessboard":
         found = find_chessboard(grey, board.columns, board.rows)
@@ -127,8 +131,9 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
 def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     """Return the view with its points in the board's order, or the reason why it is rejected.
 
-    A camera sees only the front of a board, so a mirrored order is wrong. It is corrected by
-    reversing each row, except for asymmetric dots, which are rejected.
+    A camera sees only the front of a board, so a mirrored order is wrong. Reversing each row
+    corrects it. Asymmetric dots in mirrored order are rejected, and so are points that lie on one
+    line or do not fit a homography.
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
@@ -147,10 +152,10 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     step = np.linalg.norm(
         np.diff(cv2.perspectiveTransform(board.points[None, :2, :2], homography)[0], axis=0)
     )
-    gap = np.linalg.norm(expected - view.pixels, axis=1).max()
-    if gap > LARGEST_POINT_GAP * step:
+    farthest = np.linalg.norm(expected - view.pixels, axis=1).max()
+    if farthest > LARGEST_POINT_GAP * step:
         return (
-            f"points are up to {gap:.1f} px from the perspective image of the board, so their "
+            f"points are up to {farthest:.1f} px from the perspective image of the board, so their "
             "order is wrong"
         )
     return view
@@ -169,10 +174,10 @@ def radius_differs(measured: float | None, given: float | None) -> bool:
 
 
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
-    """Return the dot centres (rows * columns, 2) px in the board's order, and the radius, m.
+    """Return the centres (rows * columns, 2) px and the measured radius of the dots, m.
 
-    The radius is measured. The centre of a dot whose fit failed is NaN. The result is None if no
-    board is found.
+    The centres are in the board's order. The centre of a dot whose fit failed is NaN. The result is
+    None if no board is found.
     """
     bright = 255 - grey if board.dark else grey
     rough = search_dots(bright, board)
@@ -189,9 +194,9 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
 def _refine(
     bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 ) -> tuple[Array, Array]:
-    """Return fitted centres (n, 2), and ratios (n,) of the fitted to the expected radii.
+    """Return fitted centres (n, 2) px, and ratios (n,) of the fitted to the expected radii.
 
-    Dots with windows of the same size are fitted together.
+    Both are NaN for dots whose fit failed. Dots with windows of the same size are fitted together.
     """
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
     # the window must not contain neighbouring dots
@@ -218,9 +223,9 @@ def _refine(
 
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
-    """Return the standard deviation in px of the Gaussian blur with the smallest misfit.
+    """Return the standard deviation of blur among SPREADS_PX with the smallest misfit, px.
 
-    The blur is that of lens and focus together.
+    The blur is the Gaussian blur of lens and focus together.
     """
     best = SPREADS_PX[0]
     least = np.inf
@@ -255,7 +260,7 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
 def _without_neighbours(
     windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float
 ) -> Array:
-    """Return windows (n, h, h) with the grey value of the ground beyond ``reach`` dot radii."""
+    """Return windows (n, h, h) filled with the background beyond ``reach`` dot radii."""
     # Imported late, because importing numba takes time.
     from cmmsim.detection.start_kernels import isolate_dots
 
@@ -265,19 +270,19 @@ def _without_neighbours(
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Return the median radius of bright dots, in units of half the distance to a neighbour.
+    """Return the median radius of bright dots, in units of the radius of their cells.
 
     Centres are (n, 2) px, and ``steps`` (n, 2, 2) px map the unit disc to each dot's cell. The dot
     covers the fraction (mean - ground) / (dot - ground) of its cell. Here, mean is the mean grey
-    value of the cell, and ground and dot are the grey values of the ground and of the dot. The
+    value of the cell, and ground and dot are the grey values of the background and of the dot. The
     radius is overestimated if a dot is so blurred that its middle is not uniform: by a quarter at
     2.5 px radius and 1 px of blur.
     """
     ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
     within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
     cell = np.stack(np.meshgrid(ticks, ticks), axis=-1)[within]
-    places = (centres[:, None] + cell @ steps.swapaxes(1, 2)).astype(np.float32)
-    values = cv2.remap(bright, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
+    samples = (centres[:, None] + cell @ steps.swapaxes(1, 2)).astype(np.float32)
+    values = cv2.remap(bright, samples[..., 0], samples[..., 1], cv2.INTER_LINEAR).astype(float)
     middle = np.percentile(values, EXTREME_PERCENTILES, axis=1).mean(axis=0)[:, None]
     ground = np.nanmedian(np.where(values <= middle, values, np.nan), axis=1)
     dot = np.nanmedian(np.where(values >= middle, values, np.nan), axis=1)
@@ -288,7 +293,8 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
 def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
     """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None.
 
-    Otsu's threshold is tried first, then OpenCV in a reduced image, then OpenCV in the whole image.
+    Otsu's threshold is tried first, but not for asymmetric dots. OpenCV is then tried in a reduced
+    image, and finally in an image of the full size.
     """
     rough = read_at_once(bright, board) if board.kind == "dots" else None
     for side in (FIND_SIDE_PX, max(bright.shape)):
@@ -306,20 +312,20 @@ def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
     if len(points) != len(board.points):
         return None
     corners = _sharpest_corners(points)
-    last = np.array([board.columns - 1, board.rows - 1], dtype=np.float32)
-    grid = last * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
+    far_corner = np.array([board.columns - 1, board.rows - 1], dtype=np.float32)
+    grid = far_corner * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
     for turn in range(4):
         homography = cv2.getPerspectiveTransform(
             np.roll(corners, turn, axis=0).astype(np.float32), grid
         )
-        places = cv2.perspectiveTransform(points[None], homography)[0]
-        cells = np.rint(places)
-        inside = np.all((cells >= 0) & (cells <= last))
+        grid_points = cv2.perspectiveTransform(points[None], homography)[0]
+        cells = np.rint(grid_points)
+        inside = np.all((cells >= 0) & (cells <= far_corner))
         index = (cells[:, 1] * board.columns + cells[:, 0]).astype(int)
         if (
             inside
             and len(set(index)) == len(points)
-            and np.abs(places - cells).max() < LARGEST_GRID_GAP
+            and np.abs(grid_points - cells).max() < LARGEST_GRID_GAP
         ):
             return np.asarray(points[np.argsort(index)])
     return None
@@ -334,6 +340,7 @@ def _bright_spots(bright: NDArray[np.uint8]) -> Array:
         if SMALLEST_AREA_PX <= moments["m00"] <= LARGEST_AREA * bright.size:
             x = moments["m10"] / moments["m00"]
             y = moments["m01"] / moments["m00"]
+            # The outlines include those of dark holes in a bright area.
             if shown[round(y), round(x)]:
                 centroids.append((x, y))
     return np.array(centroids).reshape(-1, 2)
@@ -353,9 +360,10 @@ def _sharpest_corners(points: Array) -> Array:
 
 
 def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
-    """Return the dot centres (n, 2) px that OpenCV finds in a scaled image, or None.
+    """Return the dot centres (n, 2) that OpenCV finds in a scaled image, or None.
 
-    OpenCV itself returns (n, 1, 2) up to version 4, and (n, 2) from version 5 on.
+    The centres are in px of the original image. OpenCV itself returns (n, 1, 2) up to version 4,
+    and (n, 2) from version 5 on.
     """
     small = (
         bright

@@ -1,6 +1,6 @@
 """Calibration of both cameras from the views of a board, with warnings about doubtful results.
 
-The steps are the start values, the adjustment, the rejection of images that do not fit, and the
+The steps are the initial values, the adjustment, the rejection of images that do not fit, and the
 correction of the dots' centres.
 """
 
@@ -35,24 +35,26 @@ FEWEST_PAIRS = 3
 LARGEST_RMS_RATIO = 4.0
 # Rms residuals below this limit are rounding errors and never lead to a rejection.
 ROUNDING_PX = 1e-3
-# Largest number of rounds of rejecting images, and of correcting dot centres.
+# Largest number of rounds in which images are rejected, and in which dot centres are corrected.
 ROUNDS = 5
 # The correction of the dot centres ends when it changes by less than this.
 TOLERANCE_PX = 1e-4
-# Plausible range of a board's longer side, m. Other values suggest a wrong unit.
+# Plausible range of a board's longer side, m. Other values give a warning about the unit.
 BOARD_SIDES = (0.01, 5.0)
-# Largest fraction of unused pairs without a warning.
+# A warning is given if more than this fraction of the pairs has an unused image.
 LARGEST_UNUSED = 1.0 / 3.0
-# A right camera that stands to the left of the left camera by more than this fraction of the
-# baseline is reported.
+# A warning is given if the right camera stands to the left of the left camera by more than this
+# fraction of the baseline.
 LARGEST_LEFTWARD = 0.5
-# Largest standard deviations without a warning, as shares of focal length and of image width.
+# A warning is given if the standard deviation of the focal length exceeds this fraction of the
+# focal length, or that of the principal point exceeds this fraction of the image's width.
 LARGEST_FOCAL_STD = 0.003
 LARGEST_CENTRE_STD = 0.005
-# Smallest angle without a warning between the two board normals that differ most, rad (15 degrees).
+# A warning is given if no two board normals differ by this angle, rad (15 degrees).
 SMALLEST_TILT = 0.26
-# Smallest fraction of the image within the convex hull of all points without a warning.
+# A warning is given if the convex hull of all points covers less than this fraction of the image.
 SMALLEST_COVER = 0.4
+# A warning is given if there are fewer views than this.
 FEW_VIEWS = 8
 
 
@@ -62,7 +64,8 @@ class CalibrationOptions:
 
     ``distortion`` is the key of DISTORTIONS that names the free distortion terms. ``fix_aspect``
     sets fx = fy. ``min_images`` is the required number of pairs in which both cameras see the
-    board. ``correct_dots`` enables the correction for the eccentricity of the dots' images.
+    board. ``correct_dots`` enables the correction for the eccentricity of the dots' images. Raises
+    UnknownOptionError for an unknown key, and CalibrationError if ``min_images`` is too small.
     """
 
     distortion: str = DEFAULT_DISTORTION
@@ -87,8 +90,8 @@ def calibrate(
     """Calibrate both cameras from pairs of images of size (width, height) px.
 
     A pair in which only one camera sees the board contributes to that camera only. Raises
-    CalibrationError if both cameras see the board in too few pairs, with the reasons, or if the
-    views do not determine the cameras.
+    CalibrationError, with the reasons, if both cameras see the board in too few pairs, if too few
+    pairs agree on the pose of the right camera, or if the views do not determine the cameras.
     """
     options = options or CalibrationOptions()
     _require_pairs(pairs, options)
@@ -134,7 +137,8 @@ def _without_misfits(
 ) -> tuple[list[PairView], list[PairView], Adjustment, tuple[Sightings, Sightings]]:
     """Adjust the rig, and reject images that fit far worse than the others.
 
-    Return all pairs, the used pairs, the adjustment, and the sightings that it used.
+    Return all pairs, the used pairs, the adjustment, and the sightings that the adjustment used.
+    In the pairs, a reason replaces each rejected view.
     """
     judged = list(pairs)
     boards = start.left_from_boards.copy()
@@ -184,17 +188,20 @@ def _with_true_centres(
 ) -> tuple[Adjustment, tuple[Sightings, Sightings]]:
     """Adjust the rig to dot centres that are corrected for the eccentricity of their images.
 
-    The correction depends on the rig, so correction and adjustment alternate.
+    Return the adjustment, and the corrected sightings. The correction depends on the rig, so
+    correction and adjustment alternate.
     """
-    last = [np.zeros_like(seen.pixels) for seen in measured]
+    latest = [np.zeros_like(seen.pixels) for seen in measured]
     for _ in range(ROUNDS):
         offsets = [
             _offsets(board, seen, solved.state, side, size) for side, seen in enumerate(measured)
         ]
         corrected = measured[0].shifted(-offsets[0]), measured[1].shifted(-offsets[1])
         solved = adjust(board.points, corrected, solved.state, free)
-        change = max(np.abs(now - before).max() for now, before in zip(offsets, last, strict=True))
-        last = offsets
+        change = max(
+            np.abs(now - before).max() for now, before in zip(offsets, latest, strict=True)
+        )
+        latest = offsets
         if change < TOLERANCE_PX:
             break
     return solved, corrected
@@ -204,14 +211,14 @@ def _offsets(
     board: Board, seen: Sightings, state: RigState, side: int, size: tuple[int, int]
 ) -> Array:
     """Return the eccentricities (m, 2) px: a dot image's centre minus the dot centre's image."""
-    moves = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
-    places = (
-        np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point])
-        + moves[seen.view, :3, 3]
+    poses = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
+    centres = (
+        np.einsum("mij,mj->mi", poses[seen.view, :3, :3], board.points[seen.point])
+        + poses[seen.view, :3, 3]
     )
-    normals = -moves[seen.view, :3, 2]
+    normals = -poses[seen.view, :3, 2]
     return centre_offset(
-        camera_from(state.intrinsics[side], *size), places, normals, board.dot_radius
+        camera_from(state.intrinsics[side], *size), centres, normals, board.dot_radius
     )
 
 
@@ -245,7 +252,7 @@ def contradictions(board: Board, state: RigState, pairs: Sequence[PairView]) -> 
 
 
 def _dot_radius(board: Board, pairs: Sequence[PairView]) -> list[str]:
-    """Return a line if the dots are not of the size that the board file gives."""
+    """Return a line if the measured radius of the dots contradicts the board file."""
     radii = [
         view.radius
         for pair in pairs
@@ -267,10 +274,10 @@ def _swapped(state: RigState) -> list[str]:
     eye = invert(state.right_from_left)[:3, 3]
     if eye[0] >= -LARGEST_LEFTWARD * np.linalg.norm(eye):
         return []
-    place = ", ".join(f"{value:.3g}" for value in eye)
+    where = ", ".join(f"{value:.3g}" for value in eye)
     return [
         "the right camera stands on the left of the left camera, at "
-        f"({place}) m in the left camera's axes: if this is wrong, swap the folders LEFT and RIGHT"
+        f"({where}) m in the left camera's axes: if this is wrong, swap the folders LEFT and RIGHT"
     ]
 
 
@@ -314,10 +321,10 @@ def weaknesses(
             f"times that of independent errors (limit by chance: {solved.shared.limit:.1f}); is "
             "the board flat, evenly lit and sharp?"
         )
-    spread = np.sqrt(np.diag(solved.covariance))
+    std = np.sqrt(np.diag(solved.covariance))
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):
-        focal = spread[9 * side : 9 * side + 2].max()
-        centre = spread[9 * side + 2 : 9 * side + 4].max()
+        focal = std[9 * side : 9 * side + 2].max()
+        centre = std[9 * side + 2 : 9 * side + 4].max()
         if (
             focal > LARGEST_FOCAL_STD * camera.focal_px
             or centre > LARGEST_CENTRE_STD * camera.width

@@ -1,4 +1,4 @@
-"""Result of a calibration: its figures, their TOML and JSON text, and the completed sensor file."""
+"""Result of a calibration: its values, as text for TOML and JSON, and the completed sensor file."""
 
 import json
 import os
@@ -25,11 +25,11 @@ from cmmsim.uncertainty.known_rig import KnownRig
 TABLES = ("rig.left", "rig.right", "rig.right_from_left", "rig.covariance")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
-# Largest ratio without a warning between the baselines of the calibration and of the sensor file.
-# The longer one is divided by the shorter one.
+# A warning is given if the baselines of the calibration and of the sensor file differ by more than
+# this factor.
 LARGEST_BASELINE_RATIO = 1.5
-# Above this ratio, the lengths of the board file are certainly not in m: mm give about 1000, and cm
-# about 100.
+# If they differ by more than this factor, the lengths of the board file are certainly not in m. A
+# board file in mm gives about 1000, and one in cm about 100.
 OTHER_UNIT_RATIO = 30.0
 
 
@@ -99,7 +99,9 @@ class Calibration:
 
 
 def _inverse_left_jacobian(vector: Array) -> Array:
-    """Return the derivative (3, 3) of a rotation vector (3,) by a small rotation on the left.
+    """Return the derivative (3, 3) of a rotation vector (3,) with respect to a small rotation.
+
+    The small rotation multiplies the rotation matrix from the left.
 
     Source: J. Sola et al., A micro Lie theory for state estimation in robotics (2018), eq. 146.
     """
@@ -187,9 +189,9 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
 class SensorTemplate:
     """Text of a sensor file without the tables of its cameras.
 
-    Relative paths in ``text`` refer to the folder for which the text was made. ``size`` is (width,
-    height) of the images, px, and ``baseline`` the distance between the cameras, m, both from the
-    original file. ``name`` is the built-in name or the path of that file.
+    A relative path in ``based_on`` refers to the folder for which ``text`` was made. ``size`` is
+    (width, height) of the images, px, and ``baseline`` the distance between the cameras, m, both
+    from the original file. ``name`` is the built-in name or the path of that file.
     """
 
     text: str
@@ -243,9 +245,9 @@ class SensorTemplate:
 def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
     """Return the template of a sensor file, given by a built-in name or a path.
 
-    The completed file is meant for ``folder``, so a path in ``based_on`` becomes relative to it.
-    Raises the exceptions of read_sensor_file, and CalibrationError if the cameras are given as
-    inline tables.
+    The completed file is meant for ``folder``, so a relative path in ``based_on`` is rewritten
+    relative to ``folder``. Raises the exceptions of read_sensor_file. Raises CalibrationError if
+    the cameras are given as inline tables, or if ``based_on`` cannot be rewritten.
     """
     section = read_sensor_file(name).rig
     text = (
@@ -268,7 +270,10 @@ def require_sensor(path: str | Path) -> None:
 
 
 def _based_from(text: str, name: str | Path, folder: Path) -> str:
-    """Return the text with a relative path in ``based_on`` rewritten relative to ``folder``."""
+    """Return the text with a relative path in ``based_on`` rewritten relative to ``folder``.
+
+    Raises CalibrationError if ``based_on`` does not stand on a line of its own.
+    """
     basis = tomllib.loads(text).get("based_on")
     if basis is None or basis in built_in_names() or Path(basis).is_absolute():
         return text

@@ -1,12 +1,12 @@
 """Comparison of two calibrations, each from one half of the pictures.
 
-It checks the stated covariance, and does not need the true cameras. With the cameras of each half,
+The comparison checks the stated covariance without the true cameras. With the cameras of each half,
 distances between points of the board are also measured in the pictures of the other half, and
-compared with the distances of the board file. Three errors are stated for each distance: that of
-the known rig, that of the images' noise, and that of the board, such as of its print. An error of
-the board moves a point in both images alike. It therefore causes residuals of the calibration, but
-no gap between the point's two rays. Thus the ray gaps give the noise of the images, and the rest of
-the residuals gives the error of the board.
+compared with the distances of the board file. The stated variance of a distance has three
+contributions: the uncertainty of the rig, the noise of the images, and the error of the board, such
+as that of its print. An error of the board moves a point in both images alike. It therefore causes
+residuals of the calibration, but no gap between the point's two rays. Thus the ray gaps give the
+noise of the images, and the rest of the residuals gives the error of the board.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,8 +36,9 @@ ROUNDS = 3
 class MeasuredBoard(NamedTuple):
     """Points of a board in one pair of pictures.
 
-    ``numbers`` (n,) are the numbers of the points. ``points`` are their places, with covariances
-    for pixels of variance 1 px². ``pixel`` is the size of a pixel at the board's distance, m.
+    ``numbers`` (n,) are the indices of the points on the board. ``points`` are their measured
+    positions, with covariances for pixels of variance 1 px². ``pixel`` is the size of a pixel at
+    the board's distance, m.
     """
 
     numbers: NDArray[np.int_]
@@ -51,8 +52,8 @@ class Distances:
 
     errors    (n,), measured minus stated distance, m
     variances (n,), stated variances of the errors, m²
-    noise_px  standard deviation of a point's pixel coordinates by the noise of images
-    board_m   standard deviation of a point's place on the board in each axis
+    noise_px  standard deviation of a point's pixel coordinates due to noise of the images
+    board_m   standard deviation of a point's position on the board along each axis, m
     """
 
     errors: Array
@@ -85,10 +86,10 @@ def measured_distances(
     variance = calibration.adjustment.sigma_px**2
     noise = min(float(np.mean(np.concatenate(gaps))), variance)
     seen = [_measured(board, rig, pair) for pair in other]
-    pixel = float(np.mean([one.pixel for one in seen]))
+    pixel = float(np.mean([view.pixel for view in seen]))
     of_board = (variance - noise) * pixel**2
     parts = [
-        _errors(board, rig, one, noise, of_board, calibration.known.covariance) for one in seen
+        _errors(board, rig, view, noise, of_board, calibration.known.covariance) for view in seen
     ]
     errors, variances = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Distances(errors, variances, float(np.sqrt(noise)), float(np.sqrt(of_board)))
@@ -101,25 +102,25 @@ def _measured(board: Board, rig: StereoRig, pair: PairView) -> MeasuredBoard:
     assert isinstance(right, BoardView)
     tried = [_common(left, right.read_as(order)) for order in board.symmetries]
     index, pixels = min(tried, key=lambda one: _epipolar_gap(rig, one[1]))
-    places = board.points[index]
+    board_points = board.points[index]
     unit = np.tile(np.eye(2), (len(index), 1, 1))
     offsets = np.zeros_like(pixels)
-    # The places of dots and the eccentricities of their images depend on each other.
+    # The positions of dots and the eccentricities of their images depend on each other.
     for _ in range(ROUNDS if board.dot_radius else 1):
-        at = pixels - offsets
-        points = triangulate(rig, at[0], at[1], unit, unit)
-        place = register(places, points.points, points.covariances).transform
+        centre_pixels = pixels - offsets
+        points = triangulate(rig, centre_pixels[0], centre_pixels[1], unit, unit)
+        left_from_board = register(board_points, points.points, points.covariances).transform
         for side in range(len(SIDES) if board.dot_radius else 0):
-            move = rig.from_camera[side] @ place
-            normals = np.tile(-move[:3, 2], (len(index), 1))
-            centres = apply(move, places)
+            camera_from_board = rig.from_camera[side] @ left_from_board
+            normals = np.tile(-camera_from_board[:3, 2], (len(index), 1))
+            centres = apply(camera_from_board, board_points)
             offsets[side] = centre_offset(rig.cameras[side], centres, normals, board.dot_radius)
     depth = float(np.linalg.norm(points.points.mean(axis=0)))
     return MeasuredBoard(index, points, depth / rig.left.focal_px)
 
 
 def _common(left: BoardView, right: BoardView) -> tuple[NDArray[np.int_], Array]:
-    """Return the numbers (n,) of the points that both views show, and their pixels (2, n, 2)."""
+    """Return the indices (n,) of the points that both views show, and their pixels (2, n, 2)."""
     index, in_left, in_right = np.intersect1d(left.index, right.index, return_indices=True)
     return index, np.stack([left.pixels[in_left], right.pixels[in_right]])
 
@@ -150,20 +151,20 @@ def _errors(
     stated = board.points[measured.numbers]
     stated = np.linalg.norm(stated[first] - stated[second], axis=1)
     points = measured.points.points
-    gaps = points[first] - points[second]
-    found = np.linalg.norm(gaps, axis=1)
-    along = gaps / found[:, None]
+    differences = points[first] - points[second]
+    lengths = np.linalg.norm(differences, axis=1)
+    along = differences / lengths[:, None]
     by_points, by_rig = (np.concatenate(part, axis=1) for part in rig.derivatives(points))
     # Errors of the rig move the triangulated point such that its pixels change least.
     moved = -np.linalg.pinv(by_points) @ by_rig
     by_rig = np.einsum("ni,nik->nk", along, moved[first] - moved[second])
-    spread = noise * measured.points.covariances
+    covariances = noise * measured.points.covariances
     variances = (
-        np.einsum("ni,nij,nj->n", along, spread[first] + spread[second], along)
+        np.einsum("ni,nij,nj->n", along, covariances[first] + covariances[second], along)
         + np.einsum("nk,kl,nl->n", by_rig, covariance, by_rig)
         + 2.0 * of_board
     )
-    return found - stated, variances
+    return lengths - stated, variances
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class Halves:
 
     @property
     def mean_square(self) -> float:
-        """Mean over splits and directions; well above 1 if the stated covariance is too small."""
+        """Mean of ``squares``; well above 1 if the stated covariance is too small."""
         return float(self.squares.mean())
 
     @property
@@ -205,13 +206,13 @@ class Halves:
 
     @property
     def distance_figures(self) -> dict[str, float]:
-        """Root mean squares over all splits of the figures of `Distances`, by their names."""
+        """Root mean square over ``distances`` of each value of `Distances`, by its name."""
         names = ("rms_m", "normalised_error", "noise_px", "board_m")
         values = np.array([[getattr(one, name) for name in names] for one in self.distances])
         return dict(zip(names, np.sqrt(np.mean(values**2, axis=0)).tolist(), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
+        """Return the results as a dictionary for JSON."""
         return {
             "splits": len(self.squares),
             "mean_square": self.mean_square,
@@ -263,9 +264,9 @@ def _seen_by_both(found: Calibration, pairs: Sequence[PairView]) -> list[PairVie
 
 
 def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
-    """Return the squared differences (p,) of two rigs along independent directions.
+    """Return the squared differences (p,) of two rigs along p independent directions.
 
-    Each is divided by the sum of both variances.
+    Each is divided by the sum of both variances along its direction.
     """
     covariance = one.covariance + other.covariance
     free = np.flatnonzero(np.diag(covariance) > 0.0)

@@ -35,13 +35,13 @@ DARK = 0.06
 # The normal of the front points against the board's z axis.
 FRONT = frozen([0.0, 0.0, -1.0])
 # The next constants limit the poses of the board.
-# Largest angle between the board's normal and the direction to the middle of the baseline, rad.
+# Largest angle between the front's normal and the direction to the middle of the baseline, rad.
 LARGEST_TILT = 0.75
 # Range of the board's depth, in units of ``meeting_depth``.
 DEPTH_RANGE = (0.8, 1.2)
-# Each image is divided into 3 x 3 cells that the board visits in turn.
+# Each image is divided into CELLS x CELLS cells, in which the board appears in turn.
 CELLS = 3
-# Smallest cosine of the angle between the board's normal and the view direction of either camera.
+# Smallest cosine of the angle between the board's z axis and the view direction of either camera.
 GRAZING = 0.35
 # Largest number of poses tried for one image, and number of poses that are examined together.
 TRIES = 4000
@@ -51,7 +51,7 @@ SUPERSAMPLING = 12
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
-    """Return plate and dots of a board as one body in the board frame.
+    """Return the plate and the dots of a board as one body in the board frame.
 
     ``distance`` is the distance from the cameras to the board, m.
     """
@@ -62,7 +62,7 @@ def board_drawable(board: Board, distance: float) -> Drawable:
 
 
 def plate_corners(board: Board) -> Array:
-    """Return the corners (4, 3) of the plate's front, m."""
+    """Return the corners (4, 3) of the plate's front in the board frame, m."""
     points = board.points
     rim = board.spacing * (MARGIN + (RIM if board.has_squares else 0.0))
     x0, y0 = points[:, :2].min(axis=0) - rim
@@ -84,14 +84,14 @@ def _squares(board: Board) -> Print:
     rows = board.rows + 1
     rim = round(RIM * SQUARE)
     if board.kind == "chessboard":
-        place = np.add.outer(np.arange(rows), np.arange(columns))
-        bright = np.kron(place % 2, np.ones((SQUARE, SQUARE), dtype=int))
+        parity = np.add.outer(np.arange(rows), np.arange(columns))
+        bright = np.kron(parity % 2, np.ones((SQUARE, SQUARE), dtype=int))
     else:
         bright = board.charuco().generateImage((columns * SQUARE, rows * SQUARE)) // 255
     levels = np.where(np.pad(bright, rim, constant_values=1), BRIGHT, DARK).astype(np.float32)
     # The frame of a print begins at its corner, and that of a board at its first point.
-    place = rigid(np.eye(3), plate_corners(board)[0])
-    return Print(levels, board.spacing / SQUARE, place)
+    parity = rigid(np.eye(3), plate_corners(board)[0])
+    return Print(levels, board.spacing / SQUARE, parity)
 
 
 def default_board(rig: StereoRig) -> Board:
@@ -106,7 +106,7 @@ def default_board(rig: StereoRig) -> Board:
 def meeting_depth(rig: StereoRig) -> float:
     """Return the depth along the left optical axis at which the right axis comes nearest, m.
 
-    It is 1.5 baselines for parallel axes.
+    It is 1.5 baselines for axes that are parallel or come nearest behind the cameras.
     """
     right_axis = invert(rig.right_from_left)[:3, 2]
     eye = _right_eye(rig)
@@ -117,10 +117,10 @@ def meeting_depth(rig: StereoRig) -> float:
 
 
 def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generator) -> list[Array]:
-    """Return ``count`` poses left_from_board (4, 4).
+    """Draw ``count`` random poses left_from_board (4, 4).
 
-    Both cameras see the whole board in each of them. Raises CalibrationError if no such pose is
-    found.
+    Both cameras see the whole front of the board in each of them. Raises CalibrationError if no
+    such pose is found.
     """
     return [_draw_pose(rig, board, k, rng) for k in range(count)]
 
@@ -128,8 +128,9 @@ def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generat
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
     """Draw one pose that shows the whole board to both cameras.
 
-    ``number`` selects the cell of the image in which the board's middle lies. If the first half of
-    the tries fails, any cell is allowed.
+    ``number`` selects the cell in which the board's middle lies, of the left image if it is even,
+    otherwise of the right image. If the first half of the tries fails, any cell is allowed. Raises
+    CalibrationError if all tries fail.
     """
     corners = plate_corners(board)
     depth = meeting_depth(rig)
@@ -156,7 +157,10 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
 def _drawn_numbers(
     number: int, first: int, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int_], Array]:
-    """Draw the cell (n,) and six numbers (n, 6) from 0 to 1 for each of ``count`` poses."""
+    """Draw a cell and six numbers from 0 to 1 for each pose: (count,) and (count, 6).
+
+    ``first`` is the index of the first of these tries for the pose of the given ``number``.
+    """
     turn = (4 + 2 * number) % CELLS**2
     if first < TRIES // 2:
         return np.full(count, turn), rng.random((count, 6))
@@ -181,15 +185,15 @@ def _poses_of(
     corner = np.column_stack([cells % CELLS, cells // CELLS])
     pixels = (corner + numbers[:, 1:3]) / CELLS * (camera.width, camera.height)
     ideal = np.column_stack([(pixels - camera.centre) / camera.focal_lengths, np.ones(len(cells))])
-    places = apply(invert(from_left), depths[:, None] * ideal)
+    middles = apply(invert(from_left), depths[:, None] * ideal)
     about = 2.0 * np.pi * numbers[:, 3]
     tilt = LARGEST_TILT * numbers[:, 4]
     turn = np.pi * (2.0 * numbers[:, 5] - 1.0)
     axes = np.column_stack([np.cos(about), np.sin(about), np.zeros(len(cells))])
     tilted = Rotation.from_rotvec(tilt[:, None] * axes) * Rotation.from_euler("z", turn[:, None])
     poses = np.zeros((len(cells), 4, 4))
-    poses[:, :3, :3] = _facing(0.5 * _right_eye(rig) - places) @ tilted.as_matrix()
-    poses[:, :3, 3] = places - poses[:, :3, :3] @ middle
+    poses[:, :3, :3] = _facing(0.5 * _right_eye(rig) - middles) @ tilted.as_matrix()
+    poses[:, :3, 3] = middles - poses[:, :3, :3] @ middle
     poses[:, 3, 3] = 1.0
     return poses
 
@@ -215,8 +219,8 @@ def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.b
 
     A view at a grazing angle does not count.
     """
-    places = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
-    views = np.stack([places, places - _right_eye(rig)])
+    middles = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
+    views = np.stack([middles, middles - _right_eye(rig)])
     return np.asarray(
         (
             np.einsum("ni,sni->sn", poses[:, :3, 2], views)

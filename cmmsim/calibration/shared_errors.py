@@ -1,13 +1,13 @@
-"""Common errors of the points of one view, found from the views' scores, and their covariance.
+"""Common errors of the points of one view, estimated from the views' scores.
 
 The adjustment assumes that errors of pixels are independent. In photographs a bent board, uneven
 light or the bias of the corner search displaces neighbouring points together. A view then carries
 less information than its number of points suggests. The scores of the views show this, while the
-size of the residuals does not. Let r_v be the residuals of view v, and J_v their derivatives with
-respect to the common unknowns after the view's own pose is eliminated. The score of the view is s_v
-= J_v' r_v. The sum over all views is zero at the solution. Let I_v be the views' reduced normal
-matrices, which add up to N. For independent errors of variance sigma², the covariance of the scores
-is
+magnitude of the residuals does not. Let r_v be the residuals of view v, and J_v the derivatives of
+the computed pixels with respect to the common unknowns after the view's own pose is eliminated. The
+score of the view is s_v = J_v' r_v. The sum of all scores is zero at the solution. Let I_v be the
+views' reduced normal matrices, which add up to N. For independent errors of variance sigma², the
+covariance of the scores is
 
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
@@ -43,7 +43,8 @@ class SharedErrors:
     independent errors. With independent errors it exceeds ``limit`` with probability CHANCE.
     ``independent`` (c, c) is the covariance of the common unknowns for independent errors, sigma²
     N^-1. ``covariance`` (c, c) takes the common errors into account. Both are equal if the ratio
-    does not exceed its limit.
+    does not exceed its limit. Where the ratio cannot be estimated, as from a single view, it is 1
+    and the limit is inf.
     """
 
     ratio: float
@@ -89,7 +90,7 @@ def _whitening(total: Array) -> Array:
 def _moments(shares: Array) -> tuple[float, float]:
     """Return mean and variance of Q for independent normal errors.
 
-    The views' shares W_v (v, c, c) add up to the unit matrix.
+    ``shares`` (v, c, c) are the matrices W_v of the views, which add up to the unit matrix.
     """
     squares = shares @ shares
     trace_sum = float(np.einsum("vii->", squares))
@@ -105,8 +106,8 @@ def _moments(shares: Array) -> tuple[float, float]:
 def _enlargement(pulls: Array, ratio: float) -> Array:
     """Return the whitened covariance (c, c), which is the unit matrix for independent errors.
 
-    It is the shrunk sandwich of whitened scores (v, c), scaled to the mean eigenvalue ``ratio``.
-    Eigenvalues below one are raised to one.
+    It is the shrunk sandwich estimate from the whitened scores ``pulls`` (v, c), scaled to the mean
+    eigenvalue ``ratio``. Eigenvalues below one are then raised to one.
     """
     views, size = pulls.shape
     sandwich = pulls.T @ pulls

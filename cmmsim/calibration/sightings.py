@@ -1,4 +1,4 @@
-"""Views of the board in pairs of image files, and all points that each camera saw."""
+"""Views of the board in pairs of image files, and lists of all points that each camera saw."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +24,8 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     """Read the grey values (height, width) of an image file.
 
     A rotation noted in the file's metadata is not applied. Colours are converted to grey. Values of
-    more than 8 bits are scaled so that the brightest 0.1 % are white. Raises CalibrationError for
-    an unreadable file.
+    more than 8 bits are scaled so that the brightest 0.1 % are white. Raises CalibrationError for a
+    file that cannot be read.
     """
     image = read_pixels(path, CalibrationError)
     if image.ndim == 3:
@@ -36,7 +36,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
-    """Return the image with grey values from 0 to 255."""
+    """Return the image with values from 0 to 255. NaN and infinite values become black."""
     if image.dtype == np.uint8:
         return image
     values = np.nan_to_num(image.astype(np.float32), posinf=0.0, neginf=0.0)
@@ -86,8 +86,8 @@ def view_pairs(
 ) -> tuple[list[PairView], tuple[int, int]]:
     """Return the views of the board in each pair, and the common size (width, height) px.
 
-    ``advance`` is called after each pair. Raises CalibrationError for images that cannot be read or
-    differ in size, and for pairs of the same image.
+    ``advance`` is called after each pair. Raises CalibrationError if there are no pairs, for images
+    that cannot be read or differ in size, and for a pair of two equal images.
     """
     if not pairs:
         raise CalibrationError("no pairs of images")
@@ -117,8 +117,8 @@ def view_pairs(
 class Sightings:
     """All m sightings of board points by one camera.
 
-    ``view`` (m,) is the index of the view, in ascending order. ``point`` (m,) is the index of the
-    point of the board, and ``pixels`` (m, 2) its place in the image.
+    ``view`` (m,) are the indices of the views, in ascending order. ``point`` (m,) are the indices
+    of the points on the board, and ``pixels`` (m, 2) their pixels.
     """
 
     view: NDArray[np.int_]

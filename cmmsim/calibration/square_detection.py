@@ -7,24 +7,25 @@ from numpy.typing import NDArray
 from cmmsim.calibration.board import Board
 from cmmsim.geometry.pose import Array
 
-# Half the width of cornerSubPix's window, as a share of the distance between neighbouring corners.
+# Half the width of cornerSubPix's window, as a fraction of the distance between neighbouring
+# corners.
 FINE_WINDOW_RATIO = 0.3
-# Fewest corners of a ChArUco board that determine its place.
+# A ChArUco board with fewer detected corners is not found.
 FEWEST_CORNERS = 4
-# Share of the gap between marker and square that is painted over together with the marker.
+# Fraction of the margin between marker and edge of the square that is painted over with the marker.
 PAINTED = 0.5
 # Percentile of the grey values of the square that gives the grey value of the paint.
 PAPER_PERCENTILE = 90.0
 # Number of fractional binary digits in the coordinates of painted polygons.
 SHIFT = 4
-# A corner farther than this from its place by the homography of the board is an outlier.
+# A corner is an outlier if it is farther than this from the pixel that the homography predicts.
 OUTLIER_PX = 2.0
 
 
 def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Return the corners (rows * columns, 2) px, or None.
 
-    The sector-based search is tried first, then the older search with refined corners.
+    The sector-based search is tried first, then the older search, whose corners are refined.
     """
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=flags)
@@ -41,7 +42,7 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
 
 
 def counts_squares(grey: NDArray[np.uint8], columns: int, rows: int) -> bool:
-    """Tell whether a quick search finds a chessboard of this many squares."""
+    """Return True if a quick search finds a chessboard of ``columns`` x ``rows`` squares."""
     corners = (columns - 1, rows - 1)
     # OpenCV refuses boards of fewer corners.
     if min(corners) < 3:
@@ -51,9 +52,9 @@ def counts_squares(grey: NDArray[np.uint8], columns: int, rows: int) -> bool:
 
 
 def find_charuco(grey: NDArray[np.uint8], board: Board) -> Array | None:
-    """Return the corners (rows * columns, 2) px, or None. Corners that are not seen are NaN.
+    """Return the corners (rows * columns, 2) px, or None if fewer than FEWEST_CORNERS are found.
 
-    The pattern of OpenCV before version 4.6 is tried second.
+    Corners that are not seen are NaN. The pattern of OpenCV before version 4.6 is tried second.
     """
     for legacy in (False, True):
         detector = cv2.aruco.CharucoDetector(board.charuco(legacy))
@@ -96,8 +97,8 @@ def _refined(
     if homography is None:
         return rough
     corners = np.stack([plane, *(plane + step for step in board.spacing * np.eye(2))])
-    seen = cv2.perspectiveTransform(corners.reshape(1, -1, 2), homography).reshape(3, -1, 2)
-    nearest = np.linalg.norm(seen[1:] - seen[0], axis=2).min()
+    predicted = cv2.perspectiveTransform(corners.reshape(1, -1, 2), homography).reshape(3, -1, 2)
+    nearest = np.linalg.norm(predicted[1:] - predicted[0], axis=2).min()
     return _fine(painted, rough, nearest)
 
 

@@ -1,9 +1,9 @@
-"""Start values of the adjustment: OpenCV's calibration of each camera and of the pair.
+"""Initial values of the adjustment from OpenCV's calibration of each camera and of both together.
 
 The points of a symmetric board can be numbered in several orders (half a turn, quarter turns), and
-the order is found for each picture separately. Two pictures of a pair with different orders give a
-wrong place of the right camera. The order in each right picture is therefore chosen such that most
-pairs agree on this place.
+the order is found for each picture separately. If the two pictures of a pair have different orders,
+they give a wrong pose of the right camera. The order in each right picture is therefore chosen such
+that most pairs agree on this pose. Here, a pair is a left and a right picture of one exposure.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,11 @@ from cmmsim.calibration.sightings import SIDES, PairView, views_of
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert, rigid
 
+# Smallest number of different views of each camera, and of pairs that agree on right_from_left.
 FEWEST_VIEWS = 3
-# Fewest common points of two pictures from which OpenCV finds the place of a board.
+# Pairs with fewer common points are left out of OpenCV's stereo calibration.
 FEWEST_COMMON = 6
-# Two pictures show the board in the same place if their points differ by less than this, px rms.
+# Two pictures of a camera count as one view if their points differ by less than this, px rms.
 ALIKE_PX = 2.0
 # Poses of the right camera count as the same if they differ by less than this angle, rad, and by
 # less than this fraction of the baseline.
@@ -41,17 +42,20 @@ def start_values(
     radial_terms: bool,
     fix_aspect: bool,
 ) -> tuple[RigState, list[PairView]]:
-    """Return the first state, and the pairs with the same order of points in both images.
+    """Return the initial state, and the pairs with the same order of points in both images.
 
-    Pairs that do not fit the others lose both views. If ``radial_terms`` is True, two radial terms
-    of distortion are estimated. ``size`` is (width, height) px. Raises CalibrationError.
+    A pair that does not agree with the others on right_from_left loses both views. The reason
+    replaces each of them. If ``radial_terms`` is True, two radial terms of distortion are
+    estimated. ``size`` is (width, height) px. Raises CalibrationError if a camera has too few
+    different views, if OpenCV finds no camera, or if too few pairs agree on right_from_left.
     """
-    left, from_left = _one_camera(board, pairs, 0, size, radial_terms, fix_aspect)
-    right, from_right = _one_camera(board, pairs, 1, size, radial_terms, fix_aspect)
-    read, from_right, right_from_left = _read_alike(board, pairs, from_left, from_right)
+    left, in_left = _one_camera(board, pairs, 0, size, radial_terms, fix_aspect)
+    right, in_right = _one_camera(board, pairs, 1, size, radial_terms, fix_aspect)
+    read, in_right, right_from_left = _read_alike(board, pairs, in_left, in_right)
     right_from_left = _stereo(board, read, (left, right), size, right_from_left)
+    # Boards that no camera sees get any pose, which is not used.
     boards = [
-        from_left[k] if k in from_left else invert(right_from_left) @ from_right.get(k, np.eye(4))
+        in_left[k] if k in in_left else invert(right_from_left) @ in_right.get(k, np.eye(4))
         for k in range(len(pairs))
     ]
     return RigState(np.stack([left, right]), right_from_left, np.stack(boards)), read
@@ -67,7 +71,8 @@ def _one_camera(
 ) -> tuple[Array, dict[int, Array]]:
     """Return the intrinsics (9,) of one camera, and camera_from_board (4, 4) for each of its views.
 
-    The keys are the indices of the pairs.
+    The keys are the indices of the pairs. Raises CalibrationError if the camera has too few
+    different views, or if OpenCV finds no valid camera.
     """
     views = views_of(pairs, side)
     if len(views) < FEWEST_VIEWS:
@@ -83,7 +88,7 @@ def _one_camera(
     points = [board.points[view.index].astype(np.float32) for view in views.values()]
     pixels = [view.pixels.astype(np.float32) for view in views.values()]
     try:
-        _, matrix, terms, turns, shifts = cv2.calibrateCamera(
+        _, matrix, terms, rotation_vectors, translations = cv2.calibrateCamera(
             points, pixels, size, np.eye(3), np.zeros(5), flags=flags
         )
     except cv2.error as error:
@@ -94,25 +99,24 @@ def _one_camera(
     values = np.array(
         [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(terms)[:5]], dtype=float
     )
-    places = [
+    poses = [
         rigid(cv2.Rodrigues(turn)[0], np.ravel(shift))
-        for turn, shift in zip(turns, shifts, strict=True)
+        for turn, shift in zip(rotation_vectors, translations, strict=True)
     ]
-    if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(places).all()):
+    if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(poses).all()):
         raise CalibrationError(
             f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
             "board tilted to several sides"
         )
-    return values, dict(zip(views, places, strict=True))
+    return values, dict(zip(views, poses, strict=True))
 
 
 def _require_variety(
     views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str
 ) -> None:
-    """Raise CalibrationError if the views of a camera show the board in too few places.
+    """Raise CalibrationError if a camera has too few different views.
 
-    ``orders`` are the board's symmetries. Two views that agree in any of these orders count as one
-    place.
+    ``orders`` are the board's symmetries. Two views that agree in any of these orders count as one.
     """
     different: list[BoardView] = []
     for view in views:
@@ -131,7 +135,7 @@ def _require_variety(
 
 
 def _distance(a: BoardView, b: BoardView) -> float:
-    """Return the root mean square distance of the points that both views show, px."""
+    """Return the rms distance of the points that both views show, px; inf if they share none."""
     _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
     gap: Array = a.pixels[in_a] - b.pixels[in_b]
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
@@ -145,21 +149,22 @@ def _read_alike(
 ) -> tuple[list[PairView], dict[int, Array], Array]:
     """Order the points of each right image such that most pairs agree on right_from_left.
 
-    Return the pairs in this order, the poses right_from_board by the pair's index, and
-    right_from_left (4, 4).
+    ``from_left`` and ``from_right`` are the poses left_from_board and right_from_board, by the
+    pair's index. Return the pairs with the points in this order, the poses right_from_board in this
+    order, and right_from_left (4, 4). In a pair that agrees in no order, the reason MISFIT replaces
+    both views. Raises CalibrationError if fewer than FEWEST_VIEWS or half of the pairs agree.
     """
     orders = board.symmetries
     symmetry_motions = [_symmetry_motion(board, order) for order in orders]
     candidates = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
-    places = np.stack(
+    rigs = np.stack(
         [from_right[k] @ symmetry_motions[j] @ invert(from_left[k]) for k, j in candidates]
     )
-    alike = _alike(places)
+    alike = _alike(rigs)
     pair_of = np.array([k for k, _ in candidates])
     support = np.array([len(set(pair_of[row])) for row in alike])
-    angle = _angles(places, np.eye(3)[None])[:, 0]
-    # Among orders with equal support, the one with the smallest angle between the cameras is most
-    # likely.
+    angle = _angles(rigs, np.eye(3)[None])[:, 0]
+    # Several orders can have equal support. The smallest angle between the cameras is most likely.
     best = int(np.lexsort((angle, -support))[0])
     count = sum(pair.both for pair in pairs)
     if support[best] < max(FEWEST_VIEWS, 0.5 * count):
@@ -176,7 +181,11 @@ def _read_alike(
             read[k] = PairView(
                 pair.name, pair.left, pair.right.read_as(orders[candidates[chosen[k]][1]])
             )
-    return read, from_right | {k: places[i] @ from_left[k] for k, i in chosen.items()}, places[best]
+    return (
+        read,
+        from_right | {k: rigs[i] @ from_left[k] for k, i in chosen.items()},
+        rigs[best],
+    )
 
 
 def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
@@ -193,7 +202,10 @@ def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
 
 
 def _alike(places: Array) -> Array:
-    """Return the mask (n, n) of pairs of transforms (n, 4, 4) that are nearly equal."""
+    """Return a mask (n, n). Entry (i, j) is True if transforms i and j are nearly equal.
+
+    The transforms ``places`` are (n, 4, 4).
+    """
     shifts = places[:, :3, 3]
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
     near = gap < ALIKE_SHIFT * np.linalg.norm(shifts, axis=1)[:, None]
@@ -215,7 +227,8 @@ def _stereo(
 ) -> Array:
     """Return right_from_left (4, 4) by OpenCV, from the points that both cameras see.
 
-    The intrinsics are fixed. If OpenCV fails, the result is ``guess``.
+    The intrinsics ``cameras`` (9,) of both cameras are fixed. If OpenCV fails, the result is
+    ``guess``.
     """
     points = []
     left = []
@@ -238,5 +251,5 @@ def _stereo(
         )
     except cv2.error:
         return guess
-    place = rigid(results[5], np.ravel(results[6]))
-    return place if np.isfinite(place).all() else guess
+    right_from_left = rigid(results[5], np.ravel(results[6]))
+    return right_from_left if np.isfinite(right_from_left).all() else guess
