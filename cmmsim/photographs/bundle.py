@@ -1,15 +1,15 @@
-"""One least-squares adjustment of sticker places, platform poses and cameras to all photographs.
+"""One least-squares adjustment of sticker positions, platform poses and cameras to all photographs.
 
 The observations are the centres of stickers in both images of all pairs, with their covariances.
-The unknowns are the places of the base's stickers in the camera frame, the places of the platform's
-stickers in the frame of a reference pair, and the pose of the platform in each pair. If the rig is
-known with a covariance, its 24 parameters are unknowns, too, and their known values are additional
-observations.
+The unknowns are the positions of the base's stickers, the positions of the platform's stickers at
+a reference pair, and the motion of the platform from the reference pair to each pair, all in the
+camera frame. If the rig is known with a covariance, its 24 parameters are unknowns, too, and their
+known values are additional observations.
 
 A pose affects only the observations of its own pair. Gauss-Newton steps therefore eliminate the
-poses pair by pair (Schur complement). A common movement of platform places and poses changes no
-observation. The adjustment holds this movement by an inner constraint, which does not affect the
-shape of the platform.
+poses pair by pair (Schur complement). A common movement of all platform stickers can be undone by
+the poses, and then changes no observation. An inner constraint fixes this movement without an
+effect on the shape of the platform.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from cmmsim.geometry.disc_image import centre_offset, sticker_outlines
 from cmmsim.geometry.pose import Array, rotation_exp, skew
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 
+# The adjustment ends after this many steps, converged or not.
 MOST_STEPS = 12
-# An adjustment ends with steps of places below this, m.
+# The adjustment ends when a step changes all coordinates of stickers by less than this, m.
 CONVERGED = 1e-9
 POSE = 6
 RIG = len(PARAMETER_NAMES)
@@ -32,15 +33,15 @@ RIG = len(PARAMETER_NAMES)
 
 @dataclass(frozen=True)
 class Observations:
-    """Centres of stickers in both images, m of them.
+    """m observations, each of the centres of one sticker in both images of a pair.
 
-    pair         (m,), number of the pair
-    sticker      (m,), number of the sticker: first those of the base, then those of the platform
-    pixels       (2, m, 2), centres of ellipses
-    covariances  (2, m, 2, 2), px²
+    pair         (m,), index of the pair
+    sticker      (m,), index of the sticker; those of the base precede those of the platform
+    pixels       (2, m, 2), centres of the ellipses
+    covariances  (2, m, 2, 2), of the centres, px²
     shapes       (2, m, 2, 2), symmetric matrices of the ellipses, px
     base         number of stickers of the base
-    normals      (n, 3), of all stickers, in the axes of their places
+    normals      (n, 3), of all n stickers, in the axes of `BundleState.places`
     radius       radius of a sticker, m
     """
 
@@ -74,8 +75,10 @@ class Observations:
 class BundleState:
     """Values of the unknowns.
 
-    They are the ``places`` (n, 3) of all stickers, m, the ``poses`` (K, 4, 4) of the platform in
-    each pair, and the ``rig``. The rig differs from the known rig by ``rig_change`` (24,).
+    They are the positions ``places`` (n, 3) of all stickers in the camera frame, m, the ``poses``
+    (K, 4, 4), and the ``rig``. The positions of platform stickers are those at the reference pair.
+    A pose moves the platform from there to its position and orientation in a pair. The parameters
+    of the rig differ from those of the known rig by ``rig_change`` (24,).
     """
 
     places: Array
@@ -103,20 +106,25 @@ class BundleState:
         for side, (camera, move) in enumerate(
             zip(self.rig.cameras, self.rig.from_camera, strict=True)
         ):
-            there = points @ move[:3, :3].T + move[:3, 3]
-            computed[side] += centre_offset(camera, there, normals @ move[:3, :3].T, seen.radius)
+            in_camera = points @ move[:3, :3].T + move[:3, 3]
+            computed[side] += centre_offset(
+                camera, in_camera, normals @ move[:3, :3].T, seen.radius
+            )
         return np.asarray(seen.pixels - computed)
 
     def radius(self, seen: Observations) -> float:
-        """Return the radius of stickers, m, as the median over all ellipses in the images."""
-        own = np.where(seen.moves[:, None, None], self.poses[seen.pair], np.eye(4))
+        """Return the radius of the stickers, m, from the median area of all observed ellipses."""
+        poses = np.where(seen.moves[:, None, None], self.poses[seen.pair], np.eye(4))
         places, normals = self.places[seen.sticker], seen.normals[seen.sticker]
-        shapes = sticker_outlines(self.rig, own, places, normals, seen.radius)[1]
+        shapes = sticker_outlines(self.rig, poses, places, normals, seen.radius)[1]
         areas = np.linalg.det(seen.shapes) / np.linalg.det(shapes)
         return seen.radius * float(np.sqrt(np.median(areas)))
 
     def moved(self, known: StereoRig, places: Array, poses: Array, rig: Array) -> BundleState:
-        """Return the state after changes of places (n, 3), poses (K, 6) and rig (24,)."""
+        """Return the state after changes of places (n, 3), poses (K, 6) and rig (24,).
+
+        The changes of poses are [dt, dphi]. ``known`` is the known rig.
+        """
         moved = self.poses.copy()
         moved[:, :3, 3] += poses[:, :3]
         moved[:, :3, :3] = (
@@ -131,11 +139,11 @@ class Bundle:
     """Result of an adjustment.
 
     state        adjusted values
-    covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, with poses eliminated
-    residuals    (2, m, 2), px
-    squares      (m,), squared residuals of both images in units of their noise
+    covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, if poses are unknown
+    residuals    (2, m, 2), measured minus computed centres, px
+    squares      (m,), sum of the squared whitened residuals in both images
     factor       sum of ``squares`` per degree of freedom
-    freedom      number of observed coordinates minus number of determined unknowns
+    freedom      degrees of freedom: number of coordinates minus number of determined unknowns
     """
 
     state: BundleState
@@ -151,7 +159,7 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
 
     ``known`` is the rig as calibrated, and ``prior`` (24, 24) the covariance of its parameters.
     Parameters with zero variance do not change. The covariance of the result assumes the stated
-    noise; ``factor`` tells how much larger the squared residuals are.
+    noise. The ``factor`` of the result is well above 1 if the residuals are larger than this noise.
     """
     state = start
     free = np.flatnonzero(np.diag(prior) > 0.0)
@@ -165,7 +173,7 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
     squares = np.einsum(
         "smi,smij,smj->m", residuals, np.linalg.inv(seen.covariances), residuals, optimize=True
     )
-    # The common movement of places and poses of the platform is not determined.
+    # The common movement of the platform's stickers is not determined.
     unknowns = 3 * len(np.unique(seen.sticker)) + POSE * (len(np.unique(seen.pair[seen.moves])) - 1)
     freedom = 4 * len(squares) - unknowns
     factor = float(squares.sum() / max(freedom, 1))
@@ -183,48 +191,48 @@ def _step(
     rows = _rows(seen, state, free)
     count = 3 * len(state.places)
     matrix = np.zeros((count + len(free),) * 2)
-    right = np.zeros(len(matrix))
+    rhs = np.zeros(len(matrix))
     matrix[count:, count:] = information
-    right[count:] = -information @ state.rig_change[free]
+    rhs[count:] = -information @ state.rig_change[free]
     poses = []
     for by_common, by_pose, residuals in rows:
         matrix += by_common.T @ by_common
-        right += by_common.T @ residuals
+        rhs += by_common.T @ residuals
         if not by_pose.any():
             poses.append((np.zeros((POSE, len(matrix))), np.zeros(POSE)))
             continue
-        own = np.linalg.inv(by_pose.T @ by_pose)
-        mixed = own @ (by_pose.T @ by_common)
-        alone = own @ (by_pose.T @ residuals)
+        pose_covariance = np.linalg.inv(by_pose.T @ by_pose)
+        mixed = pose_covariance @ (by_pose.T @ by_common)
+        alone = pose_covariance @ (by_pose.T @ residuals)
         matrix -= by_common.T @ by_pose @ mixed
-        right -= by_common.T @ by_pose @ alone
+        rhs -= by_common.T @ by_pose @ alone
         poses.append((mixed, alone))
-    # An unseen sticker has no observations. A unit diagonal keeps the matrix invertible.
+    # An unseen sticker has no observations. A scaled diagonal keeps the matrix invertible.
     empty = np.diag(matrix) == 0.0
     matrix[empty, empty] = 1.0
     gauge = _gauge(seen, state, len(matrix))
     matrix += np.diag(matrix)[:count].mean() * gauge @ gauge.T
-    # Parameters differ by many orders of magnitude. A unit diagonal avoids a loss of digits.
+    # Parameters differ by many orders of magnitude. A scaled diagonal avoids a loss of digits.
     scale = 1.0 / np.sqrt(np.diag(matrix))
-    unit = np.linalg.inv(scale[:, None] * matrix * scale)
-    covariance = scale[:, None] * (0.5 * (unit + unit.T)) * scale
-    change = covariance @ right
-    by_pair = np.array([alone - mixed @ change for mixed, alone in poses])
+    scaled = np.linalg.inv(scale[:, None] * matrix * scale)
+    covariance = scale[:, None] * (0.5 * (scaled + scaled.T)) * scale
+    change = covariance @ rhs
+    pose_changes = np.array([alone - mixed @ change for mixed, alone in poses])
     rig = np.zeros(RIG)
     rig[free] = change[count:]
     kept = np.concatenate([np.arange(count), count + free])
-    whole = np.zeros((count + RIG,) * 2)
-    whole[np.ix_(kept, kept)] = covariance
-    return change[:count].reshape(-1, 3), by_pair, rig, whole
+    full = np.zeros((count + RIG,) * 2)
+    full[np.ix_(kept, kept)] = covariance
+    return change[:count].reshape(-1, 3), pose_changes, rig, full
 
 
 def _rows(
     seen: Observations, state: BundleState, free: NDArray[np.int_]
 ) -> list[tuple[Array, Array, Array]]:
-    """Return, for each pair, derivatives and residuals in units of their noise.
+    """Return, for each pair, the whitened derivatives and residuals of its r coordinates.
 
-    A pair has r observed coordinates. Their derivatives are with respect to places and rig
-    (r, 3 n + f), and to the pose of the pair (r, 6).
+    The derivatives are with respect to places and rig (r, 3 n + f), and to the pose of the pair
+    (r, 6).
     """
     points = state.points(seen)
     by_points, by_rig = state.rig.derivatives(points)
@@ -258,7 +266,7 @@ def _rows(
 
 
 def _gauge(seen: Observations, state: BundleState, size: int) -> Array:
-    """Return six orthonormal columns (size, 6) that span common movements of platform places."""
+    """Return six orthonormal columns (size, 6) that span the common movements of the platform."""
     places = state.places[seen.base :]
     arms = places - places.mean(axis=0)
     moves = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)

@@ -18,10 +18,12 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.photographs.matching import Spots, candidates, match, spots_in
 from cmmsim.photographs.pairs import Photograph
 
-# Both images of a pair count as images of one camera if this share of the spots agrees to SAME_PX.
+# Both images of a pair count as images of one camera if more than this fraction of the left spots
+# have a right spot within SAME_PX.
 SAME_SHARE = 0.7
 SAME_PX = 1.5
-# Shifts between the two folders that are tried, in images.
+# Shifts between the two folders that are tried, in images; positive if the left camera started
+# later.
 SHIFTS = (1, -1, 2, -2)
 # Point spreads that are tried for images that do not fit, px.
 SPREADS = (0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
@@ -35,9 +37,10 @@ def cause_of(
     base: MarkedBody,
     platform: MarkedBody,
 ) -> str:
-    """Return the cause of an error of teaching, found from the spots of K pairs.
+    """Return the cause of a failed teaching, judged by the ``spots`` of K pairs with ``names``.
 
-    If no cause is found, the result is the error's text.
+    If no cause is found, the result is the text of ``error``. A hint follows if the images show
+    enough spots.
     """
     counts = [min(len(one.centres[one.good]) for one in pair) for pair in spots]
     if max(counts) == 0:
@@ -71,34 +74,34 @@ def cause_of(
                 f"{'right' if shift > 0 else 'left'} folder, from {names[0]} on, are left out; "
                 f"did the {side} camera start later?"
             )
-    usual = int(np.median(counts))
-    if usual < len(platform.sticker_ids) or works(spots):
+    typical = int(np.median(counts))
+    if typical < len(platform.sticker_ids) or works(spots):
         return str(error)
     return (
-        f"{error}, although both images of a pair, such as {names[0]}, show about {usual} bright "
+        f"{error}, although both images of a pair, such as {names[0]}, show about {typical} bright "
         "spots: do the images of a pair belong together, and does the sensor file state these "
         "cameras and stickers?"
     )
 
 
 def _same(pair: Spots) -> bool:
-    """Tell whether the spots of both images are at the same pixels."""
+    """Return True if most spots of both images are at the same pixels."""
     left, right = (one.centres[one.good] for one in pair)
     if not len(left) or not len(right):
         return False
-    gaps = cKDTree(right).query(left)[0]
-    return bool(np.mean(gaps < SAME_PX) > SAME_SHARE)
+    distances = cKDTree(right).query(left)[0]
+    return bool(np.mean(distances < SAME_PX) > SAME_SHARE)
 
 
 def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str:
     """Return a text about a wrong noise or point spread in the sensor file, or an empty text.
 
     Measuring rejects stickers whose grey values differ too much from a blurred disc. The text names
-    the point spread that fits best.
+    the point spread that fits best. It is empty for a simulated exposure without images.
     """
-    usual = _misfit(spots)
+    chi2 = _misfit(spots)
     limit = observer.settings.limits.largest_misfit
-    if usual <= limit or isinstance(photograph.images, StickerExposure):
+    if chi2 <= limit or isinstance(photograph.images, StickerExposure):
         return ""
     tried = {}
     for psf_px in SPREADS:
@@ -107,13 +110,13 @@ def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str
         tried[psf_px] = _misfit(spots_in(photograph.images, blurred))
     best = min(tried, key=lambda psf_px: tried[psf_px])
     said = (
-        f"{photograph.name}: squared residuals of grey values are {usual:.2g} times the noise that "
+        f"{photograph.name}: squared residuals of grey values are {chi2:.2g} times the noise that "
         f"the sensor file states, and cmmsim measure refuses stickers above {limit:g}: "
     )
     if tried[best] < limit:
         return f"{said}with lens.psf_px = {best:g} they are {tried[best]:.2g} times"
     dark = observer.noise.dark_noise
-    more = dark * np.sqrt(usual)
+    more = dark * np.sqrt(chi2)
     return (
         f"{said}enlarge camera.dark_noise from {dark:g} to about {more:.2g} electrons "
         f"(with lens.psf_px = {best:g} they are still {tried[best]:.2g} times)"

@@ -1,6 +1,6 @@
 """Measuring in photographs: one pose for each pair of images, as a row of a table.
 
-The columns are named as in a record of an experiment, so that the table can become a part of it.
+The columns are named as in a record of an experiment, so the table can become a part of a record.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from cmmsim.tracker import Tracker
 
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
+# Entries (row, column) on and above the diagonal of a covariance (6, 6).
 ENTRIES = [(row, column) for row in range(6) for column in range(row, 6)]
 # Columns of the table; ``covariance`` is for noise, ``common`` for errors shared by all pairs.
 COLUMNS = (
@@ -35,9 +36,10 @@ COLUMNS = (
     "ok",
     "why",
 )
-# A hint is given if each image of a lost pair shows this share of the platform's stickers.
+# A hint is given if each image of a lost pair shows at least this many bright spots, as a fraction
+# of the number of the platform's stickers.
 SHOWN_SHARE = 0.5
-# Radius of a circle around a found sticker in a picture, px.
+# Radius of the circle around a used sticker in a picture, px.
 CIRCLE_PX = 14
 
 
@@ -87,13 +89,15 @@ class MeasuredPair:
         ]
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return both images side by side, with a circle and a name at each sticker used."""
+        """Return both images side by side, with a circle and a name pixels each sticker used."""
         sides = zip(
             (self.images.left, self.images.right),
             (self.measurement.left_pixels, self.measurement.right_pixels),
             strict=True,
         )
-        return np.hstack([_marked(image, at, self.measurement.target_ids) for image, at in sides])
+        return np.hstack(
+            [_marked(image, pixels, self.measurement.target_ids) for image, pixels in sides]
+        )
 
 
 def _marked(image: NDArray, at: Array, names: NDArray[np.str_]) -> NDArray[np.uint8]:
@@ -103,17 +107,20 @@ def _marked(image: NDArray, at: Array, names: NDArray[np.str_]) -> NDArray[np.ui
     picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     for (x, y), name in zip(np.rint(at).astype(int).tolist(), names, strict=True):
         cv2.circle(picture, (x, y), CIRCLE_PX, (0, 255, 0), 1, cv2.LINE_AA)
-        place = (x + CIRCLE_PX, y - CIRCLE_PX)
-        cv2.putText(picture, str(name), place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 255, 0), 1)
+        label_position = (x + CIRCLE_PX, y - CIRCLE_PX)
+        cv2.putText(
+            picture, str(name), label_position, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 255, 0), 1
+        )
     return np.asarray(picture, dtype=np.uint8)
 
 
 def measure_pairs(
     photographs: Iterable[Photograph], estimator: PoseEstimator
 ) -> Iterator[MeasuredPair]:
-    """Yield the measurement of each pair, near the pose that the pairs before it predict.
+    """Yield the measurement of each pair.
 
-    Raises PhotographError if the images of the first pair are exchanged.
+    Stickers are searched near the pose that the preceding pairs predict. Raises PhotographError if
+    no pose is found in the first pair until its images are exchanged.
     """
     tracker = Tracker(estimator)
     for number, one in enumerate(photographs):
@@ -126,7 +133,7 @@ def measure_pairs(
 
 
 def _hint(lost: Photograph, estimator: PoseEstimator) -> str:
-    """Return a hint if each image of a lost pair shows enough bright spots, or an empty text."""
+    """Return a hint if each image of a lost pair shows enough bright spots; otherwise no text."""
     sides = bright_ellipses(readable(lost.images), estimator)
     counts = [int(fits.good.sum()) for fits in sides]
     if min(counts) < SHOWN_SHARE * len(estimator.platform.sticker_ids):

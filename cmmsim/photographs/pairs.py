@@ -31,7 +31,7 @@ Source = str | Path | Iterable[NDArray]  # a folder of images, a video, or array
 class Photograph:
     """Pair of images with its name and its time in s.
 
-    A simulated exposure without whole images can take the place of a frame.
+    ``images`` is a StereoFrame or a simulated exposure, which need not have whole images.
     """
 
     name: str
@@ -57,7 +57,11 @@ class Format:
             raise UnknownOptionError("colour", self.colour, COLOURS)
 
     def frame(self, left: NDArray, right: NDArray, names: tuple[str, str]) -> StereoFrame:
-        """Return both images as a frame. Raises PhotographError, which names the image."""
+        """Return both images as a frame.
+
+        Raises PhotographError, which names the image, for a wrong size or type, for grey values
+        above white, for colours if they are refused, and for two equal images.
+        """
         sides = zip((left, right), names, self.rig.cameras, strict=True)
         frame = StereoFrame(
             *(self._grey(image, name, cam.width, cam.height) for image, name, cam in sides)
@@ -110,12 +114,13 @@ class Format:
 
 
 class Photographs:
-    """Pairs of photographs, which can be read several times unless they are an iterator.
+    """Pairs of photographs, which can be read several times unless the sources are iterators.
 
     left, right  Folders of images, videos, or arrays (height, width) of both cameras.
     format       Required format of the images.
 
-    Raises PhotographError if folders or videos cannot be read or paired.
+    Raises PhotographError if only one source is a path, or if folders cannot be read or paired.
+    Videos are not opened before their frames are counted or read.
     """
 
     def __init__(self, left: Source, right: Source, format: Format) -> None:
@@ -134,7 +139,10 @@ class Photographs:
                 self._files = pair_images(left, right, PhotographError)
 
     def __len__(self) -> int:
-        """Return the number of pairs. It is 0 if it is not known before they are read."""
+        """Return the number of pairs, or 0 if it is not known before they are read.
+
+        Raises PhotographError for a video that cannot be read.
+        """
         if self._videos:
             counts = [_frames_of(Path(str(path))) for path in self._sources]
             return min(counts)
@@ -144,7 +152,11 @@ class Photographs:
         return min(counts)
 
     def __iter__(self) -> Iterator[Photograph]:
-        """Yield each pair. Raises PhotographError for the first image that cannot be used."""
+        """Yield each pair.
+
+        Raises PhotographError for the first image that cannot be used, and if one camera has more
+        images than the other.
+        """
         if self._videos:
             yield from self._from_videos()
         elif self._files:
@@ -192,7 +204,7 @@ class Photographs:
 
 
 class _Video:
-    """Video that is read frame by frame."""
+    """Video that is read frame by frame. Raises PhotographError if it cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self._capture = cv2.VideoCapture(str(path))

@@ -42,7 +42,8 @@ FEWEST_PAIRS = 3
 MOST_PAIRS = 500
 # A warning is given if the squared residuals exceed the stated noise by this factor.
 LARGEST_FACTOR = 1.5
-# A warning is given if the radius of stickers differs from the stated one by more than this share.
+# A warning is given if the radius of stickers differs from the stated one by more than this
+# fraction.
 LARGEST_GROWTH = 0.02
 # A warning is given if the platform moves by less than this in the images.
 SHORTEST_WAY_PX = 3.0
@@ -56,9 +57,9 @@ class PhotographedTeaching:
     Attributes
     ----------
     taught : Taught
-        Frames and places, which `load_sensor` takes.
+        Frames and sticker positions, in the form that `load_sensor` takes.
     frames : TaughtFrames
-        Frames and places with their joint covariance.
+        Frames and sticker positions with their joint covariance.
     observations : Observations
         Centres of stickers that were used.
     bundle : Bundle
@@ -135,8 +136,9 @@ def teach_from(
 ) -> PhotographedTeaching:
     """Teach base and platform from photographs.
 
-    ``known`` states how well the rig of the observer is known; None means exactly. Raises
-    TeachingError.
+    ``known`` states how well the rig of the observer is known; None means exactly. ``advance`` is
+    called after each pair is read. Raises TeachingError, with the probable cause, for fewer than
+    FEWEST_PAIRS pairs, and if base or platform cannot be taught.
     """
     names = []
     spots = []
@@ -158,12 +160,12 @@ def teach_from(
     except LostError as error:
         cause = cause_of(error, spots, names, observer, base, platform)
         raise TeachingError(f"teaching failed: {cause}") from error
-    said = [doubt] if doubt else []
+    warnings = [doubt] if doubt else []
     if left_out:
-        said.append(
+        warnings.append(
             f"{left_out} pairs are not used: {MOST_PAIRS} pairs, spread over all, are enough"
         )
-    return replace(found, warnings=(*said, *found.warnings))
+    return replace(found, warnings=(*warnings, *found.warnings))
 
 
 def _taught(
@@ -174,7 +176,11 @@ def _taught(
     name: str,
     known: KnownRig | None,
 ) -> PhotographedTeaching:
-    """Match and adjust the stickers, and fit the planes of the frames. Raises LostError."""
+    """Match and adjust the stickers, and fit the planes of the frames.
+
+    Raises LostError if a body is not found, if a plane has too few stickers, or if fewer than two
+    pairs agree.
+    """
     base, platform = whole
     pairs = [candidates(one, observer) for one in spots]
     bodies = match(pairs, platform, base, names)
@@ -190,8 +196,8 @@ def _taught(
             for own in marked:
                 require_planes(own)
         except LostError as error:
-            said = "; ".join(f"{sticker} {reason}" for sticker, reason in lost.items())
-            raise LostError(f"{error}: {said}") from error
+            reasons = "; ".join(f"{sticker} {reason}" for sticker, reason in lost.items())
+            raise LostError(f"{error}: {reasons}") from error
         seen, start = observations(pairs, bodies, marked, observer)
         judged = adjust_robustly(seen, start, observer.rig, prior, names)
         # The images give a better radius than the file, and the centres of ellipses depend on it.
@@ -252,7 +258,7 @@ def doubts(
 
 
 def longest_way(seen: Observations) -> float:
-    """Return the longest movement of a sticker of the platform in the images, px."""
+    """Return the largest range of a pixel coordinate of any sticker of the platform, px."""
     ways = [
         float(np.ptp(seen.pixels[:, seen.sticker == sticker], axis=1).max())
         for sticker in np.unique(seen.sticker[seen.moves])
@@ -266,7 +272,7 @@ def observations(
     marked: list[MarkedBody],
     observer: Observer,
 ) -> tuple[Observations, BundleState]:
-    """Return all observations of the stickers of base and platform, and start values."""
+    """Return all observations of the stickers of base and platform, and the initial state."""
     rows = []
     normals = []
     first = 0
@@ -275,11 +281,11 @@ def observations(
         rows.append(np.stack([pair, first + sticker, found.members[sticker, pair]]))
         first += len(found.sticker)
         even = np.tile(np.eye(3), (len(found.places), 1, 1))
-        turn = register(own.nominal, found.places, even).transform[:3, :3]
-        normals.append(own.sticker_normals @ turn.T)
+        rotation = register(own.nominal, found.places, even).transform[:3, :3]
+        normals.append(own.sticker_normals @ rotation.T)
     pair, sticker, spot = np.concatenate(rows, axis=1)
     pixels = np.stack([pairs[k].pixels[:, j] for k, j in zip(pair, spot, strict=True)], axis=1)
-    spread: Array = np.stack(
+    covariances: Array = np.stack(
         [pairs[k].covariances[:, j] for k, j in zip(pair, spot, strict=True)], axis=1
     )
     shapes = np.stack([pairs[k].shapes[:, j] for k, j in zip(pair, spot, strict=True)], axis=1)
@@ -287,7 +293,7 @@ def observations(
         pair,
         sticker,
         pixels,
-        spread + observer.settings.centre_error_px**2 * np.eye(2),
+        covariances + observer.settings.centre_error_px**2 * np.eye(2),
         shapes,
         len(bodies[0].sticker),
         np.concatenate(normals),

@@ -1,7 +1,7 @@
 """Frames from the planes of adjusted stickers, with the covariance of the whole result.
 
 The frames are defined as in the simulated teaching. Their errors follow to first order from the
-errors of all places together. The derivatives are central differences.
+errors of all sticker positions together. The derivatives are central differences.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from cmmsim.measuring.taught import Taught
 from cmmsim.photographs.bundle import POSE, RIG, Bundle, Observations
 from cmmsim.uncertainty.known_rig import KnownRig
 
-# Step of a place for differences, m.
+# Half the distance between the two positions of a central difference, m.
 STEP = 1e-6
 
 
 @dataclass(frozen=True)
 class TaughtFrames:
-    """Base frame and platform places, with their joint covariance.
+    """Base frame and positions of the platform's stickers, with their joint covariance.
 
     base_from_camera  (4, 4)
-    base_places       (k, 3), in base axes, m
-    places            (n, 3), of the platform's stickers in platform axes, m
-    covariance        (N, N) with N = 6 + 3 n + 24, of the small error of base_from_camera, the
-                      places, and the parameters of the rig
+    base_places       (k, 3), positions of the base's stickers in base axes, m
+    places            (n, 3), positions of the platform's stickers in platform axes, m
+    covariance        (N, N) with N = 6 + 3 n + 24, of the small error of base_from_camera, of
+                      ``places``, and of the parameters of the rig
     base_ids          (k,), names of the base's stickers
     platform_ids      (n,), names of the platform's stickers
-    effect            (6, 3 n), derivative of a registered platform frame by errors of the places
+    effect            (6, 3 n), small error [dt, dphi] of a registered platform frame per error of
+                      ``places``
     """
 
     base_from_camera: Array
@@ -49,27 +50,32 @@ class TaughtFrames:
     effect: Array
 
     def taught(self, name: str, known: KnownRig | None, setup: str = "") -> Taught:
-        """Return the result of teaching; ``known`` is the adjusted rig, or None if it is exact."""
+        """Return the result of teaching.
+
+        ``known`` is the adjusted rig, or None if it is exact. ``setup`` is that of `Taught`.
+        """
         split = POSE + self.places.size
         own = self.covariance[:split, :split]
         by_rig = None
         if known is not None:
-            # The part of the covariance that errors of the rig explain is stated by their effect
-            # ``by_rig``; only the rest is stated as noise.
+            # Errors of the rig explain a part of the covariance. This part is stated as their
+            # effect ``by_rig``, and only the rest is stated as noise.
             with_rig = self.covariance[:split, split:]
             slope = with_rig @ np.linalg.pinv(self.covariance[split:, split:], hermitian=True)
             own = own - slope @ with_rig.T
             # The errors of a rig are true minus known parameters.
             by_rig = -slope
-        places = own[POSE:, POSE:]
-        blocks = np.einsum("iaib->iab", places.reshape(*self.places.shape, *self.places.shape))
+        place_covariance = own[POSE:, POSE:]
+        blocks = np.einsum(
+            "iaib->iab", place_covariance.reshape(*self.places.shape, *self.places.shape)
+        )
         return Taught(
             name,
             self.base_from_camera,
             own[:POSE, :POSE],
             self.places,
             np.array(blocks),
-            self.effect @ places @ self.effect.T,
+            self.effect @ place_covariance @ self.effect.T,
             self.base_places,
             setup,
             known,
@@ -92,36 +98,39 @@ def require_planes(body: MarkedBody) -> None:
 def taught_frames(
     bundle: Bundle, seen: Observations, base: MarkedBody, platform: MarkedBody
 ) -> TaughtFrames:
-    """Return the frames of base and platform from the planes of their adjusted stickers."""
+    """Return the frames of base and platform from the planes of their adjusted stickers.
+
+    ``base`` and ``platform`` contain only the stickers that were adjusted.
+    """
     places = bundle.state.places
     split = 3 * seen.base
     count = places.size
     spread = bundle.covariance
     of_base = _frame_of(base, spread[:split, :split])
     of_platform = _frame_of(platform, spread[split:count, split:count])
-    stand, move = places[: seen.base], places[seen.base :]
-    base_from_camera = invert(of_base(stand, stand[None])[0])
-    body_from_model = invert(of_platform(move, move[None])[0])
-    slopes = np.zeros((POSE + move.size + RIG, count + RIG))
-    more, less = (invert(of_base(stand, one)) for one in _moved(stand))
+    base_points, platform_points = places[: seen.base], places[seen.base :]
+    base_from_camera = invert(of_base(base_points, base_points[None])[0])
+    body_from_model = invert(of_platform(platform_points, platform_points[None])[0])
+    slopes = np.zeros((POSE + platform_points.size + RIG, count + RIG))
+    more, less = (invert(of_base(base_points, one)) for one in _moved(base_points))
     slopes[:POSE, :split] = np.array(
         [_small_error(a, b) / (2.0 * STEP) for a, b in zip(more, less, strict=True)]
     ).T
     more, less = (
-        apply_each(invert(of_platform(move, one)), one).reshape(move.size, -1)
-        for one in _moved(move)
+        apply_each(invert(of_platform(platform_points, one)), one).reshape(platform_points.size, -1)
+        for one in _moved(platform_points)
     )
-    slopes[POSE : POSE + move.size, split:count] = ((more - less) / (2.0 * STEP)).T
-    slopes[POSE + move.size :, count:] = np.eye(RIG)
-    turned = apply_each(body_from_model, move)
+    slopes[POSE : POSE + platform_points.size, split:count] = ((more - less) / (2.0 * STEP)).T
+    slopes[POSE + platform_points.size :, count:] = np.eye(RIG)
+    in_platform = apply_each(body_from_model, platform_points)
     return TaughtFrames(
         base_from_camera,
-        apply_each(base_from_camera, stand),
-        turned,
+        apply_each(base_from_camera, base_points),
+        in_platform,
         slopes @ bundle.covariance @ slopes.T,
         base.sticker_ids,
         platform.sticker_ids,
-        _effect(bundle, seen, turned, body_from_model[:3, :3]),
+        _effect(bundle, seen, in_platform, body_from_model[:3, :3]),
     )
 
 
@@ -132,9 +141,10 @@ def _moved(points: Array) -> tuple[Array, Array]:
 
 
 def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array]:
-    """Return a function of adjusted points and of changed points that computes the body's frames.
+    """Return a function that computes the body's frames from its adjusted and its changed points.
 
-    The adjusted points only fix the signs of the normals. ``spread`` is the points' covariance.
+    The frames are those of the changed points. The adjusted points only fix the signs of the
+    normals. ``spread`` (3 n, 3 n) is the points' covariance.
     """
     size = len(body.nominal)
     blocks = np.array(np.einsum("iaib->iab", spread.reshape(size, 3, size, 3)))
@@ -147,10 +157,11 @@ def _frame_of(body: MarkedBody, spread: Array) -> Callable[[Array, Array], Array
 
 
 def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> Array:
-    """Return the derivative (6, 3 n) of a registered frame by errors of the platform's places.
+    """Return the small error (6, 3 n) of a registered platform frame per error of the stickers.
 
-    The places (n, 3) are in platform axes. ``turn`` (3, 3) rotates the model's axes into these.
-    The weight of a sticker is its information in all photographs together.
+    The positions ``places`` (n, 3) are in platform axes, into which ``turn`` (3, 3) rotates the
+    axes of the adjusted state. The weight of a sticker is its information matrix from all
+    photographs together.
     """
     own = seen.selected(seen.moves)
     by_points = bundle.state.rig.derivatives(bundle.state.points(own))[0]

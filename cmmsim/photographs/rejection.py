@@ -5,7 +5,7 @@ adjustment is repeated. A pair or a sticker is left out as a whole if most of it
 out. A sticker is also left out if its centres show that it moved. The result names the reasons.
 
 All residuals can be larger than the noise that the fits of ellipses state. The noise is then
-enlarged to the size of the residuals.
+enlarged such that it explains the residuals.
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.geometry.triangulation import triangulate
 from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
 
-# Probability that a good observation is left out.
+# Probability that a good observation counts as an outlier.
 CHANCE = 1e-5
 LARGEST_SQUARE = float(chdtri(4, CHANCE))
 MEDIAN_SQUARE = float(chdtri(4, 0.5))
-# Share of a sticker's largest squared residual above which a centre counts as nearly its worst.
+# A centre counts as nearly the worst of its sticker if its squared residual exceeds this fraction
+# of the sticker's largest one.
 NEARLY = 0.5
 # Probability that residuals count as larger than noise although they are not.
 EXCESS_CHANCE = 1e-4
+# Largest number of rounds in which centres are left out.
 ROUNDS = 40
-# Fewest stickers of the platform that determine its pose in a pair.
+# A pair is left out if fewer stickers of the platform remain in it.
 FEWEST = 4
-# Largest share of left-out centres of a pair or of a sticker that remains in use.
+# A pair or a sticker is left out if less than this fraction of its centres remains.
 LARGEST_SHARE = 0.5
-# A jump of a sticker's place is reported if it is this many times the scatter of the places.
+# A sticker has moved if its position jumps by more than this multiple of the scatter about both
+# positions.
 CLEAR_JUMP = 4.0
 
 
@@ -46,9 +49,9 @@ class Judged:
 
     seen      observations in use
     bundle    their adjustment
-    pairs     reasons by the number of a pair whose platform is left out
-    stickers  reasons by the number of a sticker that is left out
-    singles   number of single centres that are left out, of pairs and stickers in use
+    pairs     reasons by the index of a pair whose platform is left out
+    stickers  reasons by the index of a sticker that is left out
+    singles   number of observations that are left out although their pair and sticker are in use
     """
 
     seen: Observations
@@ -67,7 +70,8 @@ def adjust_robustly(
 ) -> Judged:
     """Adjust a state to the observations that agree; ``names`` (K,) are those of the pairs.
 
-    Raises LostError if fewer than two pairs remain.
+    If the noise is enlarged, the ``factor`` of the result is that before. Raises LostError if fewer
+    than two pairs remain.
     """
     kept = np.ones(len(seen.pair), dtype=bool)
     left_out: tuple[dict[int, str], dict[int, str]] = ({}, {})
@@ -97,7 +101,7 @@ def adjust_robustly(
 
 
 def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
-    """Return the observations that are left out next.
+    """Return the indices of the observations that are left out next.
 
     A wrong centre pulls the place of its sticker and the pose of its pair, so that right centres
     seem wrong as well. A centre is therefore left out only if it is nearly the worst of its sticker
@@ -114,9 +118,10 @@ def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
 def _left_out(
     seen: Observations, state: BundleState, kept: NDArray[np.bool_], names: Sequence[str]
 ) -> tuple[dict[int, str], dict[int, str]]:
-    """Leave out pairs and stickers of which too many centres are left out; return the reasons.
+    """Leave out stickers that moved, and pairs and stickers that have lost too many centres.
 
-    The mask ``kept`` (m,) of centres in use is changed in place.
+    Return the reasons, first for pairs, then for stickers. The mask ``kept`` (m,) of observations
+    in use is changed in place.
     """
     pairs: dict[int, str] = {}
     stickers: dict[int, str] = {}
@@ -144,23 +149,23 @@ def _left_out(
 
 def _movement(mine: Observations, state: BundleState, names: Sequence[str]) -> str:
     """Return a text that states when and how far a sticker has moved, or an empty text."""
-    found = triangulate(state.rig, *mine.pixels, *mine.covariances).points
+    points = triangulate(state.rig, *mine.pixels, *mine.covariances).points
     poses = state.poses[mine.pair]
-    places = np.array(
+    positions = np.array(
         [
             apply(invert(pose), point) if moves else point
-            for pose, point, moves in zip(poses, found, mine.moves, strict=True)
+            for pose, point, moves in zip(poses, points, mine.moves, strict=True)
         ]
     )
     order = np.argsort(mine.pair)
-    places = places[order]
-    # The best split into two places leaves the least scatter about them.
-    splits = [(places[:k], places[k:]) for k in range(1, len(places))]
+    positions = positions[order]
+    # The best split in time leaves the least scatter about the mean positions before and after.
+    splits = [(positions[:k], positions[k:]) for k in range(1, len(positions))]
     scatter = [sum(float(np.sum((one - one.mean(axis=0)) ** 2)) for one in two) for two in splits]
     if scatter:
         k = int(np.argmin(scatter))
         jump = float(np.linalg.norm(np.subtract(*(one.mean(axis=0) for one in splits[k]))))
-        if jump > CLEAR_JUMP * np.sqrt(scatter[k] / len(places)):
+        if jump > CLEAR_JUMP * np.sqrt(scatter[k] / len(positions)):
             before, after = (names[mine.pair[order][j]] for j in (k, k + 1))
             return f"moved by {1e3 * jump:.2f} mm between {before} and {after}"
     return ""

@@ -60,7 +60,7 @@ def read_taught(path: str | Path) -> Taught:
     Raises
     ------
     TeachingError
-        If the file cannot be read, or is not such a file.
+        If the file cannot be read, is not JSON, lacks an entry, or has an invalid one.
 
     Examples
     --------
