@@ -81,9 +81,9 @@ class Instrument:
         self._progress = progress
         self.method = method
         self._known = taught.known if isinstance(taught, Taught) else known
-        figures = file.camera.model_dump(exclude={"pattern_seed", "grey_noise_percent"})
+        values = file.camera.model_dump(exclude={"pattern_seed", "grey_noise_percent"})
         self.noise = CameraNoise(
-            **{("enabled" if k == "noise" else k): v for k, v in figures.items()}
+            **{("enabled" if k == "noise" else k): v for k, v in values.items()}
         )
         lens = lens_from_file(file)
         # An estimator that does not know the lens assumes that all depths are in focus.
@@ -120,10 +120,16 @@ class Instrument:
 
     @cached_property
     def _view(self) -> StickerView:
-        """Stickers at their expected places in the images of the known rig."""
-        place = self.true_cameras.camera_from_base
+        """Stickers at their expected pixels in the images of the known rig."""
+        camera_from_base = self.true_cameras.camera_from_base
         return StickerView(
-            self._file, self.platform, self.base, self.rig, self._known, place, self.optics
+            self._file,
+            self.platform,
+            self.base,
+            self.rig,
+            self._known,
+            camera_from_base,
+            self.optics,
         )
 
     @cached_property
@@ -160,7 +166,7 @@ class Instrument:
 
     @property
     def truth(self) -> Taught:
-        """Result of a teaching without errors: the true places of rig and stickers.
+        """Result of a teaching without errors: the true base frame and sticker positions.
 
         Measurements do not use this result. It serves studies of the observation noise alone.
         """
@@ -224,7 +230,8 @@ class Instrument:
         Raises
         ------
         TeachingError
-            If a sticker cannot be seen, or the three planes of a body do not meet in one point.
+            If a sticker cannot be seen, if the three planes of a body do not meet in one point, or
+            if teaching from ``frames`` fails.
 
         Examples
         --------
@@ -263,7 +270,7 @@ class Instrument:
         Raises
         ------
         TeachingError
-            If the stickers are not found, or do not determine the frames.
+            If there are too few pairs, or if the stickers do not determine the frames.
         """
         platform, rig, known = self._stated
         for body in (platform, self.base):
@@ -308,7 +315,7 @@ class Instrument:
         self.true_cameras.add_bodies(meshes)
 
     def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
-        """Change the true rig; the estimator's known rig does not change.
+        """Add changes to the true rig. The estimator's known rig does not change.
 
         Parameters
         ----------
@@ -342,7 +349,7 @@ class Instrument:
         changes : mapping of str to float
             Amounts by name, as in `move_rig`. An empty mapping ends the drift.
         frames : int
-            Number of frames until the amounts are reached. Afterwards, the rig does not change.
+            Number of frames. The last of them has the full amounts, and so have all later frames.
 
         Raises
         ------
@@ -387,9 +394,11 @@ class Instrument:
         """
         self._require_registration("common errors can be computed for")
         known = self._known_rig
-        at = np.asarray(poses, dtype=float)
-        along = np.asarray(rates, dtype=float)
-        return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
+        pose_values = np.asarray(poses, dtype=float)
+        rate_values = np.asarray(rates, dtype=float)
+        return self._geometry.common_errors(
+            pose_values, rate_values, known.covariance, known.exposure_std
+        )
 
     def _require_registration(self, what: str) -> None:
         """Raise CmmError unless the method is "registration"; ``what`` begins the message."""

@@ -139,7 +139,8 @@ class Sensor(Instrument):
         UnknownBodyError
             If an obstacle was never registered.
         CmmError
-            If the blur is too long, or ``obstacles`` is not a mapping of names to transforms.
+            If the blur is too long, if ``obstacles`` is not a mapping of names to transforms, or if
+            the renderer is not valid for this sensor file.
 
         Examples
         --------
@@ -224,8 +225,8 @@ class Sensor(Instrument):
         # One random number per frame, so that runs over different poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
-            share = f"a share of {self.timing.dropout:.3g} drops out"
-            measured = lost_measurement(f"dropped frame ({share})")
+            fraction = f"a share of {self.timing.dropout:.3g} drops out"
+            measured = lost_measurement(f"dropped frame ({fraction})")
         else:
             measured = self._tracker.measure(images)
         if self._watch is not None:
@@ -270,7 +271,7 @@ class Sensor(Instrument):
         obstacles: Mapping[str, Array] | None = None,
         near: ArrayLike | None = None,
     ) -> MeasuredPoses:
-        """Measure the platform in many frames at once, on all cores.
+        """Measure the platform in many frames pose_values once, on all cores.
 
         Each frame has its own noise and dropout. The noise has the same covariance as in `measure`,
         but different random numbers. The rig does not drift.
@@ -284,7 +285,8 @@ class Sensor(Instrument):
         obstacles : mapping of str to ndarray, shape (4, 4), optional
             Transforms of bodies that stand still, as in `look`.
         near : array_like, shape (N, 6), optional
-            Poses near which stickers are searched, instead of the true poses.
+            Poses near which stickers are searched, instead of the true poses. With the renderer
+            "statistical", there is usually no search, and they have no effect.
 
         Returns
         -------
@@ -294,37 +296,45 @@ class Sensor(Instrument):
         ------
         ShapeError
             If a row of poses, rates or ``near`` is not six finite numbers.
+        UnknownBodyError
+            If an obstacle was never registered.
 
         Examples
         --------
         >>> sensor.measure_many([sensor.home] * 3).poses.shape
         (3, 6)
         """
-        at = pose_rows(poses)
+        pose_values = pose_rows(poses)
         wanted = "each pose needs a pose rate of six finite numbers, m/s and rad/s"
-        rates = finite_array(0.0 * at if pose_rates is None else pose_rates, at.shape, wanted)
-        around = finite_array(
-            at if near is None else near, at.shape, "near needs six finite numbers per pose"
+        rates = finite_array(
+            0.0 * pose_values if pose_rates is None else pose_rates, pose_values.shape, wanted
+        )
+        search_poses = finite_array(
+            pose_values if near is None else near,
+            pose_values.shape,
+            "near needs six finite numbers per pose",
         )
         camera = self.camera
         placed = self.true_cameras.placed(obstacles)
         if isinstance(camera, VirtualStereoCamera):
-            blocks = measure_frames(camera, self._frames(at, rates, around, placed))
+            blocks = measure_frames(camera, self._frames(pose_values, rates, search_poses, placed))
             found = MeasuredPoses.of([each.found for each in blocks])
         elif isinstance(tracker := self._new_tracker(), Tracker):
             found = MeasuredPoses.of_each(
-                measure_without_images(camera, self._frames(at, rates, around, placed))
+                measure_without_images(
+                    camera, self._frames(pose_values, rates, search_poses, placed)
+                )
             )
         else:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
-            self._frame += len(at)
+            self._frame += len(pose_values)
             found = tracker.measure_many(
-                camera, camera.exposed(at, rates), camera.placed(placed), rng
+                camera, camera.exposed(pose_values, rates), camera.placed(placed), rng
             )
-        return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
+        return found.without(self._dropout_rng.random(len(pose_values)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
-        """Measure a platform at rest in many frames, without dropouts.
+        """Measure a platform pose_values rest in many frames, without dropouts.
 
         Stickers are searched in windows even with the renderer "statistical".
 
@@ -347,10 +357,12 @@ class Sensor(Instrument):
         >>> [one.ok for one in sensor.measure_each([sensor.home], [sensor.home])]
         [True]
         """
-        at = pose_rows(poses)
+        pose_values = pose_rows(poses)
         camera = self.camera
-        around = finite_array(near, at.shape, "near needs six finite numbers per pose")
-        frames = self._frames(at, 0.0 * at, around, {})
+        search_poses = finite_array(
+            near, pose_values.shape, "near needs six finite numbers per pose"
+        )
+        frames = self._frames(pose_values, 0.0 * pose_values, search_poses, {})
         if isinstance(camera, StatisticalStereoCamera):
             return measure_without_images(camera, frames)
         return [one for each in measure_frames(camera, frames) for one in each.measurements()]
@@ -370,8 +382,8 @@ class Sensor(Instrument):
         return Frames(self.estimator, at, rates, around, rngs, placed, period)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
-        # StatisticalTracker is faster, but it requires that no sticker was left out at teaching,
-        # and that the print is perfect.
+        # StatisticalTracker is faster, but it supports registration only. It requires that no
+        # sticker was left out at teaching, and that the print is perfect.
         whole = len(self.true_cameras.scene[0].sticker_places) == len(self.platform.nominal)
         perfect = self._file.print.is_perfect
         if (

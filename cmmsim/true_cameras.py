@@ -61,7 +61,7 @@ class Drift:
 
 
 class TrueCameras:
-    """Both true cameras in front of platform and base, with all stickers at their true places.
+    """Both true cameras in front of platform and base, with all stickers at their true positions.
 
     `Sensor.add_bodies`, `Sensor.move_rig` and `Sensor.drift_rig` describe the arguments and
     exceptions of `add_bodies`, `move` and `drift`.
@@ -135,7 +135,7 @@ class TrueCameras:
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
-        """Tell whether ``bodies`` are all obstacles, in their order and with rigid transforms."""
+        """Return True if ``bodies`` are all obstacles, in their order and with rigid transforms."""
         shape = len(self.obstacles), 4, 4
         if (
             bodies.names != tuple(self.obstacles)
@@ -210,8 +210,10 @@ class TrueCameras:
         if file.print.unevenness == 0.0 and file.print.outline == 0.0:
             return None
         target = np.array(file.rig.target)
-        size = radius_at(self.rig, self.camera_from_base, target, file.stickers.radius)
-        return CentreErrors.of(file, size, sum(len(body.sticker_places) for body in self.scene))
+        radius_px = radius_at(self.rig, self.camera_from_base, target, file.stickers.radius)
+        return CentreErrors.of(
+            file, radius_px, sum(len(body.sticker_places) for body in self.scene)
+        )
 
     def _drawing(self) -> VirtualStereoCamera:
         """Return cameras that draw images.
@@ -254,15 +256,17 @@ class TrueCameras:
         Only stickers that the image shows with the platform at home are considered.
         """
         moved = self.rig.moved(changes)
-        places = (pose_to_transform(self._file.platform.home), np.eye(4))
-        for body, scene, place in zip(self._bodies, self.scene, places, strict=True):
-            points = apply(self.camera_from_base @ place, scene.sticker_places)
-            there, shown = moved.project(points)
+        base_from_bodies = (pose_to_transform(self._file.platform.home), np.eye(4))
+        for body, scene, base_from_body in zip(
+            self._bodies, self.scene, base_from_bodies, strict=True
+        ):
+            points = apply(self.camera_from_base @ base_from_body, scene.sticker_places)
+            pixels, shown = moved.project(points)
             gone = np.argwhere(self.rig.project(points)[1] & ~shown)
             if len(gone):
                 side, sticker = gone[0]
                 camera = moved.cameras[side]
-                x, y = there[side, sticker]
+                x, y = pixels[side, sticker]
                 raise CmmError(
                     f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the "
                     f"{body.name} out of the {('left', 'right')[side]} image, to ({x:.0f}, "

@@ -34,9 +34,9 @@ EDGE_PX = DetectionSettings().window_size
 
 @dataclass(frozen=True)
 class SightLines:
-    """Geometry that decides visibility.
+    """Geometry that decides visibility: a platform with nominal sticker positions, and the rig.
 
-    It consists of a platform with nominal sticker places, a rig, and camera_from_base (4, 4).
+    ``camera_from_base`` is (4, 4).
     """
 
     platform: MarkedBody
@@ -49,22 +49,22 @@ class SightLines:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def visible(self, pose: ArrayLike) -> NDArray[np.bool_]:
-        """Tell for each sticker (n,) whether both cameras see it at a pose (6,) of the platform."""
+        """Return a mask (n,) of the stickers that both cameras see at a pose (6,), m and rad."""
         base_from_platform = pose_to_transform(pose)
         seen = np.ones(len(self.platform.sticker_ids), dtype=bool)
         for camera, from_base in zip(self.rig.cameras, self.cameras_from_base, strict=True):
-            move = from_base @ base_from_platform
-            places = apply(move, self.platform.nominal)
-            normals = self.platform.sticker_normals @ move[:3, :3].T
-            pixels, ahead = camera.project(places)
-            seen &= ahead & camera.shows(pixels, EDGE_PX) & faces_camera(places, normals)
+            camera_from_platform = from_base @ base_from_platform
+            positions = apply(camera_from_platform, self.platform.nominal)
+            normals = self.platform.sticker_normals @ camera_from_platform[:3, :3].T
+            pixels, ahead = camera.project(positions)
+            seen &= ahead & camera.shows(pixels, EDGE_PX) & faces_camera(positions, normals)
         return seen
 
 
 def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
     """Return the sight lines of a built-in sensor or a sensor file, with changes to its entries.
 
-    Raises UnknownSensorError or SensorFileError.
+    Raises the same exceptions as `read_sensor_file`.
     """
     file = read_sensor_file(name, changes)
     rig, camera_from_base = rig_from_file(file.rig)
@@ -89,8 +89,8 @@ def expected_covariance(
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
     """Return the covariance (6, 6) that a sensor states for a pose (6,), m and rad.
 
-    One exposure is drawn. Stickers are measured at the places that follow from the pose, without
-    teaching or search. Raises the same exceptions as `expected_covariance`.
+    One exposure is drawn. Stickers are measured at the pixels that follow from the pose, without
+    teaching or search. Raises LostError if the stickers do not determine the pose.
     """
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform

@@ -24,24 +24,25 @@ from cmmsim.sensor import Sensor
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)
-# m: half of the width of side A.
+# Half the width of side A, m.
 HALF_RIDGE = 0.020
-# m: width of sides B and C.
+# Width of sides B and C, m.
 SIDE_WIDTH = 0.060
-# m: length of the board beyond its outermost stickers.
+# Length of the board beyond its outermost stickers, m.
 END_LENGTH = 0.020
-# m: distance by which the base is moved behind the cameras.
+# Distance by which the base is moved behind the cameras, m.
 OUT_OF_SIGHT = 100.0
-# m: distance between the origins of the two end frames of the rigid bar, which lie on its x axis.
+# Distance between the origins of the two end frames of the rigid bar, which lie on its x axis, m.
 LENGTH = 0.300
+# Half the length and half the width of the rigid bar, rounded up, m.
 HALF_LENGTH = 0.5 * LENGTH + 0.065
 HALF_WIDTH = HALF_RIDGE + SIDE_WIDTH
 # True transform from the frame of the second end to the frame of the first end.
 FIRST_FROM_SECOND = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))
 
-# Places of the stickers of one side: along (n,) and across (n,) the artefact, m. Along is counted
-# from the middle of the artefact. Across is counted from the middle line on side A, and from the
-# edge that is shared with side A on sides B and C.
+# Coordinates of the stickers of one side: along (n,) and across (n,) the artefact, m. Along is
+# counted from the middle of the artefact. Across is counted from the middle line on side A. On
+# sides B and C, it is counted from the edge that is shared with side A.
 StickerRow = tuple[ArrayLike, ArrayLike]
 
 
@@ -75,7 +76,7 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
 def artefact_file(file: SensorFile, artefact: Platform) -> SensorFile:
     """Return the sensor file with an artefact instead of the platform, and the base out of sight.
 
-    The artefact's stickers lie exactly at their nominal places, which its certificate states.
+    The artefact's stickers lie exactly at their nominal positions, which its certificate states.
     """
     stickers = file.stickers.model_copy(update={"placement": (0.0, 0.0)})
     return file.model_copy(
@@ -92,7 +93,7 @@ def _side(
     """Return one side with its stickers.
 
     The axis u runs along the artefact. With the side's normal n, v = n x u points towards +y on all
-    sides. On side C, ``sign`` is -1, because places across are counted towards -y.
+    sides. On side C, ``sign`` is -1, because coordinates across are counted towards -y.
     """
     stickers = [(float(u), sign * float(v)) for u, v in np.column_stack(row)]
     return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0), stickers=stickers)
@@ -139,6 +140,7 @@ def _end(bar: MarkedBody, name: str, side: float) -> MarkedBody:
 
 
 def _behind(body: Body, rig: Rig) -> Body:
+    """Return a body moved by OUT_OF_SIGHT against the direction of view."""
     view = np.array(rig.target) - np.array(rig.position)
     shift = -OUT_OF_SIGHT * view / np.linalg.norm(view)
     planes = Planes(
@@ -180,8 +182,8 @@ class SensorUnderTest:
     def renderer_name(self) -> str:
         """Return the name of the renderer in use; "auto" is resolved.
 
-        Raises UnknownOptionError, and OpenGLMissingError if the renderer needs OpenGL that is
-        missing.
+        Raises UnknownOptionError for an unknown renderer, and OpenGLMissingError if the renderer
+        needs OpenGL but OpenGL is missing.
         """
         name = choose_renderer(self.renderer or self.file.renderer).name
         if name == "pyrender":
@@ -197,19 +199,21 @@ class SensorUnderTest:
 def estimator_of(
     sensor: Sensor, body: MarkedBody, base_from_camera: Array | None = None
 ) -> PoseEstimator:
-    """Return the sensor's pose estimator for a body with certified sticker places.
+    """Return the sensor's pose estimator for a body with certified sticker positions.
 
     Poses are in the base frame if ``base_from_camera`` (4, 4) is given, else in the camera frame.
     """
-    place = np.eye(4) if base_from_camera is None else base_from_camera
-    taught = Taught.without_error(sensor.name, place, body.nominal.copy(), np.zeros((0, 3)))
+    output_from_camera = np.eye(4) if base_from_camera is None else base_from_camera
+    taught = Taught.without_error(
+        sensor.name, output_from_camera, body.nominal.copy(), np.zeros((0, 3))
+    )
     return PoseEstimator(sensor.rig, sensor.noise, sensor.settings, body, taught)
 
 
 def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
-    """Find a rough camera_from_body (4, 4) in whole images.
+    """Return a rough camera_from_body (4, 4), found in whole images.
 
-    Raises AcceptanceError, which names the body, if it is not found.
+    Raises AcceptanceError, which names the body, if the body is not found.
     """
     try:
         return estimator.locate(images)

@@ -1,4 +1,4 @@
-"""Latency in the style of ASTM E3124: the time from a motion to the report of its pose.
+"""Latency in the style of ASTM E3124: the time from a pose to the report of this pose.
 
 A body moves on a circle, and its true position is known at every time. The reported positions are
 compared with the true motion at the times of the reports. The latency is the time shift of the true
@@ -32,8 +32,9 @@ STREAM = 201
 RADIUS = 0.05
 PERIOD = 1.0
 FRAMES = 180
-# s: step of the difference quotient of a motion.
+# Step of the central differences of a motion, s.
 STEP = 1e-5
+# Number of least-squares steps. The first half estimates a common delay, the rest single delays.
 ITERATIONS = 8
 Motion = Callable[[Array], Array]
 """Function that returns true positions (n,3) m at times (n,) s."""
@@ -84,7 +85,7 @@ def estimate_latency(
     estimated as well, but not returned. Reports are at times ``reported`` (n,) s with ``positions``
     (n, 3) m and ``covariances`` (n, 3, 3) m². The search begins with common delays from 0 to
     ``largest`` s, which must be at most half the period of the motion. Raises ShapeError for fewer
-    than four reports, and for a motion that stands still.
+    than four reports, for positions of another shape, and for a motion that stands still.
     """
     if len(reported) < 4 or positions.shape != (len(reported), 3):
         raise ShapeError(
@@ -96,20 +97,20 @@ def estimate_latency(
     for iteration in range(ITERATIONS):
         times = reported - delays
         velocity = (motion(times + STEP) - motion(times - STEP)) / (2.0 * STEP)
-        squared = np.sum(velocity**2, axis=1)
-        if squared.min() < 1e-8:
+        squared_speed = np.sum(velocity**2, axis=1)
+        if squared_speed.min() < 1e-8:
             raise ShapeError(
                 "latency needs a motion without standstill: its lowest speed is "
-                f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
+                f"{1e3 * np.sqrt(squared_speed.min()):.3g} mm/s, at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
         # one common delay and the offset are estimated first, then each delay separately
         if iteration < ITERATIONS // 2:
-            common, shift = _common_step(residuals, velocity)
+            common, offset_change = _common_step(residuals, velocity)
             delays = delays + common
-            offset = offset + shift
+            offset = offset + offset_change
         else:
-            delays = delays - np.sum(residuals * velocity, axis=1) / squared
+            delays = delays - np.sum(residuals * velocity, axis=1) / squared_speed
     return Latency(
         delays,
         float(delays.mean()),
@@ -121,7 +122,7 @@ def estimate_latency(
 
 
 def require_room(volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError unless the body stays inside the volume on its circle."""
+    """Raise AcceptanceError unless the whole body stays inside the volume on its circle."""
     needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
     if np.any(needed > volume.size):
         raise AcceptanceError(
@@ -138,8 +139,8 @@ def latency_test(
 ) -> LatencyTest:
     """Move a body on a circle in the middle of the volume, and estimate the latency of the reports.
 
-    ``advance`` is called after each frame. Raises AcceptanceError if the volume is too small, or if
-    fewer than four frames are measured.
+    ``advance`` is called after each frame. Raises AcceptanceError if the volume is too small, if
+    the body is not found in the first image, or if fewer than four frames are measured.
     """
     require_room(volume)
     sensor = under_test.facing(rigid_bar(), STREAM)
@@ -186,7 +187,7 @@ def _circle(times: Array) -> Array:
 
 
 def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
-    """Return the common delay, from a grid, with the smallest variance of the residuals.
+    """Return the delay on a grid, common to all reports, with the smallest variance of residuals.
 
     The variance does not depend on a constant offset.
     """

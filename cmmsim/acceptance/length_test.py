@@ -3,8 +3,8 @@
 An artefact with a row of six stickers stands on each measuring line. The test lengths are the
 distances from the first sticker to the other five. A measured length is the mean over a few
 exposures of the artefact at rest. The error of a length is the measured minus the certified length.
-The standard limits the magnitude of the error. The standard's tests of sphere form and sphere
-spacing are omitted, because the targets are flat stickers.
+The standard limits the magnitude of this error. Its tests of sphere form and sphere spacing are
+omitted, because the targets are flat stickers.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from cmmsim.sensor import Sensor
 STREAM = 1
 # Number of exposures of the artefact at rest over which lengths are averaged.
 EXPOSURES = 5
-# Irregular places of the stickers that serve to recognise the artefact. Along the artefact, they
-# are counted from its middle, as fractions of the longest length. Across, they are in m.
+# Irregular coordinates of the stickers that serve to recognise the artefact. Along the artefact,
+# they are counted from its middle, as fractions of the longest length. Across, they are in m.
 RECOGNITION_B = (-0.37, -0.08, 0.31)
 RECOGNITION_C = (-0.29, 0.13, 0.4)
 RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
@@ -36,7 +36,7 @@ class MeasuredLength:
     """Measured length on a line.
 
     ``true`` is the certified length, m. ``measured`` (k,) are the lengths in k exposures, m, and
-    ``std`` is the stated standard deviation of the length in one exposure.
+    ``std`` is the stated standard deviation of the length in one exposure, m.
     """
 
     line: str
@@ -70,14 +70,14 @@ class LengthTest:
 
     @property
     def largest(self) -> MeasuredLength:
-        """The length with the largest error."""
+        """Measured length whose error has the largest magnitude."""
         return max(self.lengths, key=lambda length: abs(length.error))
 
     @property
     def variance_ratio(self) -> float:
-        """Mean square of the errors in single exposures, in units of their stated variance.
+        """Mean of squared errors in single exposures divided by their stated variances.
 
-        A value of 1 means that the stated variance is right.
+        It is about 1 if the stated variances are right.
         """
         stds = np.array([length.std for length in self.lengths])
         return float(np.mean((self.single_errors / stds[:, None]) ** 2))
@@ -110,7 +110,8 @@ def length_test(
     """Measure five lengths on each of the seven lines of a volume.
 
     The lines are measured on all cores, each with its own noise. ``advance`` is called after each
-    line. Raises AcceptanceError if a line breaks a rule or a sticker is not measured.
+    line. Raises AcceptanceError if a line breaks a rule of the standard, if an artefact is not
+    found in its images, or if a sticker of its row is not measured.
     """
     lines = seven_lines(volume)
     lengths: list[MeasuredLength] = []
@@ -132,7 +133,8 @@ def measure_line(
 ) -> list[MeasuredLength]:
     """Measure the lengths of one line in a number of exposures.
 
-    The platform of ``sensor`` must be the artefact of the line.
+    The platform of ``sensor`` must be the artefact of the line. Raises AcceptanceError if the
+    artefact is not found, or if a sticker of its row is not measured.
     """
     pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
     body = sensor.platform

@@ -55,6 +55,7 @@ TURN_CYCLES = np.array([1.0, 1.5, 0.5])
 TOWARDS_DEPTH = np.deg2rad(35.0)
 # Time step of the difference quotient of a path, s.
 STEP = 1e-4
+# Number of times at which the speed is computed to find its maximum.
 SPEED_SAMPLES = 100
 # Number that selects the random noise of the first run. The next runs have the next numbers.
 STREAM = 101
@@ -63,7 +64,9 @@ STANDING_FRAMES = 15
 # Number of consecutive lost frames that ends a run. Further frames would probably be lost as well,
 # and the search of the whole images after each lost frame takes time.
 MOST_LOST_FRAMES = 5
+# Index of the axis along which the bar moves to and fro, by the name of the raster.
 RASTERS = {"x": 0, "y": 1}
+# Direction of the bar in volume axes.
 ORIENTATIONS = {
     "along x": np.array([1.0, 0.0, 0.0]),
     "along y": np.array([0.0, 1.0, 0.0]),
@@ -90,10 +93,10 @@ class BarPath:
         The speed is zero at time 0.
         """
         phase = 2.0 * np.pi * time / SECONDS
-        slow = -np.cos(0.5 * phase) * self.reach
-        slow[self.fast] = -np.cos(CYCLES * phase) * self.reach[self.fast]
+        position = -np.cos(0.5 * phase) * self.reach
+        position[self.fast] = -np.cos(CYCLES * phase) * self.reach[self.fast]
         turn = rotation_exp(-TURN * np.cos(TURN_CYCLES * phase))
-        return self.volume.pose(self.along, slow, turn)
+        return self.volume.pose(self.along, position, turn)
 
     def pose_rate(self, time: float) -> Array:
         """Return the time derivative (6,) of the pose, from central differences."""
@@ -144,7 +147,7 @@ class BarRun:
     errors           (n, 6), errors of the relative pose as shift and rotation vector, in axes of
                      the first end, m and rad
     distance_errors  (n,), errors of the distance between the ends, m
-    variance_ratios  (n,), squared errors in units of the stated covariance, divided by 6
+    variance_ratios  (n,), squared Mahalanobis distances of the errors, divided by 6
     lost             number of frames in which an end was not measured
     given_up         reason if the run has ended early, otherwise empty
 
@@ -198,9 +201,9 @@ class BarTest:
 
     @property
     def variance_ratio(self) -> float:
-        """Mean squared error in units of the stated covariance.
+        """Mean of the variance ratios of all frames.
 
-        A value of 1 means that the covariance is right.
+        It is about 1 if the stated covariances are right.
         """
         return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
 
@@ -233,7 +236,11 @@ def bar_test(
 
 
 def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
-    """Measure the bar at ``times`` (n,) s of a path. Before time 0, the bar stands still."""
+    """Measure the bar at ``times`` (n,) s of a path. Before time 0, the bar stands still.
+
+    Raises AcceptanceError if an end is not found in the first image, or if the bar is not measured
+    both at rest and in motion.
+    """
     estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
     for estimator in estimators:
         # if an end cannot be found, the exception is raised here, before the frames are tracked
@@ -272,8 +279,8 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
     """Return the error (6,) of the second end's pose relative to the first end.
 
     The error is a shift and a rotation vector in axes of the first end. The second result is the
-    error of the ends' distance. The third result is the squared error in units of the stated
-    covariance, divided by 6.
+    error of the ends' distance, m. The third result is the squared Mahalanobis distance of the
+    error, divided by 6.
     """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ FIRST_FROM_SECOND[:3, :3].T)

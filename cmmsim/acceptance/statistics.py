@@ -14,7 +14,9 @@ from scipy.special import stdtrit
 from cmmsim.errors import ShapeError
 from cmmsim.geometry.pose import Array
 
+# Probability that an interval contains the true value.
 LEVEL = 0.95
+# Number of resamples of the bootstrap.
 RESAMPLES = 1000
 
 Interval = tuple[float, float]
@@ -22,7 +24,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of values, in the unit of the values.
+    """Number, mean, root mean square, 95th percentile and maximum of values, in their unit.
 
     ``interval`` contains the 95 % intervals of mean, rms and p95 by name, from a block bootstrap.
     """
@@ -36,9 +38,9 @@ class Statistics:
 
 
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
-    """Return the statistics of magnitudes (n,) of errors.
+    """Return the statistics of values (n,), which are magnitudes of errors.
 
-    Neighbouring values are not independent, so they are resampled in blocks of ``block`` values.
+    Neighbouring values can depend on each other, so blocks of ``block`` values are resampled.
     scipy.stats.bootstrap cannot do this, because it resamples single values only. Raises ShapeError
     if there are no values, or if a value is not finite.
     """
@@ -52,10 +54,10 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
         k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
         for k, v in _figures(values[drawn]).items()
     }
-    figures = {name: float(value) for name, value in _figures(values).items()}
+    by_name = {name: float(value) for name, value in _figures(values).items()}
     return Statistics(
         len(values),
-        **figures,
+        **by_name,
         maximum=float(values.max()),
         interval={k: (float(a), float(b)) for k, (a, b) in limits.items()},
     )
@@ -71,7 +73,10 @@ def _figures(values: Array) -> dict[str, Array]:
 
 
 def interval_of_mean(values: Array) -> Interval:
-    """Return Student's 95 % interval of the mean of independent normal values (n,), n >= 2."""
+    """Return Student's 95 % interval of the mean of independent normal values (n,).
+
+    Raises ShapeError for fewer than two values, and if a value is not finite.
+    """
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
@@ -82,7 +87,7 @@ def interval_of_mean(values: Array) -> Interval:
 
 
 def _require_finite(values: Array) -> None:
-    """Raise ShapeError unless there are values (n,), all finite."""
+    """Raise ShapeError unless values (n,) are at least one and all finite."""
     if values.ndim != 1 or len(values) == 0 or not np.all(np.isfinite(values)):
         raise ShapeError(
             "statistics need at least one value and only finite values (n,), got shape "

@@ -23,16 +23,18 @@ from cmmsim.geometry.stereo_rig import StereoRig
 MARGIN_PX = 40.0
 # Largest ratio of half the volume's depth to the distance from the baseline to the target.
 LARGEST_DEPTH_RATIO = 0.8
-# m: smallest side of a volume. The stickers of an artefact do not fit into a smaller volume.
+# Smallest side of a volume, m. The stickers of an artefact do not fit into a smaller volume.
 SMALLEST_SIZE = 0.1
+# Corners (8, 3) of the volume, in units of its sides.
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
+# Rules of the standard: numbers of lines and of different test lengths on each line.
 FEWEST_LINES = 7
 FEWEST_LENGTHS = 5
 # Smallest ratio of the longest test length to the space diagonal of the volume.
 SMALLEST_LENGTH_RATIO = 2.0 / 3.0
 # Ratio of a line to its diagonal. The rest leaves space for the ends of the artefact.
 LINE_RATIO = 0.9
-# Test lengths of a line, as shares of its longest test length.
+# Test lengths of a line, as fractions of its longest test length.
 TEST_LENGTHS = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
 # Ends of the lines, in half sides of the volume.
 LINES = {
@@ -50,8 +52,9 @@ LINES = {
 class MeasuringVolume:
     """Cuboid with sides ``size`` (3,) along x, y and z, m.
 
-    ``base_from_volume`` (4, 4) has its origin in the middle. ``distance`` is the distance of the
-    origin from the middle of the baseline, m.
+    The origin of the volume axes is the middle of the cuboid. ``base_from_volume`` is (4, 4).
+    ``distance`` is the distance of the origin from the middle of the baseline, m. Raises
+    AcceptanceError if a side is shorter than SMALLEST_SIZE.
     """
 
     base_from_volume: Array
@@ -78,8 +81,8 @@ class MeasuringVolume:
         """Return the pose (6,) of an artefact in the base frame.
 
         The artefact's origin is at ``position`` (3,) m in volume axes. The artefact's x axis has
-        the direction ``along`` (3,) of any length, and side A faces the rig. Finally the artefact
-        is rotated by ``turn`` (3, 3) in its own axes.
+        the direction ``along`` (3,) of any length, which must not be parallel to z. Side A faces
+        the rig. Finally the artefact is rotated by ``turn`` (3, 3) in its own axes.
         """
         x = along / np.linalg.norm(along)
         towards = np.array([0.0, 0.0, -1.0])
@@ -104,8 +107,8 @@ class MeasuringVolume:
 def common_volume(place: Rig) -> MeasuringVolume:
     """Return the largest cube around the target of a rig that is wholly visible to both cameras.
 
-    The images of its corners lie at least MARGIN_PX from the image edges. Raises AcceptanceError if
-    even a cube with sides SMALLEST_SIZE is not visible.
+    The images of its corners lie at least MARGIN_PX from the image edges. The sides are rounded
+    down to whole millimetres. Raises AcceptanceError if they are shorter than SMALLEST_SIZE.
     """
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
@@ -129,8 +132,8 @@ def common_volume(place: Rig) -> MeasuringVolume:
 def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
     """Return the cuboid of ``size`` (3,) m around the target of a rig.
 
-    Raises AcceptanceError, which names an invisible corner and the largest visible cube, if the
-    cuboid is not wholly visible.
+    Raises AcceptanceError, which names the reason and the largest visible cube, if the cuboid is
+    not wholly visible, and if a side is shorter than SMALLEST_SIZE.
     """
     rig, camera_from_base = rig_from_file(place)
     frame, distance = _volume_frame(rig, camera_from_base, place)
@@ -160,9 +163,9 @@ def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[
 
 
 def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
-    """Return a text that names a corner of a cuboid that a camera does not see.
+    """Return the reason why a cuboid is not wholly visible to both cameras, or None if it is.
 
-    Returns None if both cameras see all corners.
+    A cuboid that comes too close to the cameras does not count as visible.
     """
     corners = CORNERS * size
     if 0.5 * size[2] > LARGEST_DEPTH_RATIO * distance:
@@ -213,7 +216,7 @@ class MeasuringLine:
 def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
     """Return the seven lines of a volume, with five test lengths each.
 
-    Raises AcceptanceError if the lines break a rule.
+    Raises AcceptanceError if the lines break a rule of the standard.
     """
     lines = []
     for name, corners in LINES.items():
@@ -226,7 +229,7 @@ def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
 
 
 def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> None:
-    """Raise AcceptanceError if measuring lines break a rule.
+    """Raise AcceptanceError if measuring lines break a rule of the standard.
 
     The message names the line, the value and the limit.
     """
