@@ -225,8 +225,8 @@ class Sensor(Instrument):
         # One random number per frame, so that runs over different poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
-            fraction = f"a share of {self.timing.dropout:.3g} drops out"
-            measured = lost_measurement(f"dropped frame ({fraction})")
+            share = f"a share of {self.timing.dropout:.3g} drops out"
+            measured = lost_measurement(f"dropped frame ({share})")
         else:
             measured = self._tracker.measure(images)
         if self._watch is not None:
@@ -271,7 +271,7 @@ class Sensor(Instrument):
         obstacles: Mapping[str, Array] | None = None,
         near: ArrayLike | None = None,
     ) -> MeasuredPoses:
-        """Measure the platform in many frames pose_values once, on all cores.
+        """Measure the platform in many frames at once, on all cores.
 
         Each frame has its own noise and dropout. The noise has the same covariance as in `measure`,
         but different random numbers. The rig does not drift.
@@ -334,7 +334,7 @@ class Sensor(Instrument):
         return found.without(self._dropout_rng.random(len(pose_values)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
-        """Measure a platform pose_values rest in many frames, without dropouts.
+        """Measure a platform at rest in many frames, without dropouts.
 
         Stickers are searched in windows even with the renderer "statistical".
 

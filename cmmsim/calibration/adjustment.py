@@ -112,7 +112,7 @@ class RigState:
 def _moved(transform: Array, change: Array) -> Array:
     """Return a transform (4, 4) after a small change [dt, dphi] (6,).
 
-    dt is added to the translation, m. The rotation vector dphi, rad, turns the output axes.
+    dt is added to the translation, m. The rotation by dphi, rad, multiplies from the left.
     """
     moved = transform.copy()
     moved[:3, 3] += change[:3]

@@ -90,8 +90,8 @@ def _squares(board: Board) -> Print:
         bright = board.charuco().generateImage((columns * SQUARE, rows * SQUARE)) // 255
     levels = np.where(np.pad(bright, rim, constant_values=1), BRIGHT, DARK).astype(np.float32)
     # The frame of a print begins at its corner, and that of a board at its first point.
-    parity = rigid(np.eye(3), plate_corners(board)[0])
-    return Print(levels, board.spacing / SQUARE, parity)
+    board_from_print = rigid(np.eye(3), plate_corners(board)[0])
+    return Print(levels, board.spacing / SQUARE, board_from_print)
 
 
 def default_board(rig: StereoRig) -> Board:

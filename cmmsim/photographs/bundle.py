@@ -139,7 +139,7 @@ class Bundle:
     """Result of an adjustment.
 
     state        adjusted values
-    covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, if poses are unknown
+    covariance   (3 n + 24, 3 n + 24), of the places and the rig's parameters, with unknown poses
     residuals    (2, m, 2), measured minus computed centres, px
     squares      (m,), sum of the squared whitened residuals in both images
     factor       sum of ``squares`` per degree of freedom
@@ -207,12 +207,12 @@ def _step(
         matrix -= by_common.T @ by_pose @ mixed
         rhs -= by_common.T @ by_pose @ alone
         poses.append((mixed, alone))
-    # An unseen sticker has no observations. A scaled diagonal keeps the matrix invertible.
+    # An unseen sticker has no observations. A unit diagonal keeps the matrix invertible.
     empty = np.diag(matrix) == 0.0
     matrix[empty, empty] = 1.0
     gauge = _gauge(seen, state, len(matrix))
     matrix += np.diag(matrix)[:count].mean() * gauge @ gauge.T
-    # Parameters differ by many orders of magnitude. A scaled diagonal avoids a loss of digits.
+    # Parameters differ by many orders of magnitude. A unit diagonal avoids a loss of digits.
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = np.linalg.inv(scale[:, None] * matrix * scale)
     covariance = scale[:, None] * (0.5 * (scaled + scaled.T)) * scale

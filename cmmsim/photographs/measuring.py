@@ -89,7 +89,7 @@ class MeasuredPair:
         ]
 
     def picture(self) -> NDArray[np.uint8]:
-        """Return both images side by side, with a circle and a name pixels each sticker used."""
+        """Return both images side by side, with a circle and a name at each sticker used."""
         sides = zip(
             (self.images.left, self.images.right),
             (self.measurement.left_pixels, self.measurement.right_pixels),
