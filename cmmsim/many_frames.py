@@ -58,23 +58,24 @@ class Frames:
 
 
 def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[MeasuredExposures]:
-    """Measure frames block by block. The estimator is given the true movement during each exposure.
+    """Yield the measurements of frames block by block.
 
-    The result does not depend on the number of threads.
+    The estimator is given the true movement during each exposure. The result does not depend on the
+    number of threads.
     """
     estimator = frames.estimator
     poses = frames.poses
     rates = frames.rates
     rngs = frames.rngs
     expected = frames.expected
-    half = 0.5 * camera.exposure * rates
+    half_movement = 0.5 * camera.exposure * rates
     # The platform is assumed at its expected pose in mid-exposure. Its movement is the true one.
-    back = expected @ invert(transforms_of(poses))
-    first = back @ transforms_of(poses - half)
-    last = back @ transforms_of(poses + half)
-    period = 0.5 * frames.period * rates
-    before = back @ transforms_of(poses - period)
-    after = back @ transforms_of(poses + period)
+    to_expected = expected @ invert(transforms_of(poses))
+    first = to_expected @ transforms_of(poses - half_movement)
+    last = to_expected @ transforms_of(poses + half_movement)
+    half_period_movement = 0.5 * frames.period * rates
+    before = to_expected @ transforms_of(poses - half_period_movement)
+    after = to_expected @ transforms_of(poses + half_period_movement)
     parts = [slice(start, start + BLOCK) for start in range(0, len(poses), BLOCK)]
 
     def block(part: slice) -> MeasuredExposures:
@@ -102,7 +103,7 @@ def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> l
 class MeasuredExposures:
     """Result of N exposures that were measured together.
 
-    ``found`` contains the poses, and ``solved`` the stickers. ``others`` maps the number of an
+    ``found`` contains the poses, and ``solved`` the stickers. ``others`` maps the index of an
     exposure to its measurement. It contains the lost exposures, and all exposures if the method is
     not registration.
     """
@@ -139,8 +140,8 @@ def measure_exposures(
     seen = estimator.read(images, expected, places, normals).observed(exposure_ends, frame_ends)
     solved = solve_frames(seen, expected, estimator, estimator.platform, places)
     poses, covariances = estimator.in_base(solved.camera_from_body, solved.covariances)
-    of = seen.index // len(places)
-    used = np.bincount(of[solved.used], minlength=len(expected))
+    exposure_of = seen.index // len(places)
+    used = np.bincount(exposure_of[solved.used], minlength=len(expected))
     others = {}
     for k in np.flatnonzero(solved.lost | (estimator.method != "registration")):
         one = estimator.measurement_of(solved, int(k))
@@ -173,7 +174,10 @@ def threads_at_most() -> int:
 
 
 def pose_rows(poses: ArrayLike) -> Array:
-    """Return poses as an array (N, 6); N is 0 for an empty list. Raises ShapeError."""
+    """Return poses as an array (N, 6); N is 0 for an empty list.
+
+    Raises ShapeError if a pose is not six finite numbers.
+    """
     if isinstance(poses, list) and not poses:
         return np.zeros((0, 6))
     try:

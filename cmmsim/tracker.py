@@ -1,6 +1,6 @@
 """Measurement frame after frame.
 
-Stickers are searched at a pose predicted from the last measurements, never at the true pose.
+Stickers are searched at a pose predicted from previous measurements, never at the true pose.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator, require_fitting
 from cmmsim.radiometry.stereo_images import StereoFrame, StereoImages, readable
 
-# The whole images are searched as well if the predicted windows show fewer stickers than this share
-# of those in the last frame. A wrong prediction places windows beside the stickers.
+# The whole images are searched as well if the predicted windows show fewer stickers than this
+# fraction of those in the previous frame. A wrong prediction places windows beside the stickers.
 EXPECTED_SHARE = 0.7
 Ends = tuple[Array, Array] | None
 """Transforms camera_from_platform (4, 4) at the beginning and at the end of some time, or None."""
 
 
 class Tracker:
-    """Tracker that measures frame after frame, near a pose predicted from the last two poses.
+    """Tracker that measures frame after frame, near a pose predicted from the previous two poses.
 
     If the predicted windows show too few stickers, the whole images are searched as well, and the
     result with more stickers is used. Moving stickers are blurred during the exposure. The fit
-    computes the blur from the speed since the last frame. In the first frame of a run, and in the
-    first frame after a loss, the speed is estimated from the blur.
+    computes the blur from the speed since the previous frame. In the first frame of a run, and in
+    the first frame after a loss, the speed is estimated from the blur.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Tracker:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the last poses, so that the next measurement searches the whole images."""
+        """Forget all poses, so that the next measurement searches the whole images."""
         self._last: Array | None = None
         self._step_before: Array | None = None
         self._seen = 0
@@ -107,7 +107,7 @@ class Tracker:
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
         """Return the measurement in the predicted windows, or None.
 
-        The result is None without a last pose, and if the predicted windows give no pose.
+        The result is None without a previous pose, and if the predicted windows give no pose.
         """
         if self._last is None:
             return None
@@ -133,7 +133,8 @@ class Tracker:
     def _ends(self, middle: Array) -> tuple[Ends, Ends]:
         """Return the ends of the exposure, and those of a frame period about its middle.
 
-        The ends are None if the exposure takes no time, or all rows are exposed at once.
+        The first result is None if the exposure takes no time, and the second if all rows are
+        exposed at once. Without a previous pose, both are None.
         """
         settings = self._estimator.settings
         whole = 1.0 if settings.row_share > 0.0 else 0.0
@@ -142,10 +143,11 @@ class Tracker:
         )
 
     def _part_of_frame(self, middle: Array, share: float) -> Ends:
-        """Return camera_from_platform (4, 4) at the beginning and at the end of a share of a frame.
+        """Return camera_from_platform (4, 4) at both ends of a fraction of a frame period.
 
-        In the middle, camera_from_platform is ``middle``. The speed is the mean speed since the
-        last frame. The result is None without a last frame, or if the share is zero.
+        ``share`` is this fraction. In its middle, camera_from_platform is ``middle``. The speed is
+        the mean speed since the previous frame. The result is None without a previous frame, or if
+        the fraction is zero.
         """
         if self._last is None or share == 0.0:
             return None
@@ -153,11 +155,11 @@ class Tracker:
         return middle @ part_of_step(step, -0.5 * share), middle @ part_of_step(step, 0.5 * share)
 
     def _predicted(self) -> Array:
-        """Return camera_from_platform (4, 4) of the next frame if the last movement continues."""
+        """Return camera_from_platform (4, 4) of the next frame if the movement continues."""
         assert self._last is not None
         return self._last if self._step_before is None else self._last @ self._step_before
 
 
 def part_of_step(step: Array, share: float) -> Array:
-    """Return the ``share`` of a small movement (4, 4), to first order."""
+    """Return the fraction ``share`` of a small movement (4, 4), to first order."""
     return rigid(rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3])

@@ -5,10 +5,11 @@ they come from parameters that the estimator assumes to be exact: the rig (24 nu
 frames of base and platform (12), thickness and retro-reflection of the stickers (2), and the
 time at which the right camera exposes (1).
 
-To first order, these errors d change a measured pose by J(pose) d. J is computed without images:
-sticker centres are projected through a rig with errors and triangulated with the known rig.
-Teaching used the same known rig, so the taught frames and sticker places have errors as well. The
-errors at teaching and at a measured pose mostly cancel, and only their difference remains.
+To first order, these errors d change a measured pose by J(pose) d. J is computed without images,
+from the derivatives of pixels. Teaching used the same known rig, so the taught frames and sticker
+positions have errors as well. To compute them, sticker centres on the teaching path are projected
+through a rig with errors and triangulated with the known rig. The errors at teaching and at a
+measured pose mostly cancel, and only their difference remains.
 """
 
 from __future__ import annotations
@@ -84,9 +85,10 @@ class CommonErrors:
 
 @dataclass(frozen=True)
 class MeasuringGeometry:
-    """Geometry as an estimator knows it. ``home`` (6,) is the pose of the platform at teaching.
+    """Geometry as an estimator knows it.
 
-    ``print`` has the errors of the stickers' print; None if they count as perfect.
+    ``home`` (6,) is the pose of the platform at teaching. ``print`` are the errors of the stickers'
+    print; None if the print counts as perfect.
     """
 
     rig: StereoRig
@@ -106,8 +108,9 @@ class MeasuringGeometry:
     ) -> Array:
         """Return the covariance (6, 6) that common errors cause at a pose (6,).
 
-        The errors are those of the taught frames and of the rig, with ``rig_covariance`` (24, 24).
-        For other methods than registration, the covariance is not known, and the result is NaN.
+        The errors are those of the taught frames, of the print, and of the rig, which has
+        ``rig_covariance`` (24, 24). For other methods than registration, the covariance is not
+        known, and the result is NaN.
         """
         if method != "registration":
             return np.full((6, 6), np.nan)
@@ -160,8 +163,8 @@ class MeasuringGeometry:
     def taught_by_rig(self) -> tuple[Array, Array]:
         """Errors of teaching per unit of the errors of the rig's parameters.
 
-        The first result (6, 24) are small errors of the taught base_from_camera. The second result
-        (24, n, 3) are errors of the taught places of the platform's stickers.
+        The first result (6, 24) contains small errors of the taught base_from_camera. The second
+        result (24, n, 3) contains errors of the taught positions of the platform's stickers.
         """
         if self.taught.by_rig is not None:
             frames = self.taught.by_rig[:6]
@@ -228,7 +231,7 @@ class MeasuringGeometry:
         return base, path, np.concatenate([base, views.reshape(-1, 3)])
 
     def _teach(self, true: Sequence[StereoRig]) -> tuple[Array, Array]:
-        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) from r teachings.
+        """Return base_from_camera (r, 4, 4) and sticker positions (r, n, 3) from r teachings.
 
         In each teaching, one of the rigs ``true`` forms the images without noise, and the known rig
         measures them.
@@ -237,7 +240,7 @@ class MeasuringGeometry:
         return self._taught_from(np.stack([rig.project(points)[0] for rig in true], axis=1), points)
 
     def _taught_from(self, pixels: Array, near: Array) -> tuple[Array, Array]:
-        """Return base_from_camera (r, 4, 4) and sticker places (r, n, 3) from r teachings.
+        """Return base_from_camera (r, 4, 4) and sticker positions (r, n, 3) from r teachings.
 
         Each teaching sees the points ``near`` (m, 3) of ``_teaching_points`` at ``pixels``
         (2, r, m, 2).
@@ -261,9 +264,11 @@ class MeasuringGeometry:
         The known rig triangulates ``pixels`` (2, r, m, 2) of points near ``near`` (m, 3).
         """
         flat = pixels.reshape(2, -1, 2)
-        spread = np.broadcast_to(np.eye(2), (*flat.shape[:2], 2, 2))
+        unit_covariance = np.broadcast_to(np.eye(2), (*flat.shape[:2], 2, 2))
         around = np.tile(near, (pixels.shape[1], 1))
-        triangulated = triangulate(self.rig, flat[0], flat[1], spread[0], spread[1], around)
+        triangulated = triangulate(
+            self.rig, flat[0], flat[1], unit_covariance[0], unit_covariance[1], around
+        )
         shape = (*pixels.shape[1:3], 3)
         return triangulated.points.reshape(shape), triangulated.covariances.reshape(*shape, 3)
 
@@ -325,9 +330,9 @@ class _View:
         return self._registered((self._by_movement.swapaxes(2, 3) @ of_each).sum(axis=0))
 
     def by_places(self, places: Array) -> Array:
-        """Return the small movements (N, 6, p) of base_from_platform that fit changes of places.
+        """Return the small movements (N, 6, p) of base_from_platform that fit changes of stickers.
 
-        ``places`` (p, n, 3) are the changes of the taught places.
+        ``places`` (p, n, 3) are the changes of the taught positions of all stickers.
         """
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
         count, seen = self.arms.shape[:2]
@@ -339,10 +344,15 @@ class _View:
         return self._registered((rows @ columns).reshape(count, 6, -1))
 
     def _registered(self, pulls: Array) -> Array:
-        """Return the movements (N, 6, p), in base axes, of a registration with right sides."""
+        """Return the movements (N, 6, p), in base axes, that solve a registration.
+
+        ``pulls`` (N, 6, p) are the right-hand sides of the normal equations, in camera axes.
+        """
         movement = np.linalg.solve(self._normal, pulls)
-        turn = self.camera_from_base[:3, :3].T
-        return np.concatenate([turn @ movement[:, :3], turn @ movement[:, 3:]], axis=1)
+        base_from_camera = self.camera_from_base[:3, :3].T
+        return np.concatenate(
+            [base_from_camera @ movement[:, :3], base_from_camera @ movement[:, 3:]], axis=1
+        )
 
     @cached_property
     def _by_movement(self) -> Array:

@@ -1,11 +1,11 @@
 """Residuals of the stickers' pixels in blocks of frames, and the effects of errors of the rig.
 
-The residuals of a body are differences between observed and expected pixels, in units of their
-noise. Expected pixels follow from taught places and the measured pose. The pose of the platform is
-estimated from the same pixels, so the part of the residuals that a pose explains is removed. With n
-stickers, the 4 n residuals then have unit variance in 4 n - 6 directions and are zero in the other
-six. The base stands still, and its pose was taught, so nothing is removed from its residuals. They
-also show movements of the whole rig relative to the base.
+The residuals of a body are observed minus expected pixels, in units of their noise. Expected pixels
+follow from taught positions and the measured pose. The pose of the platform is estimated from the
+same pixels, so the part of the residuals that a pose explains is removed. With n stickers, the 4 n
+residuals then have unit variance in 4 n - 6 directions and are zero in the other six. The base
+stands still, and its pose was taught, so nothing is removed from its residuals. The residuals of
+the base also show movements of the whole rig relative to the base.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 
 # Names of the parameters of a common movement of both cameras. The parameters are those of the
-# base's movement in camera axes, with rotations about its origin.
+# base's movement in camera axes, with rotations about the base's origin.
 PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
 
-# The square of this, px, is added to the stated variance of a centre, which can be too small.
+# Standard deviation, px, whose square is added to the stated variance of a centre. The stated
+# variance can be too small.
 SMALLEST_STD_PX = 5e-4
 RIG = len(PARAMETER_NAMES)
 
@@ -35,7 +36,7 @@ class Rows:
     """Residuals of b blocks of frames, with their derivatives.
 
     residuals   (b, m), with variance one or zero in each direction
-    by_drift    (b, m, 30), for changes of the rig's parameters and place since teaching
+    by_drift    (b, m, 30), for changes of the rig's parameters and of its pose since teaching
     by_start    (b, m, 24), for errors of the rig's parameters that existed at teaching already
     by_delay    (b, m, 1), for the delay of the right camera's exposure, s
     by_offsets  (b, m, o), for constant errors of single centres, px
@@ -52,9 +53,9 @@ class Rows:
 class FrameBlock:
     """Block of frames that show the same stickers of a body.
 
-    ``index`` (k,) refers to the body's stickers, and ``places`` (k, 3) are in body axes. The lists
-    contain one entry per frame: the time in s, the pose (6,) of the body in the base frame, the
-    pixels (2, k, 2), and their variances (k,) px².
+    ``index`` (k,) are the indices of the stickers in the body, and ``places`` (k, 3) their
+    positions in body axes, m. The lists contain one entry per frame: the time in s, the pose (6,)
+    of the body in the base frame, the pixels (2, k, 2), and their variances (k,) px².
     """
 
     index: NDArray[np.int_]
@@ -97,7 +98,7 @@ class FrameBlock:
 def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows:
     """Return the rows of blocks of frames in which the same stickers of the platform were seen."""
     index = blocks[0].index
-    camera_from_body = np.array([seen.middle for seen in blocks])
+    camera_from_body = np.array([block.middle for block in blocks])
     arms = blocks[0].places @ camera_from_body[:, :3, :3].swapaxes(1, 2)
     slopes, by_rig = _derivatives(geometry.rig, arms + camera_from_body[:, None, :3, 3])
     taught = np.einsum(
@@ -105,7 +106,7 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> 
     )
     by_delay = np.zeros((*by_rig.shape[:-1], 1))
     by_delay[1, ..., 0] = np.einsum(
-        "bkij,bkj->bki", slopes[1], np.array([seen.velocities for seen in blocks])
+        "bkij,bkj->bki", slopes[1], np.array([block.velocities for block in blocks])
     )
     residuals, roots = _whitened(geometry.rig, blocks)
     # orthonormal columns that span the residuals which a change of the pose explains
@@ -128,12 +129,12 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> 
 def base_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows:
     """Return the rows of blocks of frames in which the same stickers of the base were seen."""
     index = blocks[0].index
-    move = geometry.camera_from_base
-    arms = blocks[0].places @ move[:3, :3].T
-    slopes, by_rig = geometry.rig.derivatives(arms + move[:3, 3])
+    camera_from_base = geometry.camera_from_base
+    arms = blocks[0].places @ camera_from_base[:3, :3].T
+    slopes, by_rig = geometry.rig.derivatives(arms + camera_from_base[:3, 3])
     sticker_slopes = slopes.transpose(1, 0, 2, 3).reshape(len(arms), 4, 3)
     sticker_by_rig = by_rig.transpose(1, 0, 2, 3).reshape(len(arms), 4, RIG)
-    # derivatives of the taught places with respect to the rig
+    # derivatives of the taught positions with respect to the rig
     taught = np.linalg.solve(
         sticker_slopes.swapaxes(1, 2) @ sticker_slopes,
         sticker_slopes.swapaxes(1, 2) @ sticker_by_rig,
@@ -168,6 +169,7 @@ def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
     return Rows(**parts, by_offsets=offsets)
 
 
+# Arrays of Rows whose columns are the same for all bodies.
 NOT_OFFSETS = ("residuals", "by_drift", "by_start", "by_delay")
 
 
@@ -182,18 +184,18 @@ def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
 
 
 def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Array]:
-    """Return mean differences (b, 4k) between observed and expected pixels of each block.
+    """Return the means (b, 4k) of observed minus expected pixels over the frames of each block.
 
-    The differences are in units of their standard deviations. The second result contains the square
-    roots (b, k) of their weights.
+    The means are in units of their standard deviations. The second result (b, k) contains the
+    reciprocals of these standard deviations, 1/px.
     """
     weights = 1.0 / (
-        np.array([each for seen in blocks for each in seen.variances]) + SMALLEST_STD_PX**2
+        np.array([each for block in blocks for each in block.variances]) + SMALLEST_STD_PX**2
     )
-    camera_from_body = np.concatenate([seen.camera_from_body for seen in blocks])
-    pixels = np.array([each for seen in blocks for each in seen.pixels]).swapaxes(0, 1)
+    camera_from_body = np.concatenate([block.camera_from_body for block in blocks])
+    pixels = np.array([each for block in blocks for each in block.pixels]).swapaxes(0, 1)
     residuals = pixels - rig.project(apply_each(camera_from_body, blocks[0].places))[0]
-    starts = np.cumsum([0, *(len(seen.times) for seen in blocks)])[:-1]
+    starts = np.cumsum([0, *(len(block.times) for block in blocks)])[:-1]
     roots = np.sqrt(np.add.reduceat(weights, starts))
     summed = np.add.reduceat(weights[..., None] * residuals, starts, axis=1)
     return (summed / roots[..., None]).swapaxes(0, 1).reshape(len(blocks), -1), roots

@@ -27,7 +27,7 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.drift_blocks import PLACES_OF_RIG, RIG, Rows
 
-# Size of a relevant drift, for each parameter: a tenth of a pixel, 20 um, 20 urad.
+# Magnitude of a relevant drift of each parameter: a tenth of a pixel, 20 um, 20 urad.
 SIZES = np.array(
     [*2 * (*4 * (0.1,), 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *6 * (2e-5,), *len(PLACES_OF_RIG) * (2e-5,)]
 )
@@ -47,6 +47,7 @@ MOST_NAMED = 3
 # A direction is named by the parameters whose components, in units of SIZES, are at least this
 # large.
 LEAST_COMPONENT = 0.3
+# Name of the direction that never changes a residual.
 ALWAYS_UNSEEN = ("scale of rig and taught places together",)
 
 
@@ -54,7 +55,8 @@ class Filter:
     """Kalman filter of n unknowns. The first w unknowns begin at zero and perform a random walk.
 
     The filter is in information form, so that all models share the products of derivatives. The
-    density of the unknowns x is proportional to exp(constant + right x - x precision x / 2).
+    density of the unknowns x is proportional to exp(constant + right x - x precision x / 2), in
+    which ``right`` (n,) is the information vector and ``precision`` (n, n) the information matrix.
     Source: B. D. O. Anderson and J. B. Moore, Optimal Filtering (1979), section 6.3.
     """
 
@@ -95,7 +97,7 @@ class Filter:
     @property
     def log_likelihood(self) -> float:
         """Log-likelihood of all residuals so far."""
-        # without an update, the precision is zero
+        # before the first update, the precision of unknowns that walk is zero
         if not self.precision[0, 0]:
             return 0.0
         lower, part = _factored(self.precision, self.right)
@@ -143,8 +145,8 @@ class Evidence:
     The errors of the calibration, in units of SIZES, are ``calibration`` (24, r) times r
     independent numbers of unit variance. ``delay_std`` is the standard deviation of the right
     camera's delay, s. ``offset_std`` (o,) are the standard deviations of constant errors of single
-    centres, px. ``place_shows`` is True if the base is observed: only then do the residuals depend
-    on the place of the whole rig.
+    centres, px. ``place_shows`` is True if the base is observed. Only then do the residuals depend
+    on the pose of the whole rig.
     """
 
     def __init__(
@@ -256,7 +258,8 @@ class Finding:
     noticed_s, noticed_frame : float and int, or None
         Time and frame at which a movement was detected; None if none was detected.
     evidence, limit : float
-        Largest logarithm of the likelihood ratio, and its limit.
+        Largest logarithm of the likelihood ratio, and the limit above which a movement counts as
+        detected.
     chance : float
         Probability of a false alarm in a run, however long.
     frames, judged_frames : int
@@ -320,7 +323,7 @@ class Finding:
 def movements(drift_information: DriftInformation) -> tuple[tuple[Movement, ...], float]:
     """Return a few parameters whose movement explains the residuals, and the explained fraction.
 
-    Parameters are chosen one by one. Each is the one that explains most together with those before.
+    Parameters are chosen one by one. Each of them explains most together with those chosen before.
     """
     information = drift_information.information
     score = drift_information.score

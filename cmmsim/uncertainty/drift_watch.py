@@ -23,7 +23,7 @@ from cmmsim.uncertainty.known_rig import KnownRig
 CHANCE = 0.01
 # Largest number of frames in a block. The residuals of a block are averaged.
 BLOCK_FRAMES = 6
-# Number of blocks that are evaluated together. Longer runs then need no more memory.
+# Number of blocks after which they are evaluated. Longer runs therefore need no more memory.
 BLOCKS_TOGETHER = 64
 # A frame with fewer stickers is not used.
 FEWEST_STICKERS = 4
@@ -40,7 +40,7 @@ class DriftWatch:
     geometry : MeasuringGeometry
         Geometry as the estimator knows it.
     known : KnownRig, optional
-        Accuracy of the geometry's rig. By default, the rig is exact.
+        Uncertainty of the geometry's rig. By default, the rig is exact.
     frame_period : float
         Time from frame to frame, s.
     chance : float
@@ -127,17 +127,18 @@ class DriftWatch:
             return None
         body = self.geometry.base
         places = self.geometry.taught.base_places
-        near = self.geometry.camera_from_base
-        seen = observer.observe(images, near, places, body.sticker_normals)
+        camera_from_base = self.geometry.camera_from_base
+        seen = observer.observe(images, camera_from_base, places, body.sticker_normals)
         try:
-            return consistent(seen, near, observer, body, places)[0]
+            return consistent(seen, camera_from_base, observer, body, places)[0]
         except LostError:
             return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
-        """Use the next frame, with the stickers of the ``base`` that it shows.
+        """Add the next frame, with the stickers of the ``base`` that it shows.
 
-        A lost frame only advances the time.
+        A frame with fewer than FEWEST_STICKERS stickers of the platform only advances the time, and
+        so does a lost frame.
         """
         time = self._frames * self._period
         self._frames += 1
@@ -158,7 +159,10 @@ class DriftWatch:
 
     @property
     def finding(self) -> Finding:
-        """Finding from the frames since the last ``restart``."""
+        """Finding from all frames since ``restart``.
+
+        Reading it ends the block that is being filled.
+        """
         self._end_block(self._frames)
         self._evaluate_blocks()
         drift_information = self._evidence.drift_information

@@ -13,8 +13,8 @@ from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
-# Tolerance for rounding errors in a covariance that is scaled to unit variances. It applies to the
-# symmetry and, per row, to negative eigenvalues.
+# Tolerance for rounding errors in a covariance that is scaled to unit variances. Entries may differ
+# by it from symmetry. An eigenvalue may be negative by it times the number of rows.
 ROUNDING = 1e-9
 
 # Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board. With real
@@ -35,7 +35,8 @@ class KnownRig:
                          Rows of exact parameters are zero.
     exposure_std         Standard deviation of the delay of the right camera's exposure, s.
 
-    Raises CmmError if the matrix is not a covariance.
+    Raises ShapeError if the matrix is not (24, 24) and finite, and CmmError if it is not symmetric
+    or has a negative variance or eigenvalue.
     """
 
     rig: StereoRig
@@ -69,7 +70,7 @@ class KnownRig:
     def drawn(
         cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0
     ) -> KnownRig:
-        """Draw the result of a calibration of a true rig, with random errors of the covariance."""
+        """Draw the result of a calibration of a true rig, with errors drawn from the covariance."""
         std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
@@ -77,21 +78,21 @@ class KnownRig:
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
     def line_std(self, points: Array) -> float:
-        """Return the standard deviation, px, of distances of images from their epipolar lines.
+        """Return the standard deviation, px, of a pixel's distance from its epipolar line.
 
-        Errors of the known rig cause these distances. The result is the largest one over ``points``
+        Errors of the known rig cause this distance. The result is the largest one over ``points``
         (n, 3) in the camera frame.
         """
         std = np.sqrt(np.diag(self.covariance))
-        moved = []
+        derivatives = []
         for k in np.flatnonzero(std):
             step = std[k] * np.eye(len(std))[k]
             more, less = (self._off_lines(self.rig.moved(end), points) for end in (step, -step))
-            moved.append((more - less) / (2.0 * std[k]))
-        if not moved:
+            derivatives.append((more - less) / (2.0 * std[k]))
+        if not derivatives:
             return 0.0
         kept = np.flatnonzero(std)
-        slopes = np.stack(moved)
+        slopes = np.stack(derivatives)
         return float(
             np.sqrt(
                 np.einsum("jn,jk,kn->n", slopes, self.covariance[np.ix_(kept, kept)], slopes).max()
@@ -99,10 +100,10 @@ class KnownRig:
         )
 
     def _off_lines(self, true: StereoRig, points: Array) -> Array:
-        """Return signed distances (n,) px of right images from the epipolar lines of left images.
+        """Return signed distances (n,) of right pixels from the epipolar lines of left pixels, px.
 
-        The rig ``true`` forms the images of the points (n, 3). The epipolar lines are those of the
-        known rig.
+        The rig ``true`` projects the points (n, 3) to pixels. The known rig undistorts these pixels
+        and gives the epipolar lines.
         """
         left, right = (
             np.column_stack([camera.undistort(pixels)[0], np.ones(len(points))])

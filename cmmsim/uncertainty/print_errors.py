@@ -39,8 +39,8 @@ class PrintErrors:
         """Return the shifts (2, N, n, 2, 2) px of the centres of stickers in both images.
 
         The last axis is for thickness and retro-shift, each with an error of one standard
-        deviation. The body stands at camera_from_body (N, 4, 4), with stickers at ``places``
-        (n, 3).
+        deviation. The body has the poses camera_from_body (N, 4, 4), and its stickers have the
+        positions ``places`` (n, 3) in body axes, m.
         """
         turns = camera_from_body[:, None, :3, :3]
         points = apply_each(camera_from_body, places)
@@ -69,7 +69,10 @@ class PrintErrors:
 
 
 def known_errors(file: SensorFile) -> PrintErrors | None:
-    """Return the print errors if an estimator with this sensor file knows their sizes, or None."""
+    """Return the print errors that an estimator with this sensor file knows, or None.
+
+    The result is None if it does not know their sizes, or if thickness and retro-shift are zero.
+    """
     sizes = print_sizes(file)
     if file.print.known and (sizes.thickness or sizes.retro_shift):
         return PrintErrors(sizes, file.stickers.radius)
