@@ -121,15 +121,9 @@ class Instrument:
     @cached_property
     def _view(self) -> StickerView:
         """Stickers at their expected pixels in the images of the known rig."""
-        camera_from_base = self.true_cameras.camera_from_base
+        from_base = self.true_cameras.camera_from_base
         return StickerView(
-            self._file,
-            self.platform,
-            self.base,
-            self.rig,
-            self._known,
-            camera_from_base,
-            self.optics,
+            self._file, self.platform, self.base, self.rig, self._known, from_base, self.optics
         )
 
     @cached_property
@@ -394,11 +388,9 @@ class Instrument:
         """
         self._require_registration("common errors can be computed for")
         known = self._known_rig
-        pose_values = np.asarray(poses, dtype=float)
-        rate_values = np.asarray(rates, dtype=float)
-        return self._geometry.common_errors(
-            pose_values, rate_values, known.covariance, known.exposure_std
-        )
+        rows = np.asarray(poses, dtype=float)
+        changes = np.asarray(rates, dtype=float)
+        return self._geometry.common_errors(rows, changes, known.covariance, known.exposure_std)
 
     def _require_registration(self, what: str) -> None:
         """Raise CmmError unless the method is "registration"; ``what`` begins the message."""

@@ -30,8 +30,7 @@ from cmmsim.detection.tags import find_tags
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
-# A view of a board other than ChArUco is rejected if less than this fraction of the points is
-# measured.
+# Smallest fraction of the points that a view must show, except for ChArUco boards.
 FEWEST_MEASURED = 0.7
 # Smallest number of measured points of a ChArUco board, which may lie partly outside the picture.
 FEWEST_CHARUCO = 6
@@ -66,12 +65,10 @@ PLAIN_NOISE = CameraNoise(
     electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0
 )
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
-# Bright spots with a smaller area are not dots.
+# Bright spots with a smaller area, or with a larger fraction of the image's area, are not dots.
 SMALLEST_AREA_PX = 20.0
-# Bright spots that fill more than this fraction of the image are not dots.
 LARGEST_AREA = 0.01
-# OpenCV first searches an image whose longer side is reduced to this length. This is faster and
-# reduces noise.
+# OpenCV first searches an image whose longer side is reduced to this, to save time.
 FIND_SIDE_PX = 1600
 # The search with a single threshold fails if a dot is farther than this from the grid that the four
 # corners define. The unit is the distance between neighbouring dots.
@@ -82,9 +79,8 @@ LARGEST_GRID_GAP = 0.3
 class BoardView:
     """View of a board by one camera.
 
-    ``index`` (n,) are the indices of the visible points of the board in ascending order, and
-    ``pixels`` (n, 2) their pixels. ``radius`` is the measured radius of the dots, m; None for
-    squares.
+    ``index`` (n,) are the indices of the visible points in ascending order, and ``pixels`` (n, 2)
+    their pixels. ``radius`` is the measured radius of the dots, m; None for squares.
     """
 
     index: NDArray[np.int_]
@@ -132,8 +128,8 @@ def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
     """Return the view with its points in the board's order, or the reason why it is rejected.
 
     A camera sees only the front of a board, so a mirrored order is wrong. Reversing each row
-    corrects it. Asymmetric dots in mirrored order are rejected, and so are points that lie on one
-    line or do not fit a homography.
+    corrects it. Asymmetric dots in mirrored order are rejected. So are points that lie on one line
+    or do not fit a homography.
     """
     grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
     plane = board.points[view.index, :2]
@@ -176,8 +172,8 @@ def radius_differs(measured: float | None, given: float | None) -> bool:
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
     """Return the centres (rows * columns, 2) px and the measured radius of the dots, m.
 
-    The centres are in the board's order. The centre of a dot whose fit failed is NaN. The result is
-    None if no board is found.
+    The centres are in the board's order, and NaN where a fit failed. The result is None if no board
+    is found.
     """
     bright = 255 - grey if board.dark else grey
     rough = search_dots(bright, board)
@@ -223,10 +219,7 @@ def _refine(
 
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
-    """Return the standard deviation of blur among SPREADS_PX with the smallest misfit, px.
-
-    The blur is the Gaussian blur of lens and focus together.
-    """
+    """Return the blur of lens and focus among SPREADS_PX that has the smallest misfit, px."""
     best = SPREADS_PX[0]
     least = np.inf
     # the misfit falls up to the true blur and rises beyond it
@@ -293,8 +286,8 @@ def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> f
 def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
     """Return rough centres (rows * columns, 2) px of bright dots in the board's order, or None.
 
-    Otsu's threshold is tried first, but not for asymmetric dots. OpenCV is then tried in a reduced
-    image, and finally in an image of the full size.
+    Otsu's threshold is tried first, except for asymmetric dots. Then OpenCV is tried in a reduced
+    image and in the whole image.
     """
     rough = read_at_once(bright, board) if board.kind == "dots" else None
     for side in (FIND_SIDE_PX, max(bright.shape)):
@@ -362,8 +355,7 @@ def _sharpest_corners(points: Array) -> Array:
 def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
     """Return the dot centres (n, 2) that OpenCV finds in a scaled image, or None.
 
-    The centres are in px of the original image. OpenCV itself returns (n, 1, 2) up to version 4,
-    and (n, 2) from version 5 on.
+    The centres are in px of the original image. OpenCV before version 5 returns (n, 1, 2).
     """
     small = (
         bright

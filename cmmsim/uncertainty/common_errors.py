@@ -87,8 +87,7 @@ class CommonErrors:
 class MeasuringGeometry:
     """Geometry as an estimator knows it.
 
-    ``home`` (6,) is the pose of the platform at teaching. ``print`` are the errors of the stickers'
-    print; None if the print counts as perfect.
+    ``home`` (6,) is the platform's pose at teaching. ``print`` is None if the print is perfect.
     """
 
     rig: StereoRig
@@ -108,9 +107,8 @@ class MeasuringGeometry:
     ) -> Array:
         """Return the covariance (6, 6) that common errors cause at a pose (6,).
 
-        The errors are those of the taught frames, of the print, and of the rig, which has
-        ``rig_covariance`` (24, 24). For other methods than registration, the covariance is not
-        known, and the result is NaN.
+        The errors are those of taught frames, print and rig; ``rig_covariance`` is (24, 24). For
+        other methods than registration, the covariance is not known, and the result is NaN.
         """
         if method != "registration":
             return np.full((6, 6), np.nan)
@@ -344,10 +342,7 @@ class _View:
         return self._registered((rows @ columns).reshape(count, 6, -1))
 
     def _registered(self, pulls: Array) -> Array:
-        """Return the movements (N, 6, p), in base axes, that solve a registration.
-
-        ``pulls`` (N, 6, p) are the right-hand sides of the normal equations, in camera axes.
-        """
+        """Return the movements (N, 6, p), in base axes, for right-hand sides in camera axes."""
         movement = np.linalg.solve(self._normal, pulls)
         base_from_camera = self.camera_from_base[:3, :3].T
         return np.concatenate(
