@@ -1,4 +1,5 @@
-"""Causes in the measured poses: gross errors of single frames, and errors that all frames share.
+"""Causes in what was measured: gross errors of single frames, errors that all frames share, and the
+scale anchor.
 
 A frame counts as suspicious if its residual is far from the median of its four neighbours, which
 shows what lasts. Its six components are then causes like all others (mean-shift model of outliers).
@@ -6,6 +7,11 @@ The spread of such differences comes from their median, which outliers do not mo
 
 Errors of cameras and teaching are asked if the record states them. The residuals are whitened for
 them already, so that a cause is one that is larger than its stated standard deviation.
+
+No pose shows the common scale of the parameters, whatever gravity is, because all torques of a
+model are proportional to them. A known load is not proportional to them. Records with different
+loads therefore show the scale, and a measured anchor can contradict it. It has a row of its own
+among the residuals, and no other.
 
 References
 ----------
@@ -23,6 +29,7 @@ from dynamics.closed_loop import ClosedLoopRun
 from identify.arrays import Array
 from identify.diagnosis.cause import Cause, OnPoses, in_each_run
 from identify.estimation.output_error_problem import OutputErrorProblem
+from identify.estimation.scale_anchor import measured_parameter
 from identify.files.dataset import POSE
 from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import kind_of
@@ -36,6 +43,12 @@ BY_CHANCE = 1e-3
 MOST_FRAMES = 8
 """Largest number of frames that are asked, those that are furthest off."""
 
+ANCHOR_STEP = 1e-3
+"""Relative change of the scale anchor for differences."""
+
+LEAST_ANCHOR = -0.9
+"""Least relative error of the scale anchor, which is above zero."""
+
 KINDS = {"rig": "errors of the cameras", "teaching": "errors of teaching"}
 """Names of the groups of errors that all frames share, by their kind."""
 
@@ -43,8 +56,47 @@ KINDS = {"rig": "errors of the cameras", "teaching": "errors of teaching"}
 def measurement_causes(
     problem: OutputErrorProblem, runs: Sequence[ClosedLoopRun]
 ) -> tuple[Cause, ...]:
-    """Return the causes in the measured poses of a problem. runs: those of the model."""
-    return (*shared_errors(problem), *gross_errors(problem, runs))
+    """Return the causes in the measurements of a problem. runs: those of the model."""
+    return (*shared_errors(problem), *scale_anchor(problem), *gross_errors(problem, runs))
+
+
+def scale_anchor(problem: OutputErrorProblem) -> tuple[Cause, ...]:
+    """Return the relative error of a measured scale anchor beside loads that show the scale, too.
+
+    It is left out where the loads of all records are the same, as they show no scale then.
+    """
+    anchor = problem.anchor
+    if anchor.value is None or len({run.payload.tobytes() for run in problem.runs}) == 1:
+        return ()
+    value = anchor.value
+    layout = problem.guess.layout
+    measured = measured_parameter(anchor.name, layout)
+    unit = layout.unit(measured)
+    mass = layout.names.index("platform.mass")
+    loads = [
+        run.payload_errors[mass, 0] / run.payload[mass] for run in problem.runs if run.payload[mass]
+    ]
+    stated = max(loads, default=0.0)
+
+    def corrected(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
+        return replace(problem, anchor=replace(anchor, value=value / (1.0 + size)))
+
+    return (
+        Cause(
+            name=f"scale anchor {anchor.name} against the weight of the known load",
+            unit="1",
+            group="scale anchor",
+            change=corrected,
+            step=ANCHOR_STEP,
+            remedy=lambda size: (
+                f"measure {measured} and the load again: {value:.4g} {unit} was measured, and "
+                f"{value / (1 + size):.4g} {unit} agrees with the load, whose mass is stated to "
+                f"{100 * stated:.2g} %"
+            ),
+            least=LEAST_ANCHOR,
+            exact=True,
+        ),
+    )
 
 
 def shared_errors(problem: OutputErrorProblem) -> tuple[Cause, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from identify.diagnosis.diagnose import diagnose
 from identify.errors import EstimationError, RecordError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify
@@ -230,3 +231,22 @@ def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(count
     assert least < stated < most, errors
     exact = identified(0, payload_mass_std=0.0).std[GAIN]
     assert np.sqrt(np.mean((errors / exact) ** 2)) > 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [0.0, 0.03, -0.05])
+def test_a_gain_that_contradicts_a_known_load_is_named_with_its_error(records, error):
+    """The load shows the scale to better than 1 % in six seconds, one record does not show it."""
+    bare, heavy = (record.copy() for record in records)
+    store_anchor(bare, ScaleAnchor("joint_gain", (1 + error) * truth()[GAIN], 0.01))
+    found = diagnose([bare, heavy], scenario=SCENARIO).findings
+    if not error:
+        assert found == ()
+        return
+    (finding,) = found
+    assert finding.name == "scale anchor joint_gain against the weight of the known load"
+    (size,) = finding.sizes
+    assert size.std < 0.01
+    assert size.value == pytest.approx(error, abs=3 * size.std)
+    assert "agrees with the load, whose mass is stated to 0.5 %" in finding.remedies[0]
+    assert diagnose(bare, scenario=SCENARIO).findings == ()
