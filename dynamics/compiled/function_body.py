@@ -1,6 +1,6 @@
 """LLVM code of one CasADi function, in static single-assignment form.
 
-Parts, their columns, groups and lanes are those of `lanes`.
+Parts, their columns, groups and lanes are explained in `lanes`.
 """
 
 from collections.abc import Callable
@@ -37,10 +37,10 @@ AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
 def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
     """Number of entries of each input of a function, and shapes of its outputs."""
-    last = _last(function)
+    final = _last(function)
     return (
-        [last.nnz_in(k) for k in range(_inputs(function))],
-        [last.size_out(k) for k in range(last.n_out())],
+        [final.nnz_in(k) for k in range(_inputs(function))],
+        [final.size_out(k) for k in range(final.n_out())],
     )
 
 
@@ -68,24 +68,27 @@ class FunctionBody:
         self._name = last.name()
         self._sizes = shapes(function)
         self.own_inputs = _inputs(function)
-        # number of input sets that are computed side by side, in one vector for each value
+        # number of sets of inputs that are computed side by side: each value is then a vector
         self._beside = function.side_by_side if isinstance(function, PartedFunction) else 1
         self._number = type_name(self._beside)
         self._inputs = _places(self._name, [last.sparsity_in(k) for k in range(self.own_inputs)])
         self._outputs = _places(self._name, [last.sparsity_out(k) for k in range(last.n_out())])
         self._quickened: Callable[[Graph], Graph] = quickened if quick else lambda graph: graph
         self._count = 0
-        # vectors that have been written, by their entries or by their line of code
+        # names of the vectors that have been written, by their entries or by their line of code
         self._vectors = dict[tuple[str, ...], str]()
         self._lines: list[str] = []
-        # name of the bit (i1) for each number that is a condition
+        # name of the bit (i1) for the name of each number that is a condition
         self._truth: dict[str, str] = {}
         self.called: set[str] = set()
         parts = self._parts(function) if isinstance(function, PartedFunction) else []
         self._write(self._quickened(graph_of(last)), parts)
 
     def text(self) -> str:
-        """Code of the function, and of the function that calls it for many rows of inputs."""
+        """Code of the function, and of the function that calls it for many rows of inputs.
+
+        A function for inputs side by side has no such second function.
+        """
         lines = "\n".join(self._lines)
         signature = "(ptr noalias readonly %inputs, ptr noalias %outputs)"
         body = f"define void @{self._name}{signature} nounwind {{\n{lines}\nret void\n}}\n"
@@ -94,7 +97,7 @@ class FunctionBody:
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
         """Write the values of a graph and its outputs.
 
-        `parts` are the columns of the parts, which are the last inputs of the graph.
+        `parts` are the columns of the parts, which are the inputs of the graph after its own.
         """
         values = GraphValues(self, graph, parts)
         for places, nodes in zip(self._outputs, graph.outputs, strict=True):
@@ -107,7 +110,7 @@ class FunctionBody:
                 )
 
     def _parts(self, function: PartedFunction) -> list[list[str]]:
-        """Column of each part. The columns of a group are computed together."""
+        """Names of the values in the column of each part. A group of parts is computed together."""
         graph = self._quickened(graph_of(function.parts, function.constants))
         values = GraphValues(self, graph, [])
         columns = [[""] * len(outputs) for outputs in graph.outputs]
@@ -199,7 +202,7 @@ class FunctionBody:
         return joined[0]
 
     def _once(self, text: str) -> str:
-        """Name of the value of a line. A line that has been written before is not written again."""
+        """Write a line unless it has been written before, and return the name of its value."""
         if (known := self._vectors.get((text,))) is None:
             known = self._vectors[(text,)] = self.new(text)
         return known
@@ -227,7 +230,7 @@ class FunctionBody:
         return vector
 
     def _entry(self, vector: str, part: int, width: int) -> str:
-        """Entry of a part in a vector: a number, or a vector if sets of inputs are side by side."""
+        """Entry of a part in a vector: a number, or a vector if input sets are side by side."""
         if width == 1 or self._beside == 1:
             return self._lane(vector, part, width)
         kind = type_name(width * self._beside)
@@ -301,9 +304,9 @@ class GraphValues:
 
 
 def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:
-    """Positions of the entries of each matrix in memory, where matrices are stored by rows.
+    """Offsets of the entries of each matrix in memory, where matrices are stored by rows.
 
-    The positions are listed in CasADi's order of entries, which is by columns.
+    The offsets are listed in CasADi's order of entries, which is by columns.
     """
     places = []
     first = 0

@@ -1,12 +1,12 @@
 """Kernels: functions of numbers, arrays and records that Numba compiles at their first call.
 
-They are in the modules called ``*_kernels``. These are imported at their first use, because
-importing Numba takes time. This module adds to Numba what it lacks:
+The modules with kernels are called ``*_kernels``, and are imported at their first use, because
+importing Numba takes time. This module adds what Numba lacks:
 
 - `kernel`, `part` and `entry` set the same compiler options for all kernels. The machine code of an
   entry is saved in the user's cache, under a digest of everything that it depends on.
-- `_InnerCompiler` makes no machine code for kernels that only other kernels call. Their code is
-  linked into that of their callers, and only the callers are optimised.
+- `_InnerCompiler` makes no machine code for kernels that only other kernels call. Their LLVM code
+  is linked into that of their callers, and optimised with these.
 - `address` and `invoke` call a kernel by its address. Otherwise, Numba would copy the called kernel
   into each of its callers, and a kernel with many callers would be compiled many times.
 - `call`, `call_columns` and `add_row` are LLVM code for three calls that Numba cannot express: a
@@ -42,7 +42,7 @@ from numba.extending import intrinsic
 from dynamics.compiled.object_files import cache_folder, load_object, save_object
 from dynamics.compiled.operations import MOST_LANES
 
-Array = np.ndarray  # of any type and shape; docstrings state them
+Array = np.ndarray  # of any type and shape; the docstrings of kernels state both
 Record = Any  # a numpy.record
 
 
@@ -67,8 +67,8 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 class _InnerLibrary(JITCodeLibrary):
     """Code of a kernel that only other kernels call, for linking into their code.
 
-    By default, Numba also optimises each kernel by itself and translates it to machine code that
-    nothing calls. This took two fifths of the time in which the kernels of a loop were compiled.
+    By default, Numba also optimises each kernel by itself, and translates it to machine code that
+    nothing calls. This took two fifths of the time that compiling the kernels of a loop takes.
     """
 
     def _optimize_final_module(self) -> None:
@@ -123,7 +123,7 @@ def part(function: Callable[..., Any]) -> Any:
     return njit(forceinline=True, **_ARITHMETIC, **_ONLY_KERNELS)(function)
 
 
-# Kernels allocate no memory. References to arrays are not counted: the arrays outlive the kernels,
+# Kernels allocate no memory, and do not count references to arrays: the arrays outlive the kernels,
 # and counting took a twelfth of the time of a run.
 _ARITHMETIC: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # Numba's stubs do not know these options.
@@ -150,9 +150,9 @@ def entry(function: Callable[..., Any]) -> Any:
 class _KernelCache:
     """Cache of an entry, with the methods that Numba calls.
 
-    Numba's own cache loads a file of any owner, and renews the file only if the module of the entry
-    has changed. This cache loads only files that nobody but the user can have written, and renews
-    them if any kernel has changed.
+    Numba's own cache loads a file of any owner, and recompiles only if the module of the entry has
+    changed. This cache loads only files that nobody but the user can have written, and recompiles
+    if any file of kernels in this package has changed.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -173,7 +173,7 @@ class _KernelCache:
 
     def save_overload(self, signature: object, result: Any) -> None:
         """Save the code compiled for a signature."""
-        # connect the code with the environments of the kernels in it, as Numba does at loading
+        # connect the code with the environments of the kernels in it, as Numba does when loading
         for environment in result._find_referenced_environments():
             result.codegen.set_env(environment.env_name, environment)
         save_object(self._file(signature, result.codegen), dumps(result._reduce()))
@@ -189,21 +189,21 @@ _at_address: dict[int, Any] = {}  # kernels for which `address` has been called,
 def address(compiled: Any, *arguments: object) -> int:
     """Address of an entry's machine code for arguments of these types, for use with `invoke`.
 
-    The entry is compiled at the first call. For a function made by `plain`, the result is a number
-    that `invoke` accepts in the same way.
+    The entry is compiled at the first call. For a plain function, the result is a number that the
+    plain form of `invoke` accepts in the same way.
     """
-    place = id(compiled)
+    pointer = id(compiled)
     if isinstance(compiled, Dispatcher):
         kinds = tuple(map(typeof, arguments))
         compiled.compile(kinds)
         result: Any = compiled.overloads[kinds]
-        place = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
-    _at_address[place] = compiled
-    return place
+        pointer = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+    _at_address[pointer] = compiled
+    return pointer
 
 
-# The following functions have the form that `numba.extending.intrinsic` requires: they take the
-# types of the arguments, and return a signature and a function that writes LLVM code.
+# From here to `_add_row`, functions have the form that `numba.extending.intrinsic` requires: they
+# take the types of the arguments, and return a signature and a function that writes LLVM code.
 
 
 def _invoke(context: Any, address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
@@ -262,12 +262,12 @@ def _add_row(context: Any, factor: Any, row: Any, into: Any, width: Any) -> Any:
             column,
             _,
         ):
-            places = [
+            pointers = [
                 builder.bitcast(builder.gep(one, [column]), vector.as_pointer())
                 for one in (row, into)
             ]
-            added, before = (builder.load(place, align=8) for place in places)
-            builder.store(builder.fadd(before, builder.fmul(factors, added)), places[1], align=8)
+            added, before = (builder.load(pointer, align=8) for pointer in pointers)
+            builder.store(builder.fadd(before, builder.fmul(factors, added)), pointers[1], align=8)
         return context.get_dummy_value()
 
     return types.void(types.float64, row, into, types.int64), code
@@ -278,8 +278,8 @@ call: Any = intrinsic(_call)
 # Calls a `ColumnFunction` by its address. The arguments are the address, the inputs common to all
 # columns, the first row of the other inputs, the first row of outputs, and the number of columns.
 call_columns: Any = intrinsic(_call_columns)
-# Adds a factor times a row to another row. The number of columns must be a multiple of the vector
-# length.
+# Adds a factor times a row to another row, in place. The number of columns must be a multiple of
+# MOST_LANES.
 add_row: Any = intrinsic(_add_row)
 
 
@@ -341,7 +341,7 @@ def plain(compiled: Any) -> Callable[..., Any]:
 def chosen(kernel: Any, compiled: bool) -> Callable[..., Any]:
     """Function to call from Python: the compiled kernel, or the plain one.
 
-    The plain one is returned if `compiled` is False or Numba's compiler is switched off.
+    It is the plain one if `compiled` is False or Numba's compiler is switched off.
     """
     if compiled and isinstance(kernel, Dispatcher):
         return kernel

@@ -1,11 +1,11 @@
 """Parts of a function that are alike, computed together by operations on vectors.
 
 Each part has one lane of the vectors. The legs of a robot are such parts: they have the same
-expression with different numbers. The parts that are alike are found by comparing their
-instructions. Values that all parts need are computed once, before the parts. The remaining
-instructions of each part are sorted into the order in which its outputs need them. Parts with the
-same operations in the same order form a group, and are its lanes. Legs of several kinds form
-several groups. The result is bit for bit the same as if the parts were computed one by one.
+expression with different numbers. Comparing the instructions of the parts shows which are alike.
+Values that all parts need are computed once, before the parts. The remaining instructions of each
+part are sorted into the order in which its outputs need them. Parts with the same operations in the
+same order form a group, and each is a lane of the group. Legs of several kinds form several groups.
+The result is bit for bit the same as if the parts were computed one by one.
 """
 
 from collections.abc import Iterable
@@ -70,8 +70,8 @@ class ColumnFunction:
 
     The first `common` inputs are the same for all columns. The other inputs and the outputs have a
     row for each entry, and each row has memory for `room` columns. `lanes` columns are computed at
-    once, so that memory behind the last column is overwritten up to a whole number of lanes.
-    `apart` is the distance between consecutive entries of the common inputs.
+    once, so that columns after the requested ones are overwritten up to a multiple of `lanes`.
+    `apart` is the distance in memory, in numbers, between consecutive entries of the common inputs.
     """
 
     function: ca.Function
@@ -86,10 +86,10 @@ class ColumnFunction:
 
 
 class Node(NamedTuple):
-    """Value in a graph: the operation that computes it, and the numbers of its operands.
+    """Value in a graph: the operation that computes it, and the indices of its operands.
 
-    A constant has a `value`. An input has an `entry`: the number of the input, and the position in
-    it.
+    A constant has a `value`. An input has an `entry`: the index of the input, and the index of the
+    entry in it.
     """
 
     operation: str
@@ -109,21 +109,21 @@ class Node(NamedTuple):
 class Graph:
     """Values of an SX function. Each value comes after its operands.
 
-    `outputs` lists, for each output, the numbers of the values of its entries.
+    `outputs` lists, for each output, the indices in `nodes` of its entries.
     """
 
     nodes: list[Node]
     outputs: list[list[int]]
 
 
-# Number of a step in the same group, or numbers of values outside it, one for each lane.
+# Index of a step in the same group, or indices of values outside the group, one for each lane.
 Operand = int | tuple[int, ...]
 
 
 class Group(NamedTuple):
     """Parts that are alike.
 
-    `lanes` are the numbers of the parts. `steps` are the operations of each part in order, with
+    `lanes` are the indices of the parts. `steps` are the operations of each part in order, with
     their operands. `outputs` are the operands that are the outputs of the parts.
     """
 
@@ -151,12 +151,12 @@ class Group(NamedTuple):
 
 
 def graph_of(function: ca.Function, constants: np.ndarray | None = None) -> Graph:
-    """Graph of an SX function. Each value has its own number, which is its index in `nodes`.
+    """Graph of an SX function, in which each instruction gives a value of its own.
 
-    `constants` are the values of the last input, if given.
+    If `constants` are given, they replace the last input.
     """
     nodes: list[Node] = []
-    # number of the value that each place in memory holds now, because instructions reuse memory
+    # index of the value that each memory slot holds now, because instructions reuse memory
     held: dict[int, int] = {}
     outputs = [[-1] * function.nnz_out(k) for k in range(function.n_out())]
     for index in range(function.n_instructions()):
@@ -209,11 +209,11 @@ def _needed_by(graph: Graph) -> list[bool]:
 
 
 def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[int]) -> Group:
-    """Steps of one part as a group of one lane, in the order in which its outputs need them."""
+    """Group of one lane with the steps of one part, in the order in which its outputs need them."""
     step_numbers: dict[int, int] = {}
     steps: list[tuple[str, list[Operand]]] = []
 
-    def place(node: int) -> Operand:
+    def operand_of(node: int) -> Operand:
         outside = everywhere[node] or graph.nodes[node].operation in LEAVES
         return (node,) if outside else step_numbers[node]
 
@@ -236,8 +236,8 @@ def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[in
             continue
         pending.pop()
         step_numbers[node] = len(steps)
-        steps.append((graph.nodes[node].operation, [place(k) for k in operands]))
-    return Group((part,), steps, [place(node) for node in outputs])
+        steps.append((graph.nodes[node].operation, [operand_of(k) for k in operands]))
+    return Group((part,), steps, [operand_of(node) for node in outputs])
 
 
 def _form(operand: Operand) -> int:

@@ -35,8 +35,9 @@ class MachineFunction:
     """Compiled function.
 
     `address` is the address of the code for a single evaluation (see the module). It is valid as
-    long as the object exists. `constants` (c,) are the values of the last argument, which callers
-    omit.
+    long as the object exists. `over_rows` evaluates many rows, but does not exist for a function of
+    columns or of several sets of inputs at once. `constants` (c,) are the values of the last
+    argument, which callers omit.
     """
 
     inputs: list[int]
@@ -50,7 +51,7 @@ class MachineFunction:
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
         """Compute all outputs (N, rows, columns) for batches (N or 1, columns) of the arguments.
 
-        NaN in the outputs raises no error.
+        N is 1 if all batches have one row. NaN in the outputs raises no error.
         """
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
         if len(self.constants):
@@ -84,12 +85,12 @@ class MachineFunction:
 def compiled_functions(
     content: bytes, build: Callable[[], list[AnyFunction]], hot: Collection[str] = ()
 ) -> dict[str, MachineFunction]:
-    """Compile the functions that `build()` returns, or load them from the cache, by name.
+    """Compile the functions that `build()` returns, or load them from the cache.
 
-    `content` identifies everything that the functions depend on besides this package. `hot` names
-    functions that inner loops evaluate. They are optimised, and their rounding may differ from
-    CasADi's. Compiling takes some seconds. Raises DynamicsError for an operation that has no
-    translation.
+    Returns the functions by name. `content` identifies everything that they depend on besides this
+    package. `hot` names functions that inner loops evaluate. These are optimised, so that their
+    rounding may differ from CasADi's. Compiling takes some seconds. Raises DynamicsError for an
+    operation that has no translation.
     """
     digest = sha256(_package_digest() + content)
     versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
@@ -107,7 +108,7 @@ def compiled_functions(
 def _without_garbage_collection() -> Iterator[None]:
     """Suspend the search for unused cycles of objects.
 
-    A graph has a million objects and no cycles. Searching them for cycles takes a third of the time
+    A graph has a million objects and no cycles. Searching it for cycles takes a third of the time
     in which a function is translated.
     """
     enabled = gc.isenabled()
@@ -125,8 +126,8 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     The line has the shapes of inputs and outputs of each function, and the length of the machine
     code of the hot functions.
 
-    Optimising takes LLVM ten times as long as translating. Functions that are not hot are only
-    translated. Their evaluation then takes up to twice as long, with the same results.
+    Functions that are not hot are only translated, because optimising takes LLVM ten times as long.
+    Without it, their evaluation takes up to twice as long, with the same results.
     """
     inner = [one for one in functions if one.name() in hot]
     others = [one for one in functions if one.name() not in hot]
@@ -181,7 +182,7 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
             inputs,
             [(rows, columns) for rows, columns in outputs],
             engine.get_function_address(name),
-            # a column function has no function for rows, and the address is 0
+            # some functions have none for rows, and the address is 0
             over_rows(engine.get_function_address(f"{name}.rows")),
             engine,
         )
@@ -264,7 +265,7 @@ class _ColumnBody(FunctionBody):
         return f"define void @{self._name}{signature} nounwind {{\n{lines}\n}}\n"
 
     def _write(self, graph: Graph, parts: list[list[str]]) -> None:
-        """Write the values that all columns share, then a loop over groups of columns."""
+        """Write the values that all columns have in common, then a loop over groups of columns."""
         common = self._given.common
         values = GraphValues(self, graph, parts)
         lanes = self._given.lanes
@@ -290,10 +291,10 @@ class _ColumnBody(FunctionBody):
             )
 
         for number in [number for number, of_column in enumerate(varies) if of_column]:
-            operation, operands, _, (place, entry) = graph.nodes[number]
+            operation, operands, _, (input_number, entry) = graph.nodes[number]
             if operation == "INPUT":
                 address = self._place(
-                    "rows", self._inputs[place][entry] - sum(self._sizes[0][:common])
+                    "rows", self._inputs[input_number][entry] - sum(self._sizes[0][:common])
                 )
                 vectors[number] = self.new(f"load {type_name(lanes)}, ptr {address}, align 8")
             else:

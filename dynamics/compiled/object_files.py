@@ -16,7 +16,7 @@ import platformdirs
 DIGEST = sha256().digest_size
 
 DAY = 24 * 3600.0  # s
-KEPT = 60 * DAY  # time, s, for which a file is kept after its last use
+KEPT = 60 * DAY  # time without use, s, after which a file is removed
 # Endings of the files in this cache. Files with the last ending are not yet complete.
 KINDS = (".kernel", ".robot", ".half")
 # Flags with which files are opened. Without O_NONBLOCK, opening a pipe would wait for a writer.
@@ -24,7 +24,7 @@ OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY"
 
 
 class CacheWarning(UserWarning):
-    """Warning that machine code cannot be saved. It is given once."""
+    """Warning that machine code cannot be saved, given once for each text in a process."""
 
 
 def cache_folder() -> Path:
@@ -36,8 +36,8 @@ def cache_folder() -> Path:
 def load_object(name: str) -> bytes | None:
     """Content that was saved under a name.
 
-    The result is None if there is no such file, if it is damaged, or if another user may have
-    written it.
+    The result is None if there is no such file, or if the file cannot be read, is damaged, or may
+    have been written by another user.
     """
     path = cache_folder() / name
     try:
@@ -56,14 +56,14 @@ def save_object(name: str, content: bytes) -> None:
     """Save content under a name, and replace earlier content.
 
     The file is written under a temporary name and then renamed. It is thus never incomplete, even
-    if a process is killed or another process saves the same content. Warns once if nothing can be
-    written. Files that have not been used for two months are removed.
+    if a process is killed or another process saves the same content. If it cannot be written, a
+    CacheWarning is given. Files that have not been used for two months are removed.
     """
     path = cache_folder() / name
     created: list[Path] = []
     temporary = None
     try:
-        # `exists` raises an error, too, if the folder may not be read
+        # `exists` raises an OSError, too, if a folder may not be read
         created = [folder for folder in path.parents if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         # readable and writable by its owner alone
@@ -75,7 +75,7 @@ def save_object(name: str, content: bytes) -> None:
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
-        with suppress(OSError):  # a folder into which another process has written remains
+        with suppress(OSError):  # a new folder into which another process has written remains
             for folder in created:
                 folder.rmdir()
         text = (
@@ -86,9 +86,9 @@ def save_object(name: str, content: bytes) -> None:
 
 
 def _note_use(path: Path, changed: float) -> None:
-    """Set a file's time of change to now, at most once a day, to note that the file is used.
+    """Set a file's modification time to now, at most once a day, to note that the file is used.
 
-    Many file systems do not store the time of access.
+    Many file systems do not store the access time. `changed` is the present modification time, s.
     """
     if time.time() - changed > DAY:
         with suppress(OSError):  # a read-only cache can be used as well
@@ -99,7 +99,7 @@ def _note_use(path: Path, changed: float) -> None:
 def _remove_unused(folder: Path) -> None:
     """Remove files that have not been used for two months, once in each process.
 
-    The sources of such files have usually changed.
+    The code from which such files were compiled has usually changed since.
     """
     oldest = time.time() - KEPT
     with suppress(OSError):  # the next process removes the remaining files

@@ -4,11 +4,11 @@ import struct
 from functools import cache
 
 MOST_LANES = 8  # number of doubles in the widest register of present processors
-# Instruction that makes a number, 0 or 1, from a bit: CasADi's conditions are numbers.
+# Instruction that makes the number 0 or 1 from a bit, because CasADi's conditions are numbers.
 TRUTH = "uitofp {i1} {last} to {double}"
 
-# LLVM instructions for each CasADi operation. {last} is the result of the instruction before, and
-# {before} is the result of the one before that.
+# LLVM instructions for each CasADi operation. {0} and {1} are its operands. {last} is the result of
+# the previous instruction, and {before} is the result of the one before that.
 MEANING: dict[str, tuple[str, ...]] = {
     "ADD": ("fadd {double} {0}, {1}",),
     "SUB": ("fsub {double} {0}, {1}",),
@@ -35,7 +35,7 @@ MEANING: dict[str, tuple[str, ...]] = {
     ),
 }
 
-# LLVM instructions for operations whose first operand is a bit, {last}.
+# LLVM instructions that replace those of `MEANING` if the first operand is known as a bit, {last}.
 OF_TRUTH: dict[str, tuple[str, ...]] = {
     "NOT": ("xor {i1} {last}, {true}", TRUTH),
     "IF_ELSE_ZERO": MEANING["IF_ELSE_ZERO"][1:],
@@ -63,19 +63,19 @@ CALLED = {
 
 
 def type_name(width: int, of: str = "double") -> str:
-    """LLVM type of a number, or of a vector of `width` numbers."""
+    """LLVM type of a vector of `width` numbers, or of a number if `width` is 1."""
     return of if width == 1 else f"<{width} x {of}>"
 
 
 def lanes_for(lanes: int) -> int:
-    """Width of a vector for a number of lanes: the next power of two."""
+    """Width of a vector with room for a number of lanes: the smallest such power of two."""
     return 1 << (lanes - 1).bit_length()
 
 
 def constant(values: list[float]) -> str:
-    """Constants as an operand.
+    """Operand for one constant, or for a vector of several.
 
-    They are written by their bits, because decimals could be rounded.
+    Constants are written as their bits, because decimals could be rounded.
     """
     bits = [f"0x{struct.pack('>d', value).hex().upper()}" for value in values]
     return bits[0] if len(bits) == 1 else f"<{', '.join(f'double {one}' for one in bits)}>"

@@ -20,13 +20,14 @@ import numpy as np
 
 from dynamics.compiled.lanes import Graph, Node, graph_of
 
-# Parts of pi / 2. Integer multiples of the first two parts have no rounding error.
+# Parts of pi / 2. Products of the first two with moderate integers have no rounding error.
 HALF_PI = (
     2 * 7.85398125648498535156e-1,
     2 * 3.77489470793079817668e-8,
     2 * 2.69515142907905952645e-15,
 )
 
+# Coefficients of polynomials in the square of the reduced argument, beginning with the constant.
 SINE = (
     *(-1.66666666666666307295e-1, 8.33333333332211858878e-3, -1.98412698295895385996e-4),
     *(2.75573136213857245213e-6, -2.50507477628578072866e-8, 1.58962301576546568060e-10),
@@ -39,7 +40,6 @@ ARCTANGENT = (
     *(-6.485021904942025371773e1, -1.228866684490136173410e2, -7.500855792314704667340e1),
     *(-1.615753718733365076637e1, -8.750608600031904122785e-1),
 )
-# Coefficients of polynomials in the square of the reduced argument, beginning with the constant.
 ARCTANGENT_DIVISOR = (
     *(1.945506571482613964425e2, 4.853903996359136964868e2, 4.328810604912902668951e2),
     *(1.650270098316988542046e2, 2.485846490142306297962e1, 1.0),
@@ -167,25 +167,25 @@ def _once_each(graph: Graph) -> Graph:
 def _sine_and_cosine() -> ca.Function:
     """Function x -> sin x, cos x."""
     x = ca.SX.sym("x")
-    turns = ca.floor(x * (2 / np.pi) + 0.5)
+    quarter_turns = ca.floor(x * (2 / np.pi) + 0.5)
     reduced = x
     # Subtract one part after the other, so that no digits are lost (Cody and Waite).
     for part in HALF_PI:
-        reduced = reduced - turns * part
+        reduced = reduced - quarter_turns * part
     square = reduced * reduced
     sine = reduced + reduced * square * _polynomial(SINE, square)
     cosine = 1 - 0.5 * square + square * square * _polynomial(COSINE, square)
-    # The sine is negative in the last two of the four quarter turns, the cosine in the middle two.
-    half = 0.5 * turns
+    # Of four quarter turns, the sine is negative in the last two, and the cosine in the middle two.
+    half = 0.5 * quarter_turns
     odd = 2 * (half - ca.floor(half))
-    back = 2 * (0.5 * half - ca.floor(0.5 * half)) >= 1
-    ahead = 2 * (0.5 * (half + 0.5) - ca.floor(0.5 * (half + 0.5))) >= 1
+    sine_negative = 2 * (0.5 * half - ca.floor(0.5 * half)) >= 1
+    cosine_negative = 2 * (0.5 * (half + 0.5) - ca.floor(0.5 * (half + 0.5))) >= 1
     return ca.Function(
         "turning",
         [x],
         [
-            ca.if_else(back, -1, 1) * ca.if_else(odd, cosine, sine),
-            ca.if_else(ahead, -1, 1) * ca.if_else(odd, sine, cosine),
+            ca.if_else(sine_negative, -1, 1) * ca.if_else(odd, cosine, sine),
+            ca.if_else(cosine_negative, -1, 1) * ca.if_else(odd, sine, cosine),
         ],
     )
 
@@ -218,7 +218,9 @@ def _polynomial(coefficients: Sequence[float], x: ca.SX) -> ca.SX:
     """Value of a polynomial by Estrin's scheme, which computes pairs of terms in parallel."""
     terms: list[ca.SX] = [ca.SX(one) for one in coefficients]
     while len(terms) > 1:
-        last = terms[-1:] if len(terms) % 2 else []
-        terms = [low + x * high for low, high in zip(terms[::2], terms[1::2], strict=False)] + last
+        unpaired = terms[-1:] if len(terms) % 2 else []
+        terms = [
+            low + x * high for low, high in zip(terms[::2], terms[1::2], strict=False)
+        ] + unpaired
         x = x * x
     return terms[0]

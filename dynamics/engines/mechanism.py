@@ -1,7 +1,7 @@
 """Mechanism in a file of another program: its bodies and joints at home, and its legs.
 
-Bodies that are welded together become one body. Joints that meet in a body without mass become one
-joint: two hinges become a universal joint, and three become a ball joint.
+Bodies that are welded together become one body. Hinges that are joined by bodies with almost no
+mass become one joint: two hinges become a universal joint, and three become a ball joint.
 """
 
 from collections.abc import Iterator
@@ -14,15 +14,15 @@ from dynamics.errors import RobotFileError
 from dynamics.legs.chain import SAME, Chain
 
 BASE = 0  # number of the body that is fixed to the ground
-# Fraction of the total mass below which a body between two hinges counts as part of a joint. Such a
-# body has a small mass only because engines require one.
+# Fraction of the total mass up to which a body between hinges counts as part of a joint. Engines
+# require that such a body has some mass.
 HUB_MASS_RATIO = 1e-4
 
 
 class Shape(NamedTuple):
-    """Mesh that draws a body: its file, the length of one unit in it, m, and its place.
+    """Mesh that draws a body.
 
-    The place (4, 4) is base_from_mesh at home.
+    `scale` is the length of one unit of the file, m. `place` (4, 4) is base_from_mesh at home.
     """
 
     file: str
@@ -36,7 +36,7 @@ class Solid:
 
     `mass` is in kg, and `centre` (3,) is the centre of mass, m. `inertia` (3, 3) is about the
     centre, kg m^2. `axes` (3, 3) has the axes of the body as columns. `rod` is the length and the
-    radius of the drawn rod, m. `shapes` are the drawn meshes.
+    radius of the drawn rod, m, or None. `shapes` are the drawn meshes.
     """
 
     name: str
@@ -52,9 +52,9 @@ class Freedom(NamedTuple):
     """Elementary joint between two bodies.
 
     `kind` is "hinge", "slide" or "ball". `point` (3,), m, and `axis` (3,) are in the axes of the
-    base. `coordinate` is its coordinate at home, rad or m. `friction` is the dry friction, N m or
-    N, and the viscous friction, N m s/rad or N s/m. `actuator` is the number of the actuator, or
-    None.
+    base; the axis of a ball is NaN. `coordinate` is its coordinate at home, rad or m. `friction` is
+    the dry friction, N m or N, and the viscous friction, N m s/rad or N s/m. `actuator` is the
+    number of the actuator, or None.
     """
 
     kind: str
@@ -85,7 +85,7 @@ class Connection:
     def seen_from(self, body: int) -> tuple[Freedom, ...]:
         """Elementary joints in the order from the given body to the other one.
 
-        Each axis has the sign for the motion of the other body relative to the given one.
+        The axes are signed for the motion of the other body relative to the given one.
         """
         if body == self.first:
             return self.freedoms
@@ -96,9 +96,9 @@ class Connection:
 class Mechanism:
     """Bodies, of which the base is the first, and their connections.
 
-    `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` holds the range of each
-    joint by name if the file states it. `gains` are lp, li, ld (3,), or those of each joint (3 n,).
-    `notes` are remarks on the file.
+    `gravity` (3,) is in m/s^2, and `travel_limit` in rad or m. `ranges` has the ranges of joints
+    that the file states, by name, rad or m. `gains` are lp, li, ld (3,), or those of each joint
+    (3 n,). `notes` are remarks on the file.
     """
 
     name: str
@@ -148,14 +148,14 @@ def simplified(mechanism: Mechanism) -> Mechanism:
 def platform_of(mechanism: Mechanism) -> int:
     """Number of the platform, which is the body with the most joints.
 
-    Raises RobotFileError if several bodies have the most joints, or if no body has two.
+    Raises RobotFileError if several bodies have the most joints, or if none has two or more.
     """
-    count = dict.fromkeys(range(1, len(mechanism.solids)), 0)
+    joint_counts = dict.fromkeys(range(1, len(mechanism.solids)), 0)
     for one in mechanism.connections:
         for body in {one.first, one.second} - {BASE}:
-            count[body] += 1
-    most = max(count.values(), default=0)
-    candidates = [body for body, number in count.items() if number == most]
+            joint_counts[body] += 1
+    most = max(joint_counts.values(), default=0)
+    candidates = [body for body, number in joint_counts.items() if number == most]
     if most < 2 or len(candidates) > 1:
         names = ", ".join(mechanism.solids[body].name for body in candidates) or "none"
         raise RobotFileError(
@@ -170,8 +170,8 @@ def legs_of(
     """Legs of a simplified mechanism, each as a chain from the base to the platform.
 
     A chain may consist of two parallel chains of equal bars. The columns of `from_platform` (3, 4)
-    are the axes and the origin of the platform at home. Raises RobotFileError, with the leg and its
-    bodies, for a mechanism of any other form.
+    are the axes and the origin of the platform at home. Bodies without connections are ignored.
+    Raises RobotFileError, with the leg and its bodies, for a mechanism of any other form.
     """
     remaining = [body for body in range(1, len(mechanism.solids)) if body != platform]
     number = 0
@@ -193,7 +193,7 @@ def _leg(
 ) -> MechanismLeg:
     """Leg that consists of the member bodies."""
     joined = sum(bool({one.first, one.second} & members) for one in mechanism.connections)
-    # with more loops, the number of ways would grow without limit
+    # with more loops, the number of paths would grow without limit
     if joined > len(members) + 2:
         raise RobotFileError(
             f"it has {joined} joints and {len(members)} bodies; one way from the base to the "
@@ -263,9 +263,9 @@ def _paths(
     members: set[int],
     behind: list[tuple[int, Connection]],
 ) -> Iterator[list[tuple[int, Connection]]]:
-    """Ways from a body to the end body that pass only through members.
+    """Paths from a body to the end body that pass only through members, continued from `behind`.
 
-    A way is a list of steps. A step is a body and the connection by which the way leaves it.
+    A path is a list of steps. A step is a body and the connection by which the path leaves it.
     """
     for connection in mechanism.connections:
         if body not in (connection.first, connection.second):
@@ -279,7 +279,11 @@ def _paths(
 
 
 def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
-    """Kind of the joint that elementary joints form, its point (3,), and its axes (2, 3)."""
+    """Kind of the joint that elementary joints form, its point (3,), and its axes (2, 3).
+
+    A missing axis is NaN. Raises RobotFileError for friction without an actuator, and for hinges
+    that form no universal or ball joint.
+    """
     for one in freedoms:
         if one.actuator is None and any(one.friction):
             raise RobotFileError(
@@ -293,9 +297,11 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
         return "-".join(kinds), freedoms[0].point, axes
     directions = np.array([one.axis for one in freedoms])
     # the point that is nearest to the axes of all hinges
-    square = sum(np.eye(3) - np.outer(axis, axis) for axis in directions)
-    pulled = sum((np.eye(3) - np.outer(one.axis, one.axis)) @ one.point for one in freedoms)
-    point = np.linalg.lstsq(square, pulled, rcond=None)[0]
+    normal_matrix = sum(np.eye(3) - np.outer(axis, axis) for axis in directions)
+    right_hand_side = sum(
+        (np.eye(3) - np.outer(one.axis, one.axis)) @ one.point for one in freedoms
+    )
+    point = np.linalg.lstsq(normal_matrix, right_hand_side, rcond=None)[0]
     distance = max(float(np.linalg.norm(np.cross(one.axis, point - one.point))) for one in freedoms)
     names = ", ".join(one.name for one in freedoms)
     if distance > SAME:
@@ -335,7 +341,7 @@ def _hub(
 ) -> tuple[int, tuple[Connection, Connection]] | None:
     """Number and connections of a body that is only part of a joint, or None.
 
-    Such a body has nearly no mass and two connections, which consist of hinges.
+    Such a body has a mass of at most `limit`, kg, and two connections, which consist of hinges.
     """
     for body in range(1, len(solids)):
         joined = [one for one in connections if body in (one.first, one.second)]
@@ -359,7 +365,7 @@ def _moved(connections: list[Connection], gone: Connection, old: int, new: int) 
 
 
 def _together(a: Solid, b: Solid) -> Solid:
-    """Merge two bodies into one."""
+    """Merge two bodies into one, with the axes of the first."""
     mass = a.mass + b.mass
     centre = (a.mass * a.centre + b.mass * b.centre) / mass if mass else a.centre
     inertia = np.zeros((3, 3))

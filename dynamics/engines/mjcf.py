@@ -2,10 +2,10 @@
 
 The platform has a free joint. The bodies of each leg form a chain from the base on, with the joints
 of the leg's segments. A `connect` equality joins the end of each leg to the platform, and the
-platform thus has only the degrees of freedom that the legs allow. Joint coordinates are those of
-`inverse_kinematics`. Motors act on the actuated joints. The viscous friction is written as joint
-damping, and the Coulomb friction as friction loss. A link that consists of two equal bars is
-written as two bodies.
+platform thus has only the degrees of freedom that the legs allow. Motors act on the actuated
+joints, whose coordinates are those of `inverse_kinematics`. Their viscous friction is written as
+joint damping, and their Coulomb friction as friction loss. A link that consists of two equal bars
+is written as two bodies.
 
 MuJoCo's ball joints let bodies spin freely about their own axes, which eq. 12 excludes. No torque
 causes this spin as long as Ixx = Iyy, and it stays zero. The export adds no damping against it,
@@ -40,7 +40,7 @@ from dynamics.kinematics.platform import base_from_platform
 from dynamics.pseudo_inertia import PAIRS, about_centre, is_centred
 from dynamics.robot import Robot
 
-# MuJoCo lowers larger values to this one without a warning
+# largest impedance; MuJoCo lowers larger values to this one without a warning
 MAX_IMPEDANCE = 0.9999
 
 # characters that XML cannot write: control characters, halves of surrogate pairs (from undecodable
@@ -67,7 +67,7 @@ class MjcfSolver:
 
     `time_constant_steps` is the time constant of the springs in steps; MuJoCo requires at least 2.
     `impedance` is the fraction of the constraint force that the solver enforces at once; the
-    springs provide the remainder.
+    springs provide the remainder. Raises DynamicsError for a value out of range.
 
     The integrator implicitfast treats joint damping implicitly. It is stable for any viscous
     friction and needs one evaluation per step. RK4 is of fourth order, for comparisons with other
@@ -104,7 +104,8 @@ def mjcf_text(
     the file that states where the parameters come from.
 
     Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
-    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
+    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True. With True, such an
+    inertia is changed to the nearest that MuJoCo accepts, and the header of the file says so.
     """
     check_type("robot", robot, Robot, DynamicsError)
     check_type("source", source, str, DynamicsError)
@@ -152,8 +153,8 @@ def mjcf_text(
 class _Chain:
     """Parts of a robot at home.
 
-    `ends` maps the number of each last part to the point (3,) at which it is joined to the
-    platform, m, in the axes of the platform.
+    `ends` maps the number of each leg's last part to the point (3,) at which this part is joined to
+    the platform, m, in the frame of the platform.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -171,7 +172,7 @@ class _Chain:
 
 
 def end_names(part: Part) -> dict[str, str]:
-    """Names of the two sites that a loop joins: on a leg's last part, and on the platform."""
+    """Names of the two sites that close a loop: on a leg's last part, and on the platform."""
     # the end of a name such as link1a: the number of the leg, and the letter of the bar
     tail = part.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
     return {"site1": f"link_end{tail}", "site2": f"platform_joint{tail}"}
@@ -198,7 +199,7 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
 
 
 def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int) -> None:
-    """Add options of the solver, and defaults for loops, joints, geoms and sites."""
+    """Add options of the solver, and defaults for loops (equalities), joints, geoms and sites."""
     _add_comment(
         root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two."
     )
@@ -254,7 +255,7 @@ def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> Non
 def _add_part(
     parent: Xml.Element, chain: _Chain, number: int, inertia: np.ndarray, friction: dict[str, str]
 ) -> tuple[Xml.Element, list[float]]:
-    """Add a part as a child of the part before it.
+    """Add a part as a child of the previous part of its leg, or of the base.
 
     Returns the new element, and the coordinates of its joint at home.
     """
@@ -262,12 +263,14 @@ def _add_part(
     home = chain.home
     segment = part.segment
     before = part.before
-    turn = home.axes[before].T
-    place = {
-        "pos": numbers_text(_cleaned(turn @ (home.origin[number] - home.origin[before]))),
-        "quat": numbers_text(_cleaned(quaternion(turn @ home.axes[number]))),
+    parent_from_base = home.axes[before].T
+    pose = {
+        "pos": numbers_text(
+            _cleaned(parent_from_base @ (home.origin[number] - home.origin[before]))
+        ),
+        "quat": numbers_text(_cleaned(quaternion(parent_from_base @ home.axes[number]))),
     }
-    body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
+    body = Xml.SubElement(parent, "body", name=part.name, attrib=pose)
     coordinates = _add_joint(
         body, part, part_axis(part, home, number), chain.joints[part.leg], friction
     )
@@ -286,7 +289,7 @@ def _add_joint(
 ) -> list[float]:
     """Add the joint of a part, and return its coordinates at home.
 
-    A universal joint is written as two hinges. The axis of the first is fixed in the body before.
+    A universal joint is written as two hinges. The axis of the first is fixed in the parent body.
     """
     if part.segment.joint == "ball":
         Xml.SubElement(body, "joint", name=part.name, type="ball")
@@ -310,15 +313,15 @@ def part_axis(part: Part, frames: Frames, number: int) -> np.ndarray:
 
 
 def _cleaned(values: np.ndarray) -> np.ndarray:
-    """Values with rounding errors about zero replaced by zero.
+    """Values with zero in place of those that are only rounding errors.
 
-    The values are of order one, in m or without unit.
+    The values are of the order of magnitude of 1, in m or without unit.
     """
     return np.where(np.abs(values) < 2e-15, 0.0, values)
 
 
 def _add_inertia(body: Xml.Element, reference: np.ndarray, inertia: np.ndarray) -> None:
-    """Add the inertia of a full body (10,) with a reference point (3,) in the axes of the body."""
+    """Add the inertia of a full body (10,) about a reference point (3,) in the body's frame, m."""
     attributes = {"pos": numbers_text(reference), "mass": numbers_text(inertia[0])}
     if is_centred(inertia):
         attributes["diaginertia"] = numbers_text(inertia[4:7])
@@ -331,7 +334,7 @@ def _add_inertia(body: Xml.Element, reference: np.ndarray, inertia: np.ndarray) 
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
-    """Add an equality that closes each loop, and the motor of each leg."""
+    """Add the equality of each loop, which closes it, and the motor of each leg."""
     equality = Xml.SubElement(root, "equality")
     actuator = Xml.SubElement(root, "actuator")
     for number in chain.ends:

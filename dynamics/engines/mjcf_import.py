@@ -1,7 +1,7 @@
 """Import of a robot from an MJCF file of any program.
 
 Loops are `connect` or `weld` equalities. Home is the keyframe `home`, else the first keyframe, else
-the model as it is written. The platform may have a free joint, or be the child of a leg. The
+the model as it is written. The platform may have a free joint, or be the child of a leg's body. The
 `numeric` elements joint_pid and travel_limit, which the exporter writes, are read back.
 """
 
@@ -46,8 +46,8 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
 def _refuse_large(path: Path, including: tuple[Path, ...] = ()) -> int:
     """Count the bodies of a file and of the files that it includes.
 
-    `including` are the files that include this one. Raises RobotFileError if the file has more
-    bodies than a robot, or includes a file of another folder.
+    `including` are the files that include this one. Raises RobotFileError if the file has more than
+    MOST_BODIES bodies, or includes a file of another folder, itself, or files over too many levels.
     """
     content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
     bodies = 0
@@ -111,8 +111,8 @@ def _mechanism(mujoco: Any, model: Any) -> Mechanism:
 
 
 def _solid(mujoco: Any, model: Any, data: Any, body: int) -> Solid:
-    """Body of a model."""
-    turn = data.ximat[body].reshape(3, 3)
+    """Body of a model. The rod that draws it is its first capsule or cylinder."""
+    base_from_principal = data.ximat[body].reshape(3, 3)
     rods = [int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)]
     first = int(model.body_geomadr[body])
     rod = None
@@ -123,14 +123,14 @@ def _solid(mujoco: Any, model: Any, data: Any, body: int) -> Solid:
         name=model.body(body).name or f"body {body}",
         mass=float(model.body_mass[body]),
         centre=data.xipos[body].copy(),
-        inertia=turn @ np.diag(model.body_inertia[body]) @ turn.T,
+        inertia=base_from_principal @ np.diag(model.body_inertia[body]) @ base_from_principal.T,
         axes=data.xmat[body].reshape(3, 3).copy(),
         rod=rod,
     )
 
 
 def _freedom(mujoco: Any, model: Any, data: Any, joint: int, actuator: int | None) -> Freedom:
-    """Elementary joint of a model."""
+    """Elementary joint of a model. Raises RobotFileError for stiffness or armature."""
     kind = {
         int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
         int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
@@ -163,7 +163,7 @@ def _joint_name(model: Any, joint: int) -> str:
 def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
     """Connection that closes a loop between two sites or two bodies, as a ball joint or a weld.
 
-    Raises RobotFileError if the loop is open at home.
+    Raises RobotFileError if the loop is open at home. A weld of two bodies is not checked.
     """
     first, second = (int(ids[equality]) for ids in (model.eq_obj1id, model.eq_obj2id))
     name = model.equality(equality).name or f"equality {equality}"
@@ -204,7 +204,7 @@ def _refuse_others(mujoco: Any, model: Any) -> None:
 
 
 def _numeric(model: Any, name: str) -> np.ndarray | None:
-    """Numbers of the element `numeric` with a name. None if the file has no such element."""
+    """Numbers of the element `numeric` with a name, or None if the file has no such element."""
     try:
         return np.array(model.numeric(name).data, dtype=float)
     except KeyError:

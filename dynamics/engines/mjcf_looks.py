@@ -1,4 +1,4 @@
-"""Appearance of a robot in MJCF: geoms without mass and contact."""
+"""Appearance of a robot in MJCF: geoms that have neither mass nor contact."""
 
 from xml.etree import ElementTree as Xml
 
@@ -18,7 +18,7 @@ COLOURS = {
 
 
 def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
-    """Add sky, light and view, and the colours of the bodies."""
+    """Add sky, light, the size of the view, and the colours of the bodies."""
     points = np.concatenate([geometry.base_joints, geometry.joints_at(geometry.home_pose)])
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     extent = 1.6 * np.linalg.norm(points - centre, axis=1).max()
@@ -35,8 +35,8 @@ def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
 def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
     """Add geoms that show the base.
 
-    The geoms are a plate behind the legs, as seen from the platform, a motor on each hinge of the
-    base, and a rail below each slide.
+    The geoms are a plate behind the legs, as seen from the platform, and one at the foot of each
+    leg: a motor on a hinge, a rail along a slide, or a ball in a universal joint.
     """
     centre, radius = disc(geometry.base_joints)
     behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])
@@ -56,7 +56,7 @@ def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
 
 
 def disc(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (3,) and radius of a disc that covers points."""
+    """Mean (3,) of points (N, 3), and the largest distance of a point from it, m."""
     centre = points.mean(axis=0)
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
@@ -64,7 +64,7 @@ def disc(points: np.ndarray) -> tuple[np.ndarray, float]:
 def add_rod(
     parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str
 ) -> None:
-    """Add a geom of a kind, such as a capsule, between two points (3,), m."""
+    """Add a geom of a kind, such as a capsule, with a radius, m, between two points (3,), m."""
     ends = numbers_text(np.concatenate([start, end]))
     Xml.SubElement(
         parent, "geom", type=kind, fromto=ends, size=numbers_text(radius), material=material

@@ -52,7 +52,8 @@ def import_mujoco() -> Any:
 class MujocoRobot:
     """Robot in MuJoCo, loaded from the text of `mjcf_text`.
 
-    Poses, twists and joint coordinates are those of `Robot`.
+    Poses, twists and joint coordinates are those of `Robot`. Raises MujocoMissingError without
+    MuJoCo, and MujocoError for a text that MuJoCo refuses or that is no export of the robot.
     """
 
     def __init__(self, robot: Robot, text: str) -> None:
@@ -107,14 +108,14 @@ class MujocoRobot:
 
     @property
     def closure_error(self) -> float:
-        """Largest distance between a leg's end and its platform joint, m."""
+        """Largest distance between the end of a leg and its joint on the platform, m."""
         self._mujoco.mj_kinematics(self.model, self.data)
         gaps = self.data.site_xpos[self._ends[0]] - self.data.site_xpos[self._ends[1]]
         return float(np.linalg.norm(gaps, axis=1).max())
 
     @property
     def link_spin(self) -> float:
-        """Largest angular velocity of a body on a ball joint about its own axis, rad/s.
+        """Largest angular speed, about its own z axis, of a body on a ball joint, rad/s.
 
         It is zero if the robot has no such body.
         """
@@ -145,29 +146,29 @@ class MujocoRobot:
         for number, (part, body) in enumerate(zip(self._parts.all, self._bodies, strict=True)):
             if part.segment.actuated:
                 continue
-            at = int(self.model.jnt_qposadr[int(body.jntadr[0])])
-            rate = int(body.dofadr[0])
+            qpos_index = int(self.model.jnt_qposadr[int(body.jntadr[0])])
+            qvel_index = int(body.dofadr[0])
             axes = frames.axes[number]
             before = frames.axes[part.before]
-            at_rest = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
-            turned = at_rest.T @ before.T @ axes
+            parent_from_body = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
+            turned = parent_from_body.T @ before.T @ axes
             spin = axes.T @ (frames.spin[number] - frames.spin[part.before])
             if part.segment.joint == "ball":
-                data.qpos[at : at + 4] = quaternion(turned)
-                data.qvel[rate : rate + 3] = spin
+                data.qpos[qpos_index : qpos_index + 4] = quaternion(turned)
+                data.qvel[qvel_index : qvel_index + 3] = spin
                 continue
             axis = part_axis(part, frames, number)
-            axis_at_rest = at_rest.T @ part.segment.axis
+            axis_at_rest = parent_from_body.T @ part.segment.axis
             if part.segment.joint == "hinge":
-                data.qpos[at] = Rotation.from_matrix(turned).as_rotvec() @ axis_at_rest
-                data.qvel[rate] = spin @ axis
+                data.qpos[qpos_index] = Rotation.from_matrix(turned).as_rotvec() @ axis_at_rest
+                data.qvel[qvel_index] = spin @ axis
                 continue
             # a universal joint turns about an axis of the part before it, then about its own x
             x_axis = turned[:, 0]
             angle = np.arctan2(np.cross(axis_at_rest, X) @ x_axis, x_axis[0])
             about_x = Rotation.from_rotvec(-angle * axis_at_rest).as_matrix() @ turned
-            data.qpos[at : at + 2] = angle, np.arctan2(about_x[2, 1], about_x[1, 1])
-            data.qvel[rate : rate + 2] = spin @ axis, spin[0]
+            data.qpos[qpos_index : qpos_index + 2] = angle, np.arctan2(about_x[2, 1], about_x[1, 1])
+            data.qvel[qvel_index : qvel_index + 2] = spin @ axis, spin[0]
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
@@ -183,7 +184,8 @@ class MujocoRobot:
     def feed_back(self, stiffness: ArrayLike, damping: ArrayLike) -> None:
         """Add -stiffness * coordinate - damping * rate to every control, in MuJoCo's integrator.
 
-        Stiffness and damping are one number, or one number (n,) per joint.
+        Stiffness and damping are one number, or one number (n,) per joint. They replace those of an
+        earlier call.
         """
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         self.model.actuator_biasprm[:, 0] = 0.0
@@ -198,6 +200,6 @@ class MujocoRobot:
             self.model.actuator_biasprm[:, column] = -values
 
     def step(self, control: np.ndarray) -> None:
-        """Do one step under a control (n,), N m or N."""
+        """Do one time step under a control (n,), N m or N."""
         self.data.ctrl[:] = floats("control", control, (self.model.nu,))
         self._mujoco.mj_step(self.model, self.data)

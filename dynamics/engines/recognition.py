@@ -1,9 +1,9 @@
 """Recognition of a mechanism from another program as a robot with legs of known kinds.
 
 The origin of the platform's frame is the platform's centre of mass. The frame has the axes of the
-file if the inertia of the platform is diagonal in them, else its principal axes. If the axes are
-tilted too far for the angles of a pose, they are reordered to be as near as possible to the axes of
-the base.
+file if the inertia of the platform is diagonal in them, else the principal axes of the inertia. If
+the axes are tilted too far for the angles of a pose, they are reordered to be as near as possible
+to the axes of the base.
 """
 
 from collections import Counter
@@ -37,12 +37,11 @@ from dynamics.robot_file import RobotDescription, parsed_robot
 from dynamics.robot_text import robot_text
 from dynamics.spatial_inertia import MOMENTS
 
-# Fraction of the largest moment below which products of inertia count as rounding errors.
+# Fraction of the largest moment up to which products of inertia count as rounding errors.
 ROUNDING = 1e-9
 
-# Largest sin(beta) at home. Near 1 the angles are singular, because alpha and gamma turn about the
-# same axis. If the platform is tilted further, its axes are reordered to be nearest to those of the
-# base.
+# Largest magnitude of sin(beta) at home, above which axes are reordered. Near 1 the angles are
+# singular, because alpha and gamma turn about the same axis.
 MOST_TILT = 0.9
 
 # Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID.
@@ -50,23 +49,25 @@ DEFAULT_FREQUENCY = 2 * np.pi * 3
 # Damping ratio of the joint with the least inertia, if a file states no joint PID.
 DEFAULT_DAMPING = 0.7
 DEFAULT_TRAVEL = 0.5  # travel beyond the home coordinates if a file states no joint ranges, rad
-# Ratio of the travel of sliding actuators to the distance from B to A, if a file has no ranges.
+# Ratio of the travel of sliding actuators beyond home to the distance between the ends of the
+# shortest leg, if a file states no joint ranges.
 DEFAULT_TRAVEL_RATIO = 0.1
 
 
 def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     """Robot of a mechanism, with one parameter set `guess`, and remarks on the file.
 
-    Raises RobotFileError, with the leg and body, if a leg is of no known kind.
+    Raises RobotFileError for a mechanism that is no robot, with the leg and its bodies if a leg is
+    of no known kind.
     """
     plain = simplified(mechanism)
     notes = list(plain.notes)
-    number = platform_of(plain)
-    platform = plain.solids[number]
+    platform_number = platform_of(plain)
+    platform = plain.solids[platform_number]
     axes, moments = _principal(platform)
     if not np.array_equal(axes, platform.axes):
         notes.append(f"the platform has principal axes instead of the axes of {platform.name}")
-    mechanism_legs = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
+    mechanism_legs = list(legs_of(plain, platform_number, np.column_stack([axes, platform.centre])))
     legs = [_leg(mechanism_leg, k) for k, mechanism_leg in enumerate(mechanism_legs, 1)]
     if not legs:
         raise RobotFileError(
@@ -91,9 +92,9 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     geometry = replace(geometry, full_bodies=tuple(full))
     layout = geometry.layout
     notes += _spinning(geometry, mechanism_legs)
-    meshes, said = _meshes(geometry, mechanism_legs)
+    meshes, mesh_notes = _meshes(geometry, mechanism_legs)
     geometry = replace(geometry, meshes=tuple(meshes))
-    notes += said
+    notes += mesh_notes
     friction = np.transpose([mechanism_leg.actuated.friction for mechanism_leg in mechanism_legs])
     dynamic = layout.check(np.concatenate([layout.rigid_of(bodies), *friction]))
     gains = plain.gains
@@ -122,7 +123,7 @@ def _leg(mechanism_leg: MechanismLeg, number: int) -> Leg:
 def _bodies(
     geometry: RobotGeometry, mechanism_legs: list[MechanismLeg], platform: np.ndarray
 ) -> np.ndarray:
-    """Full bodies (bodies, 10) of a robot: the platform (10,), and the bodies of the legs.
+    """Full bodies (bodies, 10) of a robot: the `platform` (10,), then the bodies of the legs.
 
     Raises the RobotFileError of `_inertia` with the number of the leg.
     """
@@ -147,7 +148,7 @@ def _bodies(
 def _meshes(
     geometry: RobotGeometry, mechanism_legs: list[MechanismLeg]
 ) -> tuple[list[BodyMesh], list[str]]:
-    """Meshes of the bodies of the legs, and a remark on those of paired bars, which are omitted."""
+    """Meshes of the legs' bodies, and a remark if those of bodies of two bars are omitted."""
     layout = geometry.layout
     meshes = []
     left_out = []
@@ -165,16 +166,16 @@ def _meshes(
                 continue
             for shape in bars[0].shapes:
                 joint = centre - axes @ segment.centre
-                place = axes.T @ (shape.place[:3, 3] - joint)
-                turn = Rotation.from_matrix(axes.T @ shape.place[:3, :3]).as_euler("XYZ")
-                pose = (*place.tolist(), *turn.tolist())
+                position = axes.T @ (shape.place[:3, 3] - joint)
+                angles = Rotation.from_matrix(axes.T @ shape.place[:3, :3]).as_euler("XYZ")
+                pose = (*position.tolist(), *angles.tolist())
                 meshes.append(BodyMesh(body=name, file=shape.file, scale=shape.scale, pose=pose))
-    said = f"the meshes of {', '.join(left_out)} are not taken, because two bars form the body"
-    return meshes, [said] if left_out else []
+    note = f"the meshes of {', '.join(left_out)} are not taken, because two bars form the body"
+    return meshes, [note] if left_out else []
 
 
 def _places(leg: Leg, mechanism_leg: MechanismLeg) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Centres and axes of the bodies of a leg at home."""
+    """Centres (3,), m, and axes (3, 3) of the bodies of a leg at home."""
     return [_numbers(place) for place in leg.placements(ca.SX(mechanism_leg.chain.points[-1]))]
 
 
@@ -204,10 +205,10 @@ def _inertia(
 ) -> np.ndarray:
     """Full body (10,) of a leg, in the axes that its kind of leg defines.
 
-    The body may consist of several equal bars. First moments and products of inertia are zero if
-    they have no effect. The centre of mass has an effect only if the body turns, and only along
-    the `directions` (3, n) in which the platform can move. Raises RobotFileError for bars of
-    different mass.
+    The body may consist of several equal bars. First moments and products of inertia are set to
+    zero if they have no effect. An offset of the centre of mass has an effect only if the body
+    turns, and only along the `directions` (3, n) in which the platform can move. Raises
+    RobotFileError for bars of different mass.
     """
     centre, axes = place
     name = " and ".join(bar.name for bar in bars)
@@ -229,7 +230,7 @@ def _inertia(
 
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3, 3) of the platform's frame, and the moments of inertia (3,) about them."""
+    """Axes (3, 3) of the platform's frame at home, and the moments of inertia (3,) about them."""
     inertia = platform.axes.T @ platform.inertia @ platform.axes
     axes = platform.axes
     if np.abs(inertia - np.diag(np.diagonal(inertia))).max() > ROUNDING * np.abs(inertia).max():
@@ -276,7 +277,10 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
 def _travel(
     plain: Mechanism, mechanism_legs: list[MechanismLeg], legs: list[Leg], notes: list[str]
 ) -> float:
-    """Travel limit from the ranges in the file, or a default about home."""
+    """Travel limit, rad or m, from the ranges in the file, or a default about home with a note.
+
+    Raises RobotFileError if zero or home is not inside a range.
+    """
     limits = []
     for mechanism_leg in mechanism_legs:
         at_home = mechanism_leg.actuated.coordinate
@@ -302,7 +306,7 @@ def _travel(
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """Gains lp, li, ld with the default frequency at the joint with the least inertia at home."""
+    """Gains lp, li, ld (3,) with the default frequency at the joint of least inertia at home."""
     home = ca.SX(geometry.home_pose)
     basis = geometry.chart.basis
     jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ basis

@@ -2,9 +2,9 @@
 
 URDF can describe only trees. The last body of each leg ends in a frame `end_...` that coincides
 with a frame `seat_...` of the platform, and the YAML lists these pairs of frames. The platform has
-a floating joint, or a spherical joint on the first leg. Actuated joints are written at coordinate
-zero, and passive joints as they are at home. A universal joint is two revolute joints with a hub
-between them. A spherical joint is written as a revolute joint, and the YAML names it.
+a floating joint, or a spherical joint on the first leg. The zero of an actuated joint is that of
+its coordinate, and the zero of a passive joint is at home. A universal joint is two revolute joints
+with a hub between them. A spherical joint is written as a revolute joint, and the YAML names it.
 """
 
 from xml.sax.saxutils import quoteattr
@@ -35,7 +35,8 @@ def urdf_texts(
     floating joint.
 
     Raises ParameterError for wrong parameters. Raises its subclass UnphysicalInertiaError for a
-    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True.
+    body that breaks Ix + Iy >= Iz, unless `allow_unphysical_inertia` is True. With True, such an
+    inertia is changed to the nearest that MuJoCo accepts.
     """
     values = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
     bodies = physical_inertias(robot.layout, values, allow_unphysical_inertia).values
@@ -44,8 +45,11 @@ def urdf_texts(
     at_home = robot.inverse_kinematics(robot.home_pose)
     dry = values[robot.layout.coulomb].tolist()
     viscous = values[robot.layout.viscous].tolist()
-    turn = base_from_platform(robot.home_pose)
-    places: Places = {"base": (np.zeros(3), np.eye(3)), "platform": (robot.home_pose[:3], turn)}
+    platform_axes = base_from_platform(robot.home_pose)
+    places: Places = {
+        "base": (np.zeros(3), np.eye(3)),
+        "platform": (robot.home_pose[:3], platform_axes),
+    }
     lines = [_link("base"), _link("platform", bodies[0])]
     spherical: list[str] = []
     loops: list[list[str]] = []
@@ -58,10 +62,10 @@ def urdf_texts(
         places[name] = home.origin[number], home.axes[number]
         axis = home.axes[number].T @ home.axes[part.before] @ segment.axis
         lines.append(_link(name, part.share * bodies[part.body], segment.centre))
-        # URDF has no ball joint: the YAML file names the hinges that stand for one.
+        # URDF has no ball joint: the YAML file names the hinges that stand for ball joints
         if segment.joint == "ball":
             spherical.append(name)
-        # URDF has no universal joint: it becomes two hinges, with a body without mass between them.
+        # URDF has no universal joint: it becomes two hinges, with a body without mass between them
         if segment.joint == "universal":
             hub = f"hub_{name}"
             lines.append(_link(hub))
@@ -80,11 +84,11 @@ def urdf_texts(
             more += f'<limit lower="{-limit!r}" upper="{limit!r}" effort="1" velocity="1"/>'
         lines.append(_joint(name, kind, before, part.name, places, axis, coordinate, more))
         if part.last:
-            # URDF is a tree: a leg ends at a link of its own, which the YAML file joins to one of
-            # the platform at the same place.
+            # URDF is a tree: a leg ends in a link of its own, which the YAML file joins to a link
+            # on the platform with the same origin
             end, seat = f"end_{part.name}", f"seat_{part.name}"
-            place = home.origin[number] + home.axes[number] @ segment.end
-            places |= {end: (place, home.axes[number]), seat: (place, turn)}
+            end_point = home.origin[number] + home.axes[number] @ segment.end
+            places |= {end: (end_point, home.axes[number]), seat: (end_point, platform_axes)}
             lines += [_link(end), _link(seat)]
             lines.append(_joint(f"to_{end}", "fixed", part.name, end, places))
             if platform_on_a_leg and not loops and "hanging" not in spherical:
@@ -110,16 +114,16 @@ def _link(
     inertia: np.ndarray | None = None,
     reference: np.ndarray | tuple[int, ...] = (0, 0, 0),
 ) -> str:
-    """Link without a body, or with inertial parameters (10,) about a reference point (3,), m."""
+    """Link without mass, or with inertial parameters (10,) about a reference point (3,), m."""
     if inertia is None:
         return f'<link name="{name}"/>'
     centre, tensor = about_centre(inertia)
     mass = inertia[0]
     (xx, xy, xz), (yy, yz), (zz,) = tensor[0], tensor[1, 1:], tensor[2, 2:]
     moments = f'ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="{xy}" ixz="{xz}" iyz="{yz}"'
-    place = f'<origin xyz="{_numbers(np.array(reference) + centre)}"/>'
+    origin_tag = f'<origin xyz="{_numbers(np.array(reference) + centre)}"/>'
     return (
-        f'<link name="{name}"><inertial>{place}<mass value="{mass}"/><inertia {moments}/>'
+        f'<link name="{name}"><inertial>{origin_tag}<mass value="{mass}"/><inertia {moments}/>'
         "</inertial></link>"
     )
 
@@ -134,14 +138,14 @@ def _joint(
     coordinate: float = 0.0,
     more: str = "",
 ) -> str:
-    """Joint with a coordinate, rad or m, at home. Parent and child have their `places` at home.
+    """Joint with a coordinate at home, rad or m, between two links with `places` at home.
 
-    `more` has further elements of the joint.
+    `more` is the text of further elements of the joint.
     """
     parent_origin, parent_axes = places[parent]
     origin, axes = places[child]
     axis = np.array(axis, dtype=float)
-    # URDF needs the place of the child at coordinate zero
+    # URDF needs the frame of the child at coordinate zero
     if kind == "prismatic":
         origin = origin - coordinate * axes @ axis
     else:
@@ -149,8 +153,8 @@ def _joint(
     angles = Rotation.from_matrix(parent_axes.T @ axes).as_euler("xyz", suppress_warnings=True)
     xyz = _numbers(parent_axes.T @ (origin - parent_origin))
     ends = f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{_numbers(axis)}"/>'
-    place = f'<origin xyz="{xyz}" rpy="{_numbers(angles)}"/>'
-    return f'<joint name="{name}" type="{kind}">{place}{ends}{more}</joint>'
+    origin_tag = f'<origin xyz="{xyz}" rpy="{_numbers(angles)}"/>'
+    return f'<joint name="{name}" type="{kind}">{origin_tag}{ends}{more}</joint>'
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -15,7 +15,7 @@ FOLDERS_ABOVE = 4  # number of folders above that of the URDF file that are sear
 def mesh_shapes(link: Xml.Element, place: np.ndarray, folder: Path) -> tuple[Shape, ...]:
     """Meshes among the visuals of a link with the frame `place` (4, 4) at home.
 
-    Paths are relative to `folder`. Raises RobotFileError if the scales of the axes differ.
+    Paths are relative to `folder`. Raises RobotFileError unless a mesh has one scale > 0.
     """
     shapes = []
     for visual in link.findall("visual"):
@@ -34,7 +34,10 @@ def mesh_shapes(link: Xml.Element, place: np.ndarray, folder: Path) -> tuple[Sha
 
 
 def _found(name: str, folder: Path) -> str:
-    """Path of a mesh. A name that begins with package:// is searched for in the folders above."""
+    """Path of a mesh. For a name that begins with package://, the folders above are searched, too.
+
+    If no such file exists, the path is that in `folder` without the name of the package.
+    """
     scheme, _, rest = name.rpartition("://")
     if scheme != "package":
         return str(folder / rest)
@@ -48,15 +51,18 @@ def _found(name: str, folder: Path) -> str:
 
 def origin(element: Xml.Element) -> np.ndarray:
     """Frame (4, 4) in the tag `origin` of an element."""
-    place = np.eye(4)
-    turn = Rotation.from_euler("xyz", numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
-    place[:3, :3] = turn.as_matrix()
-    place[:3, 3] = numbers(element, "origin", "xyz", (0.0, 0.0, 0.0))
-    return place
+    frame = np.eye(4)
+    rotation = Rotation.from_euler("xyz", numbers(element, "origin", "rpy", (0.0, 0.0, 0.0)))
+    frame[:3, :3] = rotation.as_matrix()
+    frame[:3, 3] = numbers(element, "origin", "xyz", (0.0, 0.0, 0.0))
+    return frame
 
 
 def numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]) -> np.ndarray:
-    """Three numbers in an attribute of a tag. Raises RobotFileError if they are not finite."""
+    """Three numbers in an attribute of a tag, or the default if there is no such attribute.
+
+    Raises RobotFileError for any other text.
+    """
     found = element.find(tag)
     text = None if found is None else found.get(key)
     if text is None:
@@ -73,13 +79,13 @@ def numbers(element: Xml.Element, tag: str, key: str, default: tuple[float, ...]
 
 
 def number_in(element: Xml.Element, tag: str, key: str) -> float:
-    """Number in an attribute of a tag; 0 without the tag. Raises the error of `real_in`."""
+    """Number in an attribute of a tag, or 0 if there is none. Raises the error of `real_in`."""
     found = element.find(tag)
     return 0.0 if found is None else real_in(found, key)
 
 
 def real_in(element: Xml.Element, key: str) -> float:
-    """Number in an attribute. Raises RobotFileError if it is not finite."""
+    """Number in an attribute, or 0 if there is none. Raises RobotFileError if it is not finite."""
     text = element.get(key, "0")
     try:
         number = float(text)

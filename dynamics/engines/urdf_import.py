@@ -11,7 +11,7 @@ tree, whose root is the fixed base. The YAML file has these keys:
 - joint_name and joint_type: joints with another type than in the URDF file, and these types. A type
   is SPHERICAL, FIXED, or UJOINT_XY (hinges about x, then y, of the frame of the joint).
 
-Home is the position near zero coordinates in which the loops are closed.
+Home is the configuration near zero coordinates in which the loops are closed.
 """
 
 import re
@@ -41,7 +41,7 @@ KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 MOST = 120
 # Largest number of all joint coordinates. The time to close loops grows with its square.
 MOST_COORDINATES = 90
-MOST_ITERATIONS = 60  # largest number of iterations to close the loops. About ten are usual.
+MOST_ITERATIONS = 60  # largest number of evaluations to close the loops; about ten are usual
 GRAVITY = np.array([0.0, 0.0, -9.81])  # gravity, m/s^2, which URDF does not state
 # Number of coordinates of each kind of joint.
 COORDINATES = {"hinge": 1, "slide": 1, "ball": 3, "weld": 0, "universal": 2, "floating": 6}
@@ -60,8 +60,9 @@ KINDS = {
 class _Joint:
     """Joint of the tree.
 
-    `place` (4, 4) is its frame in the frame of the parent, and `axes` (2, 3) are its axes in its
-    own frame. `span` is the range of its coordinate, if the file states one.
+    `place` (4, 4) is its frame in the frame of the parent at coordinate zero. `axes` (2, 3) are its
+    axes in its own frame; only a universal joint uses the second. `span` is the range of its
+    coordinate, or None if the file states none.
     """
 
     name: str
@@ -74,7 +75,7 @@ class _Joint:
     span: tuple[float, float] | None
 
     def moved(self, q: np.ndarray) -> np.ndarray:
-        """Frame (4, 4) of the child in the frame of the parent, at coordinates of the joint."""
+        """Frame (4, 4) of the child in the frame of the parent, at joint coordinates `q`."""
         motion = np.eye(4)
         if self.kind in ("ball", "floating"):
             motion[:3, :3] = Rotation.from_rotvec(q[-3:]).as_matrix()
@@ -197,7 +198,10 @@ def _mechanism(root: Xml.Element, settings: dict[str, list[Any]], folder: Path) 
 
 
 def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
-    """Joint of an XML element. `new_type` is its type in the YAML file, or None."""
+    """Joint of an XML element. `new_type` is its type in the YAML file, or None.
+
+    Raises RobotFileError for a joint that is incomplete or of an unknown type.
+    """
     name = str(element.get("name"))
     kind = str(element.get("type"))
     if kind not in KINDS or element.find("mimic") is not None:
@@ -236,9 +240,9 @@ def _joint(element: Xml.Element, new_type: str | None) -> _Joint:
 
 
 def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> list[_Joint]:
-    """Sort joints so that each follows the joint of its parent.
+    """Sort joints so that each follows the joint of its parent link.
 
-    Raises RobotFileError if they form no tree.
+    Raises RobotFileError if links and joints form no tree.
     """
     children = [joint.child for joint in joints]
     roots = [name for name in links if name not in children]
@@ -267,7 +271,7 @@ def _from_the_root(links: Mapping[str, Xml.Element], joints: list[_Joint]) -> li
 
 
 def _placed(base: str, joints: list[_Joint], q: np.ndarray) -> dict[str, np.ndarray]:
-    """Frames base_from_link (4, 4) of all links."""
+    """Frames base_from_link (4, 4) of all links at coordinates `q`, by name."""
     place = {base: np.eye(4)}
     slices = _slices(joints)
     for joint in joints:
@@ -276,7 +280,7 @@ def _placed(base: str, joints: list[_Joint], q: np.ndarray) -> dict[str, np.ndar
 
 
 def _slices(joints: list[_Joint]) -> dict[str, slice]:
-    """Slice of the coordinates of each joint, by name."""
+    """Slice of each joint in the vector of all coordinates, by name."""
     ends = np.cumsum([COORDINATES[joint.kind] for joint in joints]).tolist()
     return {
         joint.name: slice(end - COORDINATES[joint.kind], end)
@@ -287,7 +291,7 @@ def _slices(joints: list[_Joint]) -> dict[str, slice]:
 def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]]) -> np.ndarray:
     """Coordinates at which all loops are closed.
 
-    Raises RobotFileError, with the gap, if a gap remains.
+    Raises RobotFileError if a gap remains, m or rad, or for more than MOST_COORDINATES coordinates.
     """
 
     def gaps(q: np.ndarray) -> np.ndarray:
