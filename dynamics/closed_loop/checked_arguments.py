@@ -58,7 +58,7 @@ def checked_directions(
     given = np.asarray(directions)
     count = given.shape[2] if given.ndim == 3 else 0
     if count > most:
-        raise SimulationError(f"{count} directions of the commands, at most {most} fit here")
+        raise SimulationError(f"{count} directions of the commands, but at most {most} fit here")
     checked = floats("directions", directions, (*shape, count), error=SimulationError)
     start = np.zeros((shape[1], count)) if before is None else before
     start = floats("start_directions", start, (shape[1], count), error=SimulationError)
@@ -92,7 +92,7 @@ def held_commands(
     if not np.isfinite(given[written]).all():
         frame = int(np.flatnonzero(written & ~np.isfinite(given).all(axis=1))[0])
         raise SimulationError(
-            f"commands of frame {frame} are {given[frame]}: a row is finite, or NaN as a whole"
+            f"commands of frame {frame} are {given[frame]}: a row must be finite, or NaN as a whole"
         )
     newest = np.maximum.accumulate(np.where(written, np.arange(len(given)), -1))
     held = np.where((newest >= 0)[:, None], given[newest], before)

@@ -275,7 +275,7 @@ class Drives:
         if beyond[joint] > 0:
             raise SimulationError(
                 f"joint {joint + 1} needs the command {sent[joint]:.6g} to stand still at the "
-                f"start, and the drives take commands from {low:g} to {high:g} rad or m"
+                f"start, but the drives take commands from {low:g} to {high:g} rad or m"
             )
 
     def joint_law(self, gains: np.ndarray) -> JointLaw:
@@ -289,7 +289,9 @@ def _of_joints(what: str, values: tuple[float, ...], joints: int) -> np.ndarray:
     Raises SimulationError for values of another number of joints.
     """
     if values and len(values) != joints:
-        raise SimulationError(f"there are {what} of {len(values)} joints, the robot has {joints}")
+        raise SimulationError(
+            f"there are {what} of {len(values)} joints, but the robot has {joints}"
+        )
     return np.array(values) if values else np.zeros(joints)
 
 

@@ -48,7 +48,7 @@ FAILURES = {
     LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
     "overflow",
-    TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
+    TOO_MANY_EVENTS: "too many stick-slip events while one command acts",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, and the servo has no command; there",
 }
 

@@ -183,7 +183,7 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
         "below 1"
     )
     if radius < 1:
-        return f"{eigenvalue_text}: it is stable near the start, and becomes unstable far from it"
+        return f"{eigenvalue_text}: the loop is stable near the start"
     rate = lowest_frame_rate(*arguments)
     elsewhere = f"stable from {rate:.3g} Hz on" if rate > 0 else "stable at no frame rate"
     return f"{eigenvalue_text}: the loop is unstable at {hz:g} Hz, and {elsewhere}"

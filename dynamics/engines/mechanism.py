@@ -196,18 +196,18 @@ def _leg(
     # with more loops, the number of paths would grow without limit
     if joined > len(members) + 2:
         raise RobotFileError(
-            f"it has {joined} joints and {len(members)} bodies; one way from the base to the "
-            f"platform, or two with equal bars, needs at most {len(members) + 2} joints"
+            f"it has {joined} joints and {len(members)} bodies; with one path from the base to the "
+            f"platform, or two of equal bars, it would have at most {len(members) + 2} joints"
         )
     paths = list(_paths(mechanism, BASE, platform, members, []))
     solids = mechanism.solids
     if not paths or len(paths) > 2 or len({len(path) for path in paths}) > 1:
         raise RobotFileError(
-            f"it has {len(paths)} ways from the base to the platform, must have one, or two of "
+            f"it has {len(paths)} paths from the base to the platform, must have one, or two of "
             "equal bars"
         )
     for body in sorted(members - {body for path in paths for body, _ in path}):
-        raise RobotFileError(f"{solids[body].name} is on no way from the base to the platform")
+        raise RobotFileError(f"{solids[body].name} is on no path from the base to the platform")
     actuated = [
         one for body, joint in paths[0] for one in joint.seen_from(body) if one.actuator is not None
     ]
@@ -227,7 +227,7 @@ def _leg(
         ):
             if kinds[0][0] != kinds[1][0]:
                 raise RobotFileError(
-                    f"its two bars are joined differently, by {kinds[0][0]} and {kinds[1][0]}"
+                    f"its two bars have different joints: {kinds[0][0]} and {kinds[1][0]}"
                 )
             offset_before = bar_offset
             bar_offset = kinds[1][1] - kinds[0][1]

@@ -279,7 +279,7 @@ def test_a_hand_written_model_accelerates_as_mujocos_bodies_in_closed_loops(tmp_
         (
             '<connect site1="link_end3" site2="platform_joint3" name="loop3" />',
             "",
-            r"leg 3 .* 0 ways from the base",
+            r"leg 3 .* 0 paths from the base",
         ),
         (
             'name="link2" type="ball"',

@@ -280,7 +280,7 @@ def test_zeros_of_another_number_of_joints_are_refused():
     with pytest.raises(ScenarioError, match=r"joint_zero_error_rad has 2 values, but rss6 has 6"):
         build_plant(scenario, rss6())
     parameters = rss6().parameter_sets["truth"].vector
-    with pytest.raises(SimulationError, match="zeros of 2 joints, the robot has 6"):
+    with pytest.raises(SimulationError, match="zeros of 2 joints, but the robot has 6"):
         simulate_commands(
             rss6(),
             parameters,

@@ -105,7 +105,7 @@ def test_offsets_of_friction_are_within_it_and_need_an_integral():
         plant(0.05)
     with pytest.raises(SimulationError, match="under the law pd it is an error of the joint's"):
         plant(0.01, drive="pd")
-    with pytest.raises(SimulationError, match=r"offsets of 1 joints, the robot has 6"):
+    with pytest.raises(SimulationError, match=r"offsets of 1 joints, but the robot has 6"):
         Drives(friction_offset=(0.1,)).offsets(6)
     record, _ = run_plant(quick(), 0, duration_s=2.2)
     for drive in ("pd", "auto"):
