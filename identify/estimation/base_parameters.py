@@ -1,11 +1,13 @@
 """Base parameters: combinations of dynamic parameters that a motion can identify (section 4.2).
 
 The wrench is H Xi (eq. 26). If columns of H are linearly dependent, the wrench depends only on
-combinations of their parameters. With H = H_1 (1 | beta) P, the wrench is H Xi = H_1 (xi_1 + beta
-xi_2). The base parameters are xi_1 + beta xi_2, one for each pivot column. Columns are scaled to
-length one, so that the choice of pivots does not depend on units. Among all columns that are long
-enough, the pivot is the first in a fixed order (threshold pivoting). The groups are therefore the
-same for all motions.
+combinations of their parameters. Let H_1 be linearly independent columns of H, the pivots, and let
+the permutation P sort the parameters Xi into xi_1 of the pivots and xi_2 of the other columns. With
+H = H_1 (1 | beta) P, the wrench is H Xi = H_1 (xi_1 + beta xi_2). The base parameters are xi_1 +
+beta xi_2, one for each pivot column. Columns are scaled to length one, so that the choice of pivots
+does not depend on units. The next pivot is the first column, in a fixed order, of those that are
+long enough without their parts along the earlier pivots (threshold pivoting). The groups are
+therefore the same for all motions.
 """
 
 from dataclasses import dataclass
@@ -29,13 +31,15 @@ from identify.filtering import spline_derivatives
 # remainder of a column is the length of its part that is orthogonal to the pivots.
 DEPENDENT = 1e-8
 LONG_ENOUGH = 1e-3  # smallest remainder of a pivot column, as a fraction of the longest remainder
-# Coefficient that counts as rounding, as a fraction of a group's largest contribution.
+# Coefficient below which a parameter is left out of a group. It is for columns of length one, and
+# the pivot of the group has the coefficient 1.
 NEGLIGIBLE = 1e-7
 MOTIONS = 200  # number of random motions. They excite every parameter that can be excited.
-# Ranges of random positions about home, as shares of the platform's size. The largest range in
-# which the robot reaches all drawn poses is used.
+# Ranges of random positions about home, as fractions of the platform's size, the largest coordinate
+# of its joints. The largest range in which the robot reaches all drawn poses is used.
 REACH_SHARES = (0.03, 0.01, 0.003, 0.001)
-# Range of random angles about home, rad, for the first of REACH_SHARES. It shrinks with the share.
+# Range of random angles about home, rad, for the first of REACH_SHARES. For the others it is
+# smaller in proportion.
 TURN = 0.05
 
 
@@ -45,10 +49,11 @@ class BaseParameters:
 
     names                   Names of the columns, the p dynamic parameters of a robot.
     combinations (rank, p)  Matrix with base parameters = combinations @ parameters.
-    pivots                  Index of the parameter that names each group. It has the coefficient 1.
-    unseen                  Names of the parameters without any effect.
-    gap                     Largest remainder of a dependent column, and smallest remainder of an
-                            independent column.
+    pivots                  Index of the parameter that names each group, in ascending order. In its
+                            group it has the coefficient 1.
+    unseen                  Names of the parameters without any effect on the wrench.
+    gap                     Largest remainder of a dependent column, and smallest remainder of a
+                            pivot column when it was chosen.
     """
 
     names: tuple[str, ...]
@@ -64,7 +69,7 @@ class BaseParameters:
 
     @cached_property
     def rigid_groups(self) -> RigidGroups:
-        """Groups of the inertial parameters.
+        """Groups of the inertial parameters and of the friction of passive joints.
 
         Friction of actuated joints is left out, because it is in no group with other parameters.
         """
@@ -144,9 +149,10 @@ def structure(robot: Robot) -> BaseParameters:
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
     """Return the regression matrix (m * motions, p) of random motions about home.
 
-    Random poses, twists and accelerations excite every parameter that can be excited. Rows are
-    wrenches along the m coordinates that the platform can move in. Raises EstimationError, with the
-    last reason, if no neighbourhood of home is in reach.
+    Random poses, twists and accelerations excite every parameter that can be excited. The rows of a
+    motion are the components of the wrench along the m coordinates in which the platform can move.
+    Raises EstimationError if the robot reaches the drawn poses for none of REACH_SHARES. The
+    message has the reason for the smallest.
     """
     rng = np.random.default_rng(seed)
     chart = robot.geometry.chart
@@ -168,7 +174,7 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
 
 
 def rank_by_singular_values(matrix: Array) -> int:
-    """Return the rank of a regression matrix by the singular values of its scaled columns."""
+    """Return the rank of a regression matrix from singular values, with columns of length one."""
     lengths = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     return int(np.sum(singular > DEPENDENT * singular[0]))
@@ -203,7 +209,10 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
-    """Return the regression matrix H (m n, p) of a reference motion sampled at `rate_hz`."""
+    """Return the regression matrix H (m n, p) of a reference of n frames, sampled at `rate_hz`.
+
+    m: number of coordinates in which the platform can move.
+    """
     acceleration, _ = spline_derivatives(reference.rates, rate_hz)
     twist = robot.twist(reference.poses, reference.rates)
     twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
@@ -212,7 +221,11 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 
 def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
-    """Return the indices of independent columns, and the remainders on both sides of the limit."""
+    """Return the indices of the pivots among columns of length one, and `BaseParameters.gap`.
+
+    preference: number of each column. Of the columns that are long enough, the one with the lowest
+    number becomes the next pivot.
+    """
     remainder = columns.copy()
     smallest = 1.0
     chosen: list[int] = []
@@ -233,17 +246,17 @@ def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[
 
 
 def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:
-    """Return the rank (p,) of each dynamic parameter in the order of pivots."""
+    """Return a number (p,) for each dynamic parameter, the lower the earlier it becomes a pivot."""
     friction, platform, moment, mass = range(4)
     kinds = np.full(len(layout.dynamic_names), friction)
-    places = {body: place for bodies in layout.of_leg for place, body in enumerate(bodies)}
-    last = max(places.values())
+    in_leg = {body: index for bodies in layout.of_leg for index, body in enumerate(bodies)}
+    nearest = max(in_leg.values())
     for body, own in enumerate(layout.body_slices):
         names = [name.split(".")[1] for name in layout.rigid_names[own]]
-        # Masses of bodies near the platform come first.
+        # The last body of a leg is nearest to the platform, and its mass comes first.
         kinds[own] = moment
-        kinds[own.start] = mass + last - places.get(body, last)
-        kinds[own][np.isin(names, FIRST_MOMENTS)] = mass + last + 1
+        kinds[own.start] = mass + nearest - in_leg.get(body, nearest)
+        kinds[own][np.isin(names, FIRST_MOMENTS)] = mass + nearest + 1
     kinds[layout.body_slices[0]] = platform
     return np.asarray(kinds * len(kinds) + np.arange(len(kinds)))
 

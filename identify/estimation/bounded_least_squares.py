@@ -2,8 +2,8 @@
 
 It minimises |r(p)|^2 with the Jacobian J of r. The paper's update (eq. 33, with the residual in
 place of its square) solves the linear problem without limits. Here the step is limited by the
-bounds of the parameters, and by a box that shrinks if the predicted cost was wrong. The box
-prevents stalling near unstable loops.
+bounds of the parameters, and by a box that shrinks if the cost falls much less than predicted. The
+box prevents stalling near unstable loops.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,8 @@ from identify.arrays import Array
 class StopCriteria:
     """Criteria of eq. 35 by which a search stops.
 
-    The tolerances tol1 and tol2 are relative changes of the cost and of the parameters.
+    cost_tolerance, parameter_tolerance: tol1 and tol2, the relative changes of the cost and of the
+    parameters at or below which a search has converged. max_iterations: largest number of steps.
     """
 
     cost_tolerance: float
@@ -32,12 +33,12 @@ class StopCriteria:
 
 
 def relative_change(step: Array, parameters: Array, scale: Array) -> float:
-    """Return max |step_i / p_i| of eq. 35. For a parameter near zero, its scale replaces p_i."""
+    """Return max |step_i / p_i| of eq. 35, where |p_i| counts as at least 1e-3 of its scale."""
     return float(np.max(np.abs(step) / np.maximum(np.abs(parameters), 1e-3 * scale)))
 
 
 def converged(cost: float, new_cost: float, change: float, criteria: StopCriteria) -> str:
-    """Return the reason why a search has converged, or an empty text.
+    """Return the reason why a search has converged, or an empty text if it has not.
 
     cost, new_cost: costs before and after a step. change: `relative_change` by the step.
     """
@@ -52,21 +53,23 @@ def converged(cost: float, new_cost: float, change: float, criteria: StopCriteri
     return ""
 
 
-# Factors by which the radius of the trust region shrinks and grows.
+# After a poor step, the radius of the trust region is SHRINK times the length of this step. After a
+# good step that reached the radius, the radius is multiplied by GROW.
 SHRINK = 0.25
 GROW = 2.0
 
-# Ratios of the gain to the predicted gain. Below POOR the radius shrinks, above GOOD it grows.
+# Ratios of the gain to the predicted gain. Below POOR a step is poor, above GOOD it is good.
 POOR = 0.25
 GOOD = 0.75
 
-SMALLEST_RADIUS = 1e-10
+SMALLEST_RADIUS = 1e-10  # radius below which a failed step ends the search
 AT_BOUND = 1e-12  # distance from a bound that counts as rounding, in scales of the parameter
 
 Linearisation = tuple[float, Array, Array]
 
-# Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain).
-# The step stays within the bounds and within `radius` times the scale.
+# Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain). A
+# gain is a decrease of the cost. The step stays within the bounds and within `radius` times the
+# scale.
 Proposal = Callable[[Array, Array, Array, Array, Array, float], tuple[Array, float]]
 
 
@@ -90,8 +93,9 @@ class Problem(Protocol):
 class Solution:
     """Parameters (p,) found by a search, and the reason why it stopped.
 
-    at_bound (p,): True for parameters at their bounds. costs: cost at the start and after each
-    iteration. evaluations: number of evaluations of the model.
+    at_bound (p,): True for parameters at their lower bounds. costs: cost at the start and after
+    each iteration, which is a step that lowered the cost. evaluations: number of evaluations of the
+    model, failed steps included.
     """
 
     parameters: Array
@@ -119,6 +123,9 @@ def minimise(
 ) -> Solution:
     """Minimise a least-squares problem within bounds.
 
+    The search ends when it has converged, when no step lowers the cost, or after the largest number
+    of iterations.
+
     problem            Problem to minimise.
     start, lower (p,)  Parameters at the start, and their lower bounds.
     scale (p,)         Typical size of a large change of each parameter.
@@ -127,8 +134,10 @@ def minimise(
     ahead              True if the problem can be linearised at a trial step before the step is
                        accepted. This must be False for a problem with a state that follows the
                        accepted steps.
-    upper (p,)         Upper bounds.
+    upper (p,)         Upper bounds. None means no upper bounds.
     propose            Function that chooses a step. The default minimises the linearised cost.
+
+    Raises DynamicsError if the model is unstable at the start.
     """
     if upper is None:
         upper = np.full(len(start), np.inf)
@@ -149,11 +158,11 @@ def minimise(
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         trusted = ratio > POOR
         largest = float(np.abs(step / scale).max())
-        before = radius
+        old_radius = radius
         radius = _new_radius(radius, ratio, largest)
         if ratio > 0:
             # A step limited by the trust region is no evidence of convergence.
-            if largest < 0.9 * before:
+            if largest < 0.9 * old_radius:
                 change = relative_change(step, parameters, scale)
                 reason = converged(cost, new_cost, change, criteria)
             if not reason and len(costs) >= criteria.max_iterations:
@@ -194,7 +203,7 @@ def _box_step(
     scale: Array,
     radius: float,
 ) -> tuple[Array, float]:
-    """Return the minimiser of the linearised cost in the box, and the gain that it predicts."""
+    """Return the step to the minimum of the linearised cost in the box, and the predicted gain."""
     low = np.maximum((lower - parameters) / scale, -radius)
     high = np.minimum((upper - parameters) / scale, radius)
     scaled = factor * scale

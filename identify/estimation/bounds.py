@@ -32,13 +32,14 @@ from dynamics.spatial_inertia import MOMENTS
 from identify.arrays import Array
 from identify.estimation.prior import StartingGuess
 
-# Lower bound of parameters that must be above zero, as a share of the initial guess. Examples are
-# the platform's mass and the integral gain.
+# Lower bound of parameters that must be above zero, as a fraction of the initial guess. Examples
+# are the platform's mass and the integral gain.
 SMALLEST_SHARE = 1e-3
-# Distance of the start of a search from bodies that are flat, as a share of their second moments.
-# The logarithms of a flat body are infinite.
+# Twice the smallest second moment of a full body at the start of a search, as a fraction of the sum
+# of its second moments. The logarithms of a flat body are infinite.
 INSIDE = 1e-3
-# Smallest second moment of a full body, as a share of the sum of those of the initial guess.
+# Smallest second moment of a full body in a search, as a fraction of the sum of the second moments
+# of the initial guess.
 FLATTEST = 1e-4
 # Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz).
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
@@ -59,8 +60,9 @@ class ParameterBounds:
     """Coordinates (p,) of a search, and their lower bounds.
 
     matrix (p, p): parameters = matrix @ coordinates, except for full bodies that must be physically
-    possible. lower (p,): bounds of the coordinates, -inf without a bound. statements: text of each
-    bound in terms of parameters. physical: whether bodies must be physically possible.
+    possible. These have log-Cholesky coordinates. lower (p,): bounds of the coordinates, -inf
+    without a bound. statements: text of each bound in terms of parameters. physical: whether bodies
+    must be physically possible.
     """
 
     layout: ParameterLayout
@@ -70,24 +72,26 @@ class ParameterBounds:
     physical: bool
 
     def nearest(self, parameters: Array) -> Array:
-        """Return parameters (p,) within the bounds.
+        """Return these parameters (p,), moved to within the bounds.
 
-        Negative parameters are raised. Impossible bodies are changed, if possible without an effect
-        on the motion.
+        Parameters below their bounds are raised. With `physical`, impossible bodies are changed, if
+        possible without an effect on the motion, and full bodies that are nearly flat are made
+        thicker.
         """
         allowed = np.maximum(parameters, least_values(self.layout))
         if self.physical:
             bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
             allowed[self.layout.inertial] = self.layout.rigid_of(bodies)
             for own in self.log_cholesky:
-                second = allowed[own][4:7].sum() / 2
-                allowed[own] = nearest_body(allowed[own], INSIDE * second)
+                second_moments = allowed[own][4:7].sum() / 2
+                allowed[own] = nearest_body(allowed[own], INSIDE * second_moments)
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
     def outside(self, parameters: Array) -> NDArray[np.bool_]:
         """Return a mask (p,) of the parameters that are beyond a bound.
 
-        All moments of a body that cannot exist are marked, because each of them can be the cause.
+        If no rigid body can have the moments of a body, all three are marked, because each of them
+        can be the cause. Of a full body that cannot exist, all ten parameters are marked.
         """
         beyond = self.linear_coordinates(parameters) < self.linear_lower
         marked = np.asarray((self.matrix != 0) | np.eye(len(beyond), dtype=bool)) @ beyond
@@ -119,9 +123,9 @@ class ParameterBounds:
         return found
 
     def spread(self, coordinates: Array, std: Array) -> Array:
-        """Return the size (p,) of a change of each coordinate, at coordinates (p,).
+        """Return a typical change (p,) of each coordinate, at coordinates (p,).
 
-        std (p,): size of a change of each parameter.
+        std (p,): typical change of each parameter.
         """
         return np.asarray(np.abs(np.linalg.inv(self.slope(coordinates))) @ std, dtype=float)
 
@@ -156,7 +160,8 @@ class ParameterBounds:
     def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
         """Return the part (p,) of a cost's gradient (p,) that active bounds balance.
 
-        at_bound (p,): True for coordinates at their bounds.
+        Both are with respect to the parameters. If any coordinate of a full body is at its bound,
+        the part is the body's whole gradient. at_bound (p,): True for coordinates at their bounds.
         """
         multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
         found = np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
@@ -168,14 +173,14 @@ class ParameterBounds:
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     """Return the bounds of all parameters.
 
-    With `physical` they allow only masses and inertias that a rigid body can have.
+    With `physical`, the bounds allow only masses and inertias that a rigid body can have.
     """
     layout = guess.layout
     names = guess.layout.names
     matrix = np.eye(len(names))
     lower = least_values(layout)
-    for place in (names.index(name) for name in guess.above_zero):
-        lower[place] = SMALLEST_SHARE * guess.values[place]
+    for index in (names.index(name) for name in guess.above_zero):
+        lower[index] = SMALLEST_SHARE * guess.values[index]
     lower[guess.fixed] = -1.0  # the prior fixes them at zero, so their bounds must not be active
     if physical:
         lower[layout.inertial] = np.maximum(lower[layout.inertial], SMALLEST)
@@ -184,11 +189,12 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
     for body, own, full in zip(layout.bodies, layout.body_slices, layout.full, strict=True):
         if full and physical:
-            flat = slice(own.start + 1, own.start + 4)
-            second = guess.values[own][4:7].sum() / 2
-            # With the mass m, m exp(2 d) is the second moment along an axis of the Cholesky factor.
-            lower[flat] = np.log(max(FLATTEST * second / guess.values[own.start], SMALLEST)) / 2
-            statements[flat] = 3 * [f"pseudo-inertia of {body} > 0"]
+            # With the mass m and the coordinate d of an axis of the Cholesky factor, the second
+            # moment along this axis is m exp(2 d).
+            axes = slice(own.start + 1, own.start + 4)
+            second = guess.values[own][4:7].sum() / 2  # sum of the second moments
+            lower[axes] = np.log(max(FLATTEST * second / guess.values[own.start], SMALLEST)) / 2
+            statements[axes] = 3 * [f"pseudo-inertia of {body} > 0"]
     centred = [body for body, full in zip(layout.bodies, layout.full, strict=True) if not full]
     for body in centred if physical else ():
         first = names.index(f"{body}.Ixx")

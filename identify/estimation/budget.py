@@ -98,15 +98,17 @@ class Budget:
 
     @property
     def shares(self) -> Array:
-        """Shares (q, s) of the variances. They are zero for a quantity without uncertainty."""
+        """Fractions (q, s) of each quantity's variance, zero for a quantity without uncertainty."""
         total = self.variances.sum(axis=1, keepdims=True)
         return np.divide(self.variances, total, out=np.zeros_like(self.variances), where=total > 0)
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the table, with a row for each source of each quantity, the largest first.
 
-        The column `added` is the standard uncertainty that the source adds. It is negative in the
-        row of covariances if these make the quantity better known.
+        Sources that add nothing are left out. The column `added` is the standard uncertainty that
+        the source adds, and `share` its fraction of the variance. Both are negative in the row of
+        covariances if these make the quantity better known. `combined` and `expanded` are the
+        uncertainties of the quantity from all sources.
         """
         import pandas as pd
 
@@ -147,12 +149,12 @@ def budget_of(
 ) -> Budget:
     """Return the budget of q quantities from the parts (q,) of their variances, by source.
 
-    total (q,): variances of the quantities. Their excess over the sum of the parts is the effect of
-    covariances between sources.
+    total (q,): variances of the quantities. Their excess over the sum of the parts, if it is more
+    than rounding, becomes the part of covariances between sources.
     """
-    rest = total - np.asarray(sum(parts.values()))
-    if np.any(np.abs(rest) > ROUNDING * total):
-        parts = {**parts, CORRELATED: rest}
+    excess = total - np.asarray(sum(parts.values()))
+    if np.any(np.abs(excess) > ROUNDING * total):
+        parts = {**parts, CORRELATED: excess}
     variances = np.stack([np.asarray(part, dtype=float) for part in parts.values()], axis=1)
     return Budget(tuple(quantities), tuple(units), tuple(parts), variances)
 
@@ -160,9 +162,10 @@ def budget_of(
 def parameter_budget(
     layout: ParameterLayout, covariance: Array, sources: Mapping[str, Array]
 ) -> Budget:
-    """Return the budget of a robot's parameters.
+    """Return the budget of a robot's p parameters.
 
-    The first p rows of the covariance and of its parts by source are those of the parameters.
+    The first p rows and columns of the covariance and of its parts by source are those of the
+    parameters. Further ones are left out.
     """
     names = layout.names
     parts = {key: np.diag(part)[: len(names)] for key, part in sources.items()}
@@ -171,7 +174,10 @@ def parameter_budget(
 
 
 def together(budgets: Sequence[Budget]) -> Budget:
-    """Return one budget with the quantities and the sources of all budgets."""
+    """Return one budget with the quantities and the sources of all budgets.
+
+    A source that a budget lacks adds nothing to the quantities of this budget.
+    """
     sources = [key for key in SOURCES if any(key in one.sources for one in budgets)]
     rows = [
         np.stack(

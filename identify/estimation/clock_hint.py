@@ -1,6 +1,6 @@
 """Hint that the commands of a record have a clock of their own, which the record does not state.
 
-If the model does not explain a timed record, the record is identified again with such a clock.
+If the model does not explain timed records, the search is repeated with such clocks.
 """
 
 from dataclasses import replace
@@ -18,16 +18,18 @@ from identify.progress import SilentProgress
 from identify.record.stored_common_errors import CLOCK_OFFSET
 
 TRIED_S = 0.03
-"""Standard deviation, s, of the clock that is tried."""
+"""Prior standard deviation, s, of the offset of the clock that is tried."""
 
 EXPLAINS = 0.3
-"""Share of the mean squared residual that a clock must explain before a hint is given."""
+"""Fraction of the mean squared residual below which the clocks explain too little for a hint."""
 
 
 def clock_hints(problem: OutputErrorProblem, warm: Array, misfit: float) -> tuple[str, ...]:
-    """Return a hint for each timed record whose misfit a separate clock of its commands explains.
+    """Return a hint for each timed record that states no clock of its commands.
 
-    warm (p,): parameters from which the search began. misfit: mean squared whitened residual.
+    There are no hints unless such clocks, tried for all these records together, explain enough of
+    the misfit. warm (p,): parameters from which the search began. misfit: mean squared whitened
+    residual of all records without these clocks.
     """
     unstated = [_lacks_clock(run) for run in problem.runs]
     if not any(unstated):

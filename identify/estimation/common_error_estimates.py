@@ -2,9 +2,10 @@
 
 They are a by-product of the identification, a self-calibration. Let r = model - measured be the
 residuals in standard deviations of the noise, and J their Jacobian with respect to the parameters.
-The modes M are their changes by one prior standard deviation of each common error. The parameters p
-and the errors z, with prior variance one, minimise |r + J dp + M z|^2 + |z|^2 plus the prior of p.
-The search for the parameters eliminates z. At its optimum z = -(1 + M^T M)^-1 M^T r.
+The modes M are the changes of r by one prior standard deviation of each common error. The change dp
+of the parameters and the errors z, with prior variance one, minimise |r + J dp + M z|^2 + |z|^2
+plus the prior of the parameters. The search for the parameters eliminates z. With the residuals r
+at its optimum, z = -(1 + M^T M)^-1 M^T r.
 """
 
 from collections.abc import Sequence
@@ -51,8 +52,8 @@ def errors_of_run(run: LoopModel, parameters: Array) -> Array:
     The run is one returned by `with_common_errors`. The errors are in prior standard deviations.
     """
     assert run.marginal is not None
-    missed = run.noise_residuals(parameters).ravel()
-    return errors_from_residuals(run.marginal.modes, missed)
+    residuals = run.noise_residuals(parameters).ravel()
+    return errors_from_residuals(run.marginal.modes, residuals)
 
 
 def errors_from_residuals(modes: Array, missed: Array) -> Array:
@@ -67,8 +68,9 @@ def errors_from_residuals(modes: Array, missed: Array) -> Array:
 def errors_in_models(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
     """Return the most likely errors (k,) of poses, loop and bodies for each run of a problem.
 
-    The problem is one returned by `with_common_errors`. Errors of the geometry are left out,
-    because no model contains them (see `LoopModel.errors_had`).
+    The problem is one returned by `with_common_errors`. A run without common errors has an empty
+    array. Errors of the geometry are left out, because no model contains them (see
+    `LoopModel.errors_had`).
     """
     found = []
     for run in problem.runs:
@@ -81,8 +83,8 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
     """Return the runs that need random numbers for common errors, and a matrix for all runs.
 
     Records that state the same errors with the same covariance share one set of numbers. Only the
-    errors of its clock and start are each record's own. The matrix (k, d) maps the standard normal
-    numbers (d,) of the returned runs to those (k,) of all runs, in the order of the records.
+    errors of a clock or of a start belong to a single record. The matrix (k, d) maps the standard
+    normal numbers (d,) of the returned runs to those (k,) of all runs, in the order of the records.
     """
     holders = [
         next(first for first in runs if first is run or run.common.known_as(first.common))
@@ -94,35 +96,34 @@ def shared_draws(runs: Sequence[LoopModel]) -> tuple[list[LoopModel], Array]:
         if holder is run or run.common.of_record.any()
     ]
 
-    def made_of(run: LoopModel, holder: LoopModel, drawn: LoopModel) -> Array:
+    def block(run: LoopModel, holder: LoopModel, drawn: LoopModel) -> Array:
         own, other = (one.whitened_modes.shape[2] for one in (run, drawn))
         matrix = np.zeros((own, other))
         if not own:
             return matrix
-        alone = run.common.of_record
+        of_record = run.common.of_record
         if drawn is run:
-            matrix[alone, alone] = 1.0
+            matrix[of_record, of_record] = 1.0
         if drawn is holder:
             # The errors are the same, but each run has its own factor of their covariance.
-            rows, columns = ~alone, ~drawn.common.of_record
+            rows, columns = ~of_record, ~drawn.common.of_record
             factor = np.eye(int(rows.sum()))
             if run is not holder:
-                mine = run.common.whole_factor[np.ix_(rows, rows)]
-                theirs = holder.common.whole_factor[np.ix_(columns, columns)]
-                factor = np.linalg.pinv(mine) @ theirs
+                own_factor = run.common.whole_factor[np.ix_(rows, rows)]
+                holder_factor = holder.common.whole_factor[np.ix_(columns, columns)]
+                factor = np.linalg.pinv(own_factor) @ holder_factor
             matrix[np.ix_(rows, columns)] = factor
         return matrix
 
     pairs = zip(runs, holders, strict=True)
-    return drawing, np.vstack(
-        [np.hstack([made_of(*pair, one) for one in drawing]) for pair in pairs]
-    )
+    return drawing, np.vstack([np.hstack([block(*pair, one) for one in drawing]) for pair in pairs])
 
 
 def covariance_by_kind(runs: Sequence[LoopModel], moved: Array) -> dict[str, Array]:
     """Return the covariance (q, q) of estimates due to each kind of common errors.
 
-    moved (q, k): change of the estimate by each standard normal number of `shared_draws`.
+    runs: the runs that `shared_draws` returns. moved (q, k): change of the estimate by each of
+    their standard normal numbers.
     """
     of_common: dict[str, Array] = {}
     for run in runs:
@@ -137,8 +138,9 @@ def common_error_estimates(
 ) -> list[CommonErrorEstimates]:
     """Return the estimated common errors of each record of a problem `with_common_errors`.
 
-    parameters (p,): the optimum. whole (p + k, p + k): covariance of the parameters and of the
-    common errors, in prior standard deviations of the errors.
+    A record without common errors has empty estimates. parameters (p,): the optimum. whole
+    (p + k, p + k): covariance of the parameters and of the common errors of all records, in prior
+    standard deviations of the errors.
     """
     count = len(parameters)
     found = []
@@ -166,8 +168,8 @@ def common_error_estimates(
 def with_first_errors(problem: OutputErrorProblem, whole: Array) -> Array:
     """Return the covariance (p + k, p + k) of the parameters and of the first record's errors.
 
-    whole: covariance of the parameters and of the common errors of all records, in prior standard
-    deviations of the errors.
+    The errors are in their own units. whole: covariance of the parameters and of the common errors
+    of all records, in prior standard deviations of the errors.
     """
     count = len(problem.guess.values)
     first = problem.runs[0]

@@ -14,41 +14,44 @@ import numpy as np
 from identify.arrays import Array
 from identify.estimation.result import IdentificationResult
 
-# Largest ratio of a parameter's relative standard deviation without the factor to that with it.
+# Largest ratio of a parameter's relative standard deviation without the factor to that with it, at
+# which the parameter counts as sharing the factor.
 SHARED = 0.5
 ENTRY = "common_scale"  # name of the entry of an identification in result.json
 
 
 def common_scale(result: IdentificationResult) -> dict[str, Any] | None:
-    """Return the entry of the common scale for JSON, or None if no gain shows it.
+    """Return the entry of the common scale for JSON.
 
     The entry has the gain, the relative standard deviation of the scale, and for each identified
-    parameter that shares it the relative standard deviation that is left without the scale.
+    parameter that shares the scale the relative standard deviation that is left without it. None is
+    returned if the law of the drives did not act, the gain is not identified, or no parameter
+    shares the scale.
     """
     gain = result.layout.joint_pid.start
     if not (result.drive.in_loop and result.identifiable[gain]):
         return None
     shown = np.flatnonzero(result.identifiable & (result.estimate != 0))
     own, without = deviations(result.estimate, result.covariance, gain)
-    sharing = [place for place in shown if place != gain and without[place] <= SHARED * own[place]]
+    sharing = [index for index in shown if index != gain and without[index] <= SHARED * own[index]]
     if not sharing:
         return None
     return {
         "gain": result.names[gain],
         "std": float(own[gain]),
-        "shared": {result.names[place]: float(without[place]) for place in sharing},
+        "shared": {result.names[index]: float(without[index]) for index in sharing},
     }
 
 
 def deviations(estimate: Array, covariance: Array, gain: int) -> tuple[Array, Array]:
     """Return relative standard deviations (p,) of parameters, and those of their ratios to a gain.
 
-    estimate (p,), covariance (p, p). To first order, the ratio a / g has the relative variance
-    var(a) / a^2 + var(g) / g^2 - 2 cov(a, g) / (a g). Entries of parameters that are zero are
-    infinite.
+    estimate (p,), covariance (p, p): parameters and their covariance. gain: index of the gain. To
+    first order, the ratio a / g has the relative variance var(a) / a^2 + var(g) / g^2 -
+    2 cov(a, g) / (a g). Entries of parameters that are zero are infinite.
     """
-    size = np.where(estimate == 0, np.nan, estimate)
-    relative = covariance / np.outer(size, size)
+    nonzero = np.where(estimate == 0, np.nan, estimate)
+    relative = covariance / np.outer(nonzero, nonzero)
     own = np.diag(relative)
     ratio = np.maximum(own + own[gain] - 2 * relative[gain], 0.0)
     stds = np.nan_to_num(np.sqrt([own, ratio]), nan=np.inf)
@@ -56,10 +59,11 @@ def deviations(estimate: Array, covariance: Array, gain: int) -> tuple[Array, Ar
 
 
 def found_errors(identification: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Return the relative error of the common scale, and the largest one without it.
+    """Return the relative error of the common scale, and the largest one that is left without it.
 
-    Both are errors against the truth, the second of the parameters that share the scale. None
-    without a common scale or without the truth.
+    Both are errors against the truth. The second is that of the parameters that share the scale,
+    in size. None is returned if there is no common scale, or if a true value or an estimate is zero
+    or unknown.
     """
     scale = identification.get(ENTRY)
     if scale is None:

@@ -30,8 +30,9 @@ class Conditioning:
     with_guess           Condition number with the initial guess.
     poses_alone          Condition number of the poses alone, infinite if rounding hides the
                          smallest eigenvalue.
-    directions, unshown  Number of directions of base parameters and gains, and number of directions
-                         that the guess determines better than the poses.
+    directions, unshown  Number of directions of base parameters and gains, without that of the
+                         common factor, and number of those that the guess determines better than
+                         the poses.
     """
 
     with_guess: float
@@ -41,7 +42,7 @@ class Conditioning:
 
     @property
     def poor(self) -> bool:
-        """True if rounding affects the information about the least known direction."""
+        """True if rounding affects the poses' information about the least known direction."""
         return self.poses_alone > POOR
 
     def warnings(self) -> tuple[str, ...]:
@@ -76,12 +77,13 @@ def conditioning(
     gains = count + np.flatnonzero(np.diag(information)[count:])
     seen = np.concatenate([base.pivots, gains])
     group_std = np.sqrt(base.combinations**2 @ guess.std[:count] ** 2)
-    size = np.concatenate([group_std, guess.std[gains]])
+    prior_std = np.concatenate([group_std, guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # A base parameter has the information of its pivot, because it acts in the same way.
-    scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
-    # The direction of the common factor is the direction of the values. It is removed.
-    free = null_space((values / size)[None])
+    # The motion depends on a base parameter as it does on its pivot, so both have the same
+    # information.
+    scaled = information[np.ix_(seen, seen)] * np.outer(prior_std, prior_std)
+    # The common factor changes all values in proportion. This direction is removed.
+    free = null_space((values / prior_std)[None])
     shown = np.linalg.eigvalsh(free.T @ scaled @ free)
     smallest = float(shown[0])
     alone = float(shown[-1]) / smallest if smallest > 0 else np.inf

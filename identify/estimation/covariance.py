@@ -8,8 +8,9 @@ makes the response nonlinear. Therefore the experiment is repeated on the identi
 random noise. Each repetition gives residuals r. With their Jacobian J with respect to the
 parameters, the scores J^T r have the same covariance as those of the real record. With W the
 information of data and prior, the covariance of the estimate is W^-1 (cov(J^T r) + prior
-information) W^-1. The prior information contains that of the initial guess. The part of the
-covariance due to the guess is the effect of its errors, which are the same in every record.
+information) W^-1. The prior information is that of the initial guess and of the scale anchor. The
+part of the covariance due to the guess is the effect of errors of the guess, which are the same in
+every record.
 
 A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. If a
 model misses the record by more than noise explains, the effect of its error on the scores is added
@@ -57,7 +58,7 @@ a known load, errors of the initial guess, and error of the scale anchor.
 CORRELATED = "correlated"
 """Part due to prior covariances between kinds of common errors."""
 ROUNDING = 1e-9
-"""Largest difference of variances that counts as rounding, as a share of the variance."""
+"""Largest difference of variances that counts as rounding, as a fraction of the variance."""
 
 DRAWS = 100
 """Number of repetitions. They determine a standard deviation to 7 %."""
@@ -73,11 +74,11 @@ class Uncertainty:
     whole (p + k, p + k)    Covariance of the estimate and the k common errors. The common errors
                             follow record by record, in units of their prior standard deviations.
     sources (p + k, p + k)  Parts of `whole` by source of the uncertainty: NOISE, MODEL, LOAD,
-                            GUESS, ANCHOR, the kinds of common errors, and CORRELATED. Their sum is
-                            `whole`.
+                            GUESS, ANCHOR, the kinds of common errors, and CORRELATED. Parts that do
+                            not occur are left out. Up to rounding, their sum is `whole`.
     information (p, p)      Information of the poses alone.
-    gradient (p,)           Gradient J^T r of poses and prior at the estimate.
-    misfit                  Misfit of the record.
+    gradient (p,)           J^T r of poses and prior at the estimate, half the gradient of the cost.
+    misfit                  Misfit of all records together.
     unstable                Number of unstable repetitions, which were left out.
     """
 
@@ -129,9 +130,11 @@ def estimate_uncertainty(
     rng: np.random.Generator,
     advance: Advance = lambda n=1: None,
 ) -> Uncertainty:
-    """Return the uncertainty of an estimate (p,), from DRAWS repeated experiments.
+    """Return the uncertainty of an estimate (p,).
 
-    Raises EstimationError if too many of them are unstable.
+    problem: problem whose residuals are whitened for common errors at the estimate. If a model
+    closes its own loop, and its error does not dominate the residuals, the effect of noise comes
+    from DRAWS repeated experiments. Raises the EstimationError of `_noise`.
     """
     runs = problem.runs
     size = len(parameters)
@@ -143,10 +146,10 @@ def estimate_uncertainty(
     known, known_rows = problem.known(parameters)
     gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in whitened)
     information = np.asarray(sum(_information(j) for _, j in whitened))
-    whole = linear[0].rows.shape[2]
-    firsts, drawn = shared_draws(runs)
-    all_known = block_diag(known_rows, np.eye(whole - size))
-    units = _units([all_known, *(one.rows.reshape(-1, whole) for one in linear)])
+    unknowns = linear[0].rows.shape[2]
+    drawing, drawn = shared_draws(runs)
+    all_known = block_diag(known_rows, np.eye(unknowns - size))
+    units = _units([all_known, *(one.rows.reshape(-1, unknowns) for one in linear)])
     shown = [replace(one, rows=one.rows @ units) for one in linear]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     by_scores = {NOISE: scores}
@@ -158,11 +161,11 @@ def estimate_uncertainty(
         )
         by_scores[MODEL] = np.asarray(misfit.share_of_model * model)
     if any(run.payload_errors.any() for run in runs):
-        moved = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
-        by_scores[LOAD] = load_score_covariance(runs, moved)
+        by_load = [np.tensordot(one.rows, one.slopes, ((0, 1), (0, 1))) for one in shown]
+        by_scores[LOAD] = load_score_covariance(runs, by_load)
     scores = np.sum(list(by_scores.values()), axis=0)
-    beforehand = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
-    covariance = units @ (scores + beforehand) @ units.T
+    prior = _information(known_rows @ units[:size]) + _information(drawn.T @ units[size:])
+    covariance = units @ (scores + prior) @ units.T
     # This removes asymmetry due to rounding.
     covariance = (covariance + covariance.T) / 2
     sources = {kind: units @ part @ units.T for kind, part in by_scores.items()}
@@ -170,10 +173,10 @@ def estimate_uncertainty(
     for kind, rows in ((GUESS, guessed), (ANCHOR, anchored)):
         if len(rows):
             sources[kind] = _information(rows @ units[:size] @ units.T)
-    sources |= covariance_by_kind(firsts, units @ units[size:].T @ drawn)
-    rest = covariance - sum(sources.values())
-    if (np.abs(np.diag(rest)) > ROUNDING * np.diag(covariance)).any():
-        sources[CORRELATED] = rest
+    sources |= covariance_by_kind(drawing, units @ units[size:].T @ drawn)
+    remainder = covariance - sum(sources.values())
+    if (np.abs(np.diag(remainder)) > ROUNDING * np.diag(covariance)).any():
+        sources[CORRELATED] = remainder
     return Uncertainty(
         covariance,
         sources,
@@ -223,21 +226,21 @@ def _linearised(runs: Sequence[LoopModel], parameters: Array) -> list[_Linear]:
 
 
 def load_score_covariance(runs: Sequence[LoopModel], information: Sequence[Array]) -> Array:
-    """Return the covariance (q, q) of the scores T^T J^T r due to errors of the loads.
+    """Return the first-order covariance (q, q) of the scores T^T J^T r due to errors of the loads.
 
-    It is of first order. information: T^T J^T J (q, p) of each run, with the Jacobian J of its
-    residuals, and the units T of the scores (see `_units`). Runs that state the same load with the
-    same standard deviations share its error. Errors of different loads are independent.
+    information: T^T J^T J (q, p) of each run, with the Jacobian J of its residuals, and the units T
+    of the scores (see `_units`). Runs that state the same load with the same standard deviations
+    share its error. Errors of different loads are independent.
     """
     shown: dict[tuple[float, ...], Array] = {}
     for run, one in zip(runs, information, strict=True):
         load = (*run.payload, *run.payload_errors.ravel())
         shown[load] = shown.get(load, np.zeros_like(one)) + one
-    spread = [
+    by_errors = [
         total @ np.array(load[total.shape[1] :]).reshape(total.shape[1], -1)
         for load, total in shown.items()
     ]
-    return np.asarray(sum(one @ one.T for one in spread), dtype=float)
+    return np.asarray(sum(one @ one.T for one in by_errors), dtype=float)
 
 
 def _units(rows: list[Array]) -> Array:
@@ -267,9 +270,10 @@ def _noise(
     """Return the covariance (q, q) of the scores due to noise, and the misfit.
 
     The third result is the number of unstable repetitions. found: linearisation of each run, with
-    rows in the units of the scores. No experiment is repeated if the residuals are white. If the
-    model's error causes most of the residuals, only a few are. If the servo of such a model is
-    unstable with noise, the residuals of noise alone count as white.
+    rows in the units of the scores. No experiment is repeated if logged commands drive all models,
+    because the residuals of noise alone are then white. They also count as white if the model's
+    error causes most of the residuals of LANES repetitions, or if the residuals are large and fewer
+    than FEWEST repetitions are stable. If they are not large, the latter raises EstimationError.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))
@@ -320,8 +324,8 @@ def _repeated(
 ) -> list[tuple[Array, float]]:
     """Return residuals (n, 6) and mean squared residual of each stable repeated experiment.
 
-    The residuals are for noise alone. The mean square is for noise and common errors. There is one
-    experiment for each generator.
+    The residuals are those of noise alone. The mean square is that of noise and random common
+    errors, whitened for both. There is one experiment for each generator.
     """
 
     def judged(
@@ -373,7 +377,7 @@ def correlation_matrix(covariance: Array) -> Array:
 
 
 def strongest_pairs(correlations: Array, names: Sequence[str], count: int) -> list[dict[str, Any]]:
-    """Return the `count` pairs with the largest correlations (n, n) in size, the largest first.
+    """Return the `count` pairs with the largest absolute correlations (n, n), the largest first.
 
     Each pair has the entries first, second and correlation.
     """

@@ -1,6 +1,6 @@
-"""Choice of the law of the drives, by the evidence of a record for each known law.
+"""Choice of the law of the drives, by the evidence of a record for each law that is considered.
 
-Each law is a separate model. Its optimum of the output error is searched from a warm start, with
+Each law is a separate model. The optimum of its output error is searched from a warm start, with
 the logged commands as input, so that the residuals are white. The evidence is the probability of
 the record, integrated over all parameters with their prior. Near the optimum the cost is
 quadratic. By Laplace's method
@@ -34,7 +34,9 @@ SURE = 0.95  # smallest probability with which a law counts as certain
 # Number of iterations of the first search for every law. After these, laws that fit the record are
 # near their optimum. Other laws could need many more.
 FIRST = 4
-HOPELESS = 10.0  # factor of the best cost above which the search for a law is not continued
+# Ratio to the lowest cost above which the search for a law is not continued. Such a law gets the
+# probability zero.
+HOPELESS = 10.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ def choose_drive(
     """Return the law that a model names or, if it leaves the law open, the most probable law.
 
     problem_of: function that returns the output-error problem under a law. in_loop: False if no law
-    acted in the record. Raises EstimationError if the model is unstable under all laws.
+    acted in the record. The law is then the one that the model names, or else the paper's. Raises
+    EstimationError if the model is unstable under all laws.
     """
     law = model.drive_law
     if not in_loop:
@@ -111,14 +114,14 @@ def choose_drive(
                 f"the model is unstable under every law of the drives: {'; '.join(failed)}"
             )
         limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
-        found = {
+        evidences = {
             law: evidence(_searched(problem_of(law), one.solution.parameters))
             for law, one in first.items()
             if one.solution.costs[-1] <= limit
         }
         # Laws that were left out count as finished.
         advance(len(laws))
-    return DriveChoice(*_weighed(found, laws))
+    return DriveChoice(*_weighed(evidences, laws))
 
 
 def _searched(problem: OutputErrorProblem, start: Array) -> Search:
@@ -135,7 +138,7 @@ class Evidence:
     """Evidence of a record for a law.
 
     cost: cost at the optimum. misfit: cost of the poses alone, divided by the number of their
-    components. narrowed: ln det W - ln det P.
+    components. narrowed: ln det W - ln det P, see the module docstring.
     """
 
     cost: float
@@ -144,13 +147,16 @@ class Evidence:
 
 
 def evidence(found: Search) -> Evidence:
-    """Return the evidence for the law of a finished search. Raises LoopFailure."""
+    """Return the evidence for the law of a finished search.
+
+    Raises LoopFailure if the model is unstable at the optimum.
+    """
     parameters = found.solution.parameters
     judged = found.linearised()
     cost, factor, _ = judged.linearise(parameters)
     known, _ = judged.known(parameters)
     poses = 6 * sum(int(np.count_nonzero(run.ok)) for run in judged.runs)
-    of_prior = np.linalg.slogdet(judged.known_information())[1]
+    of_prior = np.linalg.slogdet(judged.known_information())[1]  # ln det P
     narrowed = 2 * np.log(np.abs(np.diag(factor))).sum() - of_prior
     return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
 
@@ -160,7 +166,8 @@ def _weighed(
 ) -> tuple[DriveName, dict[str, float]]:
     """Return the most probable law, and the probability of each.
 
-    A law without a stable model has the probability zero.
+    A law without an entry in `found` has the probability zero. Its model is unstable, or its cost
+    is too high.
     """
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}

@@ -19,7 +19,7 @@ are the sensor's noise, independent from frame to frame. The portmanteau test of
 checks their autocorrelations r_k in n frames: n (n + 2) sum_k r_k² / (n - k) over the lags
 k = 1 ... L is chi-square distributed with L degrees of freedom. A model that closes its own loop
 cannot follow the effect of the noise on the plant. Its residuals are coloured even if it is right,
-and are not tested.
+so they are not tested for whiteness.
 """
 
 from collections.abc import Sequence
@@ -45,13 +45,13 @@ NOISE_DECIDES = 3.0
 """Ratio of the residual to its expected value above which the model's error dominates."""
 
 REACH = 0.2
-"""Lag from which residuals are assumed independent, as a share of a record's length.
+"""Lag from which residuals are assumed independent, as a fraction of a record's length.
 
 Up to this lag, a window reduces the correlations gradually to zero.
 """
 
 MISFIT = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
-"""Entries of a result that hold a `Misfit`, in its order."""
+"""Entries of a result that hold the fields of a `Misfit`, in the same order."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,10 @@ class Misfit:
 
     @property
     def share_of_model(self) -> float:
-        """Share of the model's error in the residual's variance. Zero if not significant."""
+        """Fraction of the mean squared residual that is above its expected value for noise alone.
+
+        It is zero if the excess is not significant.
+        """
         return 1 - self.expected / self.found if self.significant else 0.0
 
     @property
@@ -117,7 +120,7 @@ def misfit_of_white(residuals: Array) -> Misfit:
 
 
 def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
-    """Return the covariance (p, p) of J^T r for residuals with their estimated autocorrelation.
+    """Return the covariance (p, p) of J^T r from the autocorrelation of given residuals r.
 
     residuals (n, 6), jacobian (n, 6, p): rows of the good frames. ok (N,): marks of the good
     frames. Lost frames have no residual, and add nothing.
@@ -126,7 +129,10 @@ def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.
 
 
 def spectral_density(residuals: Array, ok: NDArray[np.bool_]) -> Array:
-    """Return the spectral density (f, 6, 6) of residuals (n, 6) of the good frames, `ok` (N,)."""
+    """Return the spectral density (f, 6, 6) of residuals (n, 6) of the good frames, `ok` (N,).
+
+    f: number of frequencies of a real transform of the zero-padded frames.
+    """
     count = len(ok)
     rows = np.zeros((count, 6))
     rows[ok] = residuals
@@ -137,8 +143,8 @@ def spectral_density(residuals: Array, ok: NDArray[np.bool_]) -> Array:
     )
     lags = np.minimum(np.arange(length), length - np.arange(length))
     # A triangular window makes the sum positive semidefinite.
-    fading = np.maximum(1 - lags / (REACH * count), 0.0)
-    return np.asarray(rfft(correlations * fading[:, None, None], axis=0))
+    window = np.maximum(1 - lags / (REACH * count), 0.0)
+    return np.asarray(rfft(correlations * window[:, None, None], axis=0))
 
 
 def score_covariance(density: Array, jacobian: Array, ok: NDArray[np.bool_]) -> Array:
@@ -146,11 +152,11 @@ def score_covariance(density: Array, jacobian: Array, ok: NDArray[np.bool_]) -> 
     slopes = np.zeros((len(ok), *jacobian.shape[1:]))
     slopes[ok] = jacobian
     length = _padded(len(ok))
-    seen = rfft(slopes, length, axis=0)
-    weighted = np.einsum("fij,fjb->fib", density, seen)
-    # Doubling accounts for the negative frequencies, which zero and Nyquist do not have.
+    spectrum = rfft(slopes, length, axis=0)
+    weighted = np.einsum("fij,fjb->fib", density, spectrum)
+    # Doubling accounts for the negative frequencies. Zero and the Nyquist frequency have none.
     weighted[1 : (length + 1) // 2] *= 2
-    total = np.tensordot(seen.conj(), weighted, axes=([0, 1], [0, 1])).real / length
+    total = np.tensordot(spectrum.conj(), weighted, axes=([0, 1], [0, 1])).real / length
     return np.asarray((total + total.T) / 2, dtype=float)
 
 
@@ -226,17 +232,17 @@ def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whit
     return Whiteness(correlations, np.asarray(chdtrc(lags, statistics)), together)
 
 
-# Largest excess of the residual, as a share of the noise, that needs no cause. The residual is that
-# of the model under the logged commands. Errors of the teaching can make such an excess if the
-# teaching counts as exact, as in a log that cannot state them.
+# Largest excess of the mean squared residual, as a fraction of its expected value, that needs no
+# cause. The residual is that of the model under the logged commands. Errors of the teaching can
+# cause such an excess if the teaching counts as exact, as in a log that cannot state these errors.
 LITTLE = 0.1
 
 
 def needs_cause(misfit: Misfit, driven_misfit: Misfit, suspicious: bool) -> bool:
     """Return whether a model misses its record by so much that a cause is worth asking for.
 
-    driven_misfit: misfit under the logged commands. suspicious: whether its residuals are not
-    white.
+    driven_misfit: misfit under the logged commands. suspicious: True if the residuals under the
+    logged commands are not white.
     """
     excess = driven_misfit.found - (1 + LITTLE) * driven_misfit.expected
     return misfit.significant or suspicious or excess > 0
@@ -256,7 +262,10 @@ class Explanation:
 
     @property
     def hidden(self) -> bool:
-        """True if an error dominates under the logged commands, but not in the closed loop."""
+        """True if the model's error dominates under the logged commands, but not in the estimate.
+
+        This can happen if the estimate is for the closed loop.
+        """
         return self.driven_misfit.decides and not self.misfit.decides
 
     @property
@@ -275,10 +284,10 @@ class Explanation:
 def explanation(
     driven: OutputErrorProblem, parameters: Array, misfit: Misfit, rng: np.random.Generator
 ) -> Explanation:
-    """Judge a model from the command-driven problem at its own optimum (p,).
+    """Judge a model by the command-driven problem at its own optimal parameters (p,).
 
-    misfit: misfit of the estimate. rng: generator for `white_residuals`. Raises EstimationError
-    with too few good frames.
+    misfit: misfit of the estimate. rng: generator for `white_residuals`. Raises EstimationError if
+    there are too few good frames for `whiteness`.
     """
     residuals, ok = _residuals(driven, parameters, rng)
     return Explanation(misfit, misfit_of_white(residuals[ok]), whiteness(residuals, ok))
@@ -298,9 +307,9 @@ def by_frames(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return residuals (N, 6) of several records one after the other, and the good frames (N,).
 
-    residuals: residuals (n, 6) of each record at its good frames. frames: marks of these frames. In
-    the result, residuals of lost poses are NaN. Between two records there is a gap as long as the
-    largest lag of the test for whiteness.
+    residuals: residuals (n, 6) of each record at its good frames. frames: marks of the good frames
+    of each record. In the result, residuals of lost poses are NaN. After each record, as many lost
+    poses are inserted as the test for whiteness has lags, so that no lag joins two records.
     """
     gap = np.full((LAGS, 6), np.nan)
     parts = []

@@ -1,6 +1,6 @@
 """Warnings about bodies with all ten inertial parameters (full bodies).
 
-They concern parameters that a record does not determine, and centres of mass outside of a body.
+They concern parameters about which a record says nothing, and centres of mass outside of a body.
 """
 
 import numpy as np
@@ -11,7 +11,8 @@ from dynamics.parameters import ParameterLayout
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
 
-# Distance of a centre of mass from its body, in standard deviations, that gives a warning.
+# Distance of a centre of mass outside of its body, in standard deviations, above which there is a
+# warning.
 OUTSIDE_STDS = 3.0
 
 
@@ -27,7 +28,7 @@ def full_body_warnings(
 
 
 def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Return a warning about the parameters of full bodies that a record does not show at all."""
+    """Return a warning about the parameters of full bodies that are not `shown` (p,)."""
     unseen: dict[str, list[str]] = {}
     for kind, full, rows in zip(layout.kinds, layout.full, layout.body_slices, strict=True):
         if full and not shown[rows].all():
@@ -47,7 +48,10 @@ def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...
 
 
 def _outside(robot: Robot, estimate: Array, covariance: Array) -> list[str]:
-    """Return a warning for each full body whose centre of mass is outside of its drawing."""
+    """Return a warning for each full body whose centre of mass lies outside of the drawn body.
+
+    It lies outside if it is farther from its nominal position than the drawn body reaches.
+    """
     layout = robot.layout
     reaches = robot.geometry.body_reaches
     said = []

@@ -3,8 +3,9 @@
 A lightly damped robot oscillates long after its start. If the frequency of the model is wrong, its
 phase error grows with time, and over a whole record the cost has many local minima. Over a short
 window it has hardly any. The search therefore begins with the first half second of each stretch of
-a record. Each following window is twice as long. If the model then misses it, a shorter one is
-tried. The start of a stretch is estimated together with the parameters, see `simultaneous_search`.
+a record (`model.timed_model`). Each following window is twice as long. If the model misses the
+longer window, a shorter one is tried. The start of a stretch is estimated together with the
+parameters, see `simultaneous_search`.
 """
 
 from dataclasses import replace
@@ -17,13 +18,16 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.simultaneous_search import with_likely_errors
 
 SHORTEST_S = 0.5
-"""Length of the first window, s. It is a few periods of the joint loop."""
+"""Length of the window that is tried first, s. It is a few periods of the joint loop."""
 
 LEAST_GROWTH = 1.05
-"""Smallest ratio of the lengths of consecutive windows."""
+"""Ratio of the lengths of consecutive windows up to which the model may miss the longer one.
+
+Above this ratio, a window that the model misses is shortened.
+"""
 
 MOST_WINDOWS = 30
-"""Largest number of windows that are searched."""
+"""Largest number of windows that are searched. Then the search ends within the record."""
 
 MISSED = 2.0
 """Mean squared residual above which the model misses a window."""
@@ -34,8 +38,9 @@ def over_growing_window(
 ) -> tuple[OutputErrorProblem, Array]:
     """Return the problem with its most likely common errors, and the optimal parameters (p,).
 
-    start (p,): parameters within the bounds. Raises LoopFailure if the model is unstable with the
-    result.
+    The parameters are optimal for the longest window that was reached, which is normally the whole
+    record. start (p,): parameters within the bounds. Raises LoopFailure if the model is unstable
+    with the result.
     """
     known, parameters = problem, start
     reached_s = SHORTEST_S / 2.0
@@ -59,7 +64,7 @@ def over_growing_window(
 
 
 def _searched(part: OutputErrorProblem, start: Array) -> tuple[OutputErrorProblem, Array]:
-    """Search one window. If the model is unstable in it, the window is returned as it is."""
+    """Search one window. If the model is unstable there, the arguments are returned unchanged."""
     try:
         return with_likely_errors(part.with_common_errors(start), start)
     except DynamicsError:
@@ -67,5 +72,5 @@ def _searched(part: OutputErrorProblem, start: Array) -> tuple[OutputErrorProble
 
 
 def _misses(part: OutputErrorProblem, parameters: Array) -> bool:
-    """Return whether the model misses the measured poses of a window."""
+    """Return whether the mean squared residual of a window is above MISSED."""
     return part.cost(parameters) > MISSED * 6 * sum(int(run.ok.sum()) for run in part.runs)

@@ -57,24 +57,25 @@ from identify.estimation.prior import (
 )
 from identify.estimation.scale_anchor import ScaleAnchor
 
-# Share of the prior standard deviation and of the size of a quantity. The standard deviation of an
-# identified quantity is below this share of both.
+# Fraction of the prior standard deviation and of the size of a quantity. The standard deviation of
+# an identified quantity is below this fraction of both.
 IDENTIFIABLE_SHARE = 0.5
-# Share of an estimate's variance due to errors of the guess above which it rests on the prior.
+# Fraction of an estimate's variance, due to errors of the guess, above which the estimate rests on
+# the prior.
 RESTS_ON_PRIOR = 0.5
-# Ordinary friction, as a share of the holding torque or force. It is Coulomb friction, or viscous
-# friction at 1 rad/s or 1 m/s.
+# Ordinary friction, as a fraction of the holding torque or force. It is Coulomb friction, or
+# viscous friction at 1 rad/s or 1 m/s.
 FRICTION_SHARE = 0.1
-ASYMMETRY_SHARE = 0.1  # ordinary first moments and products of inertia, as a share of `asymmetry`
+# Ordinary first moments and products of inertia, as a fraction of `asymmetry`.
+ASYMMETRY_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class Identifiability:
     """Criterion by which quantities are identified.
 
-    std, sizes (p,): standard deviations of the initial guess of the parameters, and their sizes,
-    SI. model_holds: False if an error of the model makes most of the residuals. Then nothing is
-    identified.
+    std, sizes (p,): prior standard deviations and sizes of the parameters, SI. model_holds: False
+    if an error of the model causes most of the residuals. Then nothing counts as identified.
     """
 
     std: Array
@@ -115,11 +116,11 @@ class GroupEstimates:
     """Estimates of the base parameters, in SI units of the leading parameter of each group.
 
     names, expressions              Name of each group, and the group as a sum.
-    combinations (rank, p)          Groups as combinations of the dynamic parameters.
+    combinations (rank, d)          Groups as combinations of the d dynamic parameters.
     initial, estimate, std (rank,)  Initial guesses, estimates, and standard deviations of the
                                     estimates.
     identifiable (rank,)            True for identified groups.
-    prior_share (rank,)             Share of the variance due to errors of the initial guess.
+    prior_share (rank,)             Fraction of the variance due to errors of the initial guess.
     """
 
     names: tuple[str, ...]
@@ -145,7 +146,8 @@ class GroupEstimates:
 def group_rows(combinations: Array, layout: ParameterLayout) -> Array:
     """Return the groups as combinations (rank, p) of all parameters.
 
-    The gains of the joint PID belong to no group.
+    combinations (rank, d): the groups as combinations of the d dynamic parameters. The gains of the
+    joint PID belong to no group.
     """
     return np.pad(combinations, ((0, 0), (0, len(layout.joint_pid_names))))
 
@@ -172,10 +174,10 @@ def group_estimates(
 
 
 def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
-    """Return the share (n,) of a part of the covariance in the variance of rows @ parameters.
+    """Return the fraction (n,) of the variance of rows @ parameters that a part of it causes.
 
-    rows (n, p): combinations. part, covariance (p, p): the part and the whole covariance of the
-    parameters.
+    rows (n, p): combinations. part, covariance (p, p): the part of the covariance of the
+    parameters, and the whole covariance.
     """
     return np.asarray((combined_std(rows, part) / combined_std(rows, covariance)) ** 2)
 
@@ -193,8 +195,8 @@ def scale_warnings(
     """Return a warning if an instrument was used to fix the scale, but does not fix it well.
 
     Poses determine the controller's gain up to the scale. gain: name of this gain. std: its
-    relative standard deviation due to errors of the initial guess. prior_share: share of its
-    variance due to these errors. whole_std: its relative standard deviation of all causes.
+    relative standard deviation due to errors of the initial guess. prior_share: fraction of its
+    variance due to these errors. whole_std: its relative standard deviation from all causes.
     """
     if anchor.value is None:
         return ()
@@ -220,8 +222,8 @@ class Judgement:
     """Judgement of an estimate: identifiability, intervals and warnings.
 
     identifiable (p,)               True for identified parameters.
-    prior_share (p,)                Share of the variance due to errors of the initial guess.
-    common_share (p,)               Share of the variance due to errors that all poses have in
+    prior_share (p,)                Fraction of the variance due to errors of the initial guess.
+    common_share (p,)               Fraction of the variance due to errors that all poses have in
                                     common, by kind.
     intervals, group_intervals (p, 2) and (rank, 2)
                                     95 % intervals of parameters and groups, truncated at the
@@ -256,7 +258,7 @@ def judge(
     uncertainty: Uncertainty,
     explanation: Explanation,
 ) -> Judgement:
-    """Judge a solution by its uncertainty and by how well it explains the records.
+    """Judge a solution by its uncertainty and by how well the model explains the records.
 
     qr_threshold: threshold of `rank_by_threshold` for the groups that the references excite.
     """
@@ -270,11 +272,11 @@ def judge(
     # Every law of the drives has this gain, and poses determine it up to the common factor.
     gain = robot.layout.joint_pid.start
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
-    gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
+    gain_by_guess = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
     gain_whole = float(uncertainty.std[gain] / estimate[gain])
-    # Torque commands determine the scale.
+    # Under torque commands the gains have no information, but the commands determine the scale.
     if not uncertainty.information[gain, gain]:
-        gain_left = gain_whole = 0.0
+        gain_by_guess = gain_whole = 0.0
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -317,7 +319,7 @@ def judge(
             *scale_warnings(
                 problem.anchor,
                 robot.layout.names[gain],
-                gain_left,
+                gain_by_guess,
                 float(prior_share[gain]),
                 gain_whole,
             ),

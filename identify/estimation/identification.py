@@ -1,7 +1,7 @@
 """Identification from records: linear warm start, output error, uncertainty, identifiability.
 
-Its input is the records, the robot's geometry and initial guess, and the scenario's model side. It
-has no access to the sensor, the plant's settings or the truth.
+Its input is the records, the robot's geometry and initial guess, and the model's side of the
+scenario. It has no access to the sensor, the plant's settings or the truth.
 """
 
 from __future__ import annotations
@@ -69,13 +69,16 @@ def identify(
     scenario: Scenario | None = None,
     progress: Progress | None = None,
 ) -> IdentificationResult:
-    """Estimate the parameters of robot and joint PID from records by closed-loop output error.
+    """Estimate the parameters of robot and joint PID from records by output error.
+
+    The model closes its own loop. It gets the logged commands instead if `identification.method` of
+    the scenario is "command_driven", or if a record is timed or its law is not the servo.
 
     Parameters
     ----------
     record : xarray.Dataset or path, or sequence of them
-        One or several records of the same robot, or the paths of their netCDF files. The first
-        record has the scale anchor.
+        One or several records of the same robot, or the paths of their netCDF files. The scale
+        anchor, the seed and a missing scenario are read from the first record.
     robot : Robot, optional
         Robot with its known geometry. The default is the robot of the scenario.
     scenario : Scenario, optional
@@ -94,11 +97,13 @@ def identify(
         A record is incomplete, for example without a scenario or scale anchor, or has an invalid
         value, such as a seed that is not a whole number.
     EstimationError
-        An argument is not a Robot or Scenario. A record is of another robot, timing or servo, or
-        is not suitable for an identification. The model is unstable both at the initial guess and
-        at the warm start.
+        An argument has the wrong type, or there is no record. A record is of another robot, timing
+        or servo, or is not suitable for an identification. The scale anchor is a payload, and all
+        records have the same load. No stable model is found from the initial guess or the warm
+        start.
     ScenarioError
-        The robot has no such parameter set, or the initial guess is not valid for the model.
+        The robot lacks the parameter set that the scenario names, or the initial guess is not
+        valid for the model.
     dynamics.DynamicsError
         The robot cannot reach a pose of the record.
 
@@ -115,7 +120,7 @@ def identify(
 
 @one_thread
 def identified(asked: Asked, progress: Progress) -> IdentificationResult:
-    """Return the result of `identify` from its checked inputs. Raises the same errors."""
+    """Return the result of `identify` from checked inputs. Raises the same errors."""
     began = time.perf_counter()
     records = asked.records
     side = asked.side
@@ -142,9 +147,9 @@ def identified(asked: Asked, progress: Progress) -> IdentificationResult:
     searches = output_error_searches(problem, warm, closed_loop, progress)
     searched = time.perf_counter()
     by_commands = searches["command_driven"]
-    last = searches["closed_loop"] if closed_loop else by_commands
-    solution = last.solution
-    judged = last.linearised()
+    final = searches["closed_loop"] if closed_loop else by_commands
+    solution = final.solution
+    judged = final.linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     # Residuals of a right model are white only if the logged commands drive it.
@@ -197,7 +202,7 @@ def identified(asked: Asked, progress: Progress) -> IdentificationResult:
 def asked_of(
     record: Record | Sequence[Record], robot: Robot | None, scenario: Scenario | None
 ) -> Asked:
-    """Return the checked inputs of `identify`, with its arguments and errors."""
+    """Return the checked inputs of `identify`, which has the same arguments and errors."""
     given = [record] if isinstance(record, (xr.Dataset, str, PathLike)) else list(record)
     records = [one if isinstance(one, xr.Dataset) else _read(one) for one in given]
     if not records:
@@ -230,10 +235,11 @@ def output_error_problem(
 ) -> OutputErrorProblem:
     """Return the output-error problem of one or several records.
 
-    The first record has the scale anchor.
+    The scale anchor is read from the first record.
 
-    Raises RecordError if a record has no scale anchor, or no measured poses. Raises EstimationError
-    if a record is of another robot, timing or servo, or is not suitable for an identification.
+    Raises RecordError if the first record has no scale anchor, or a record has no measured poses.
+    Raises EstimationError if a record is of another robot, timing or servo, or is not suitable for
+    an identification, or if the scale anchor is a payload and all records have the same load.
     Raises ScenarioError if there is no parameter set for the initial guess, or the guess is not
     valid for the model.
     """

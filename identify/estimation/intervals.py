@@ -9,15 +9,16 @@ estimate, the unheld estimate is
 with the information W and the part g of the cost's gradient that the active bounds balance. At a
 flat body, all of the gradient with respect to its ten numbers is balanced. The interval of the
 unheld estimate, truncated at the bounds, has the stated coverage whatever the truth. But it can be
-empty, or not contain the estimate. Averaged over all truths within the bounds, it is off: a bound
-that a quantity cannot cross also moves all quantities that are correlated with it. The stated
-distribution is therefore the distribution of the unheld estimate, truncated at all bounds, see
-`truncated_normal`. Its interval alone would not do either, because it places a sum of many
-quantities whose true values are at their bounds too high, by more than its standard deviation.
+empty, or not contain the estimate. Averaged over all truths within the bounds, it is also in the
+wrong position, because a bound that a quantity cannot cross moves all correlated quantities, too.
+The stated distribution is therefore the distribution of the unheld estimate, truncated at all
+bounds, see `truncated_normal`. Its interval alone would not do either. For a sum of many quantities
+whose true values are at their bounds, this interval is too high by more than its standard
+deviation.
 
-The returned interval is the union of both intervals and the range between them and the estimate,
-truncated at the smallest allowed value. It is never empty, contains the estimate, and has at least
-the stated coverage. Without bounds nearby, both intervals are the same.
+The returned interval is the shortest that contains both intervals and the estimate, truncated at
+the smallest allowed value. It is never empty, and has at least the stated coverage. Without bounds
+nearby, both intervals are the same.
 """
 
 from dataclasses import dataclass
@@ -59,11 +60,11 @@ class BoundedEstimate:
     def intervals(self, rows: Array) -> Array:
         """Return the 95 % intervals (n, 2) of the quantities rows (n, p) @ parameters.
 
-        They are truncated at the smallest allowed values.
+        They are truncated at the smallest allowed values of the quantities.
         """
         unheld = rows @ self.unheld
         mean, std = self.within.marginals(rows)
-        # The interval of the estimate has no width, see the module docstring.
+        # The estimate counts as an interval without width, see the module docstring.
         middles = np.stack([unheld, mean, rows @ self.estimate])
         stds = np.stack([combined_std(rows, self.covariance), std, np.zeros(len(rows))])
         low = (middles - HALF_WIDTH * stds).min(axis=0)
@@ -79,10 +80,10 @@ class BoundedEstimate:
         return truncated(self.unheld, self.covariance, directions, lower[bounded])
 
     def probabilities(self, rows: Array, values: Array) -> Array:
-        """Return the probabilities (n,) that the quantities rows (n, p) @ parameters are smaller.
+        """Return the probabilities (n,) of rows (n, p) @ parameters < values (n,).
 
-        values (n,): values with which the quantities are compared. The stated distribution of a
-        quantity is normal as in `within`, truncated at its smallest allowed value.
+        The stated distribution of each of these quantities is normal with
+        the moments of `TruncatedNormal.marginals`, truncated at the smallest allowed value.
         """
         centre, std = self.within.marginals(rows)
         # Logarithms of upper tails keep their digits far below a bound.
@@ -130,8 +131,8 @@ def bounded_estimate(
 ) -> BoundedEstimate:
     """Return the estimate (p,) of a search within bounds.
 
-    gradient (p,) is J^T r, and information (p, p) is J^T J. For the other arguments see
-    `BoundedEstimate`.
+    gradient (p,): J^T r of poses and prior. information (p, p): J^T J of both. For the other
+    arguments see `BoundedEstimate`.
     """
     unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
     return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)

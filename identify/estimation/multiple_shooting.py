@@ -1,8 +1,9 @@
 """Multiple shooting: fits to short segments, for models that do not run through a whole record.
 
 A model that is unstable, or that leaves the reach of the robot, has no output error over a whole
-record. Driven by the logged commands, it has an output error over segments of half a second. Each
-segment starts from its own state, which is unknown like the parameters. A state holds the
+record. Driven by the logged commands, such a model still has an output error over segments of half
+a second. Each segment starts from its own state, which is unknown like the parameters, except that
+the first segment of a record starts in equilibrium. A state holds the
 coordinates of the platform, their rates, and the integrals of the joint PID. For m coordinates and
 n joints these are s = 2 m + n numbers. The end of each segment must agree with the start of the
 next segment within the accuracy of the sensor, so that at the optimum the segments form one run.
@@ -46,9 +47,11 @@ BANDWIDTH = 20.0
 
 @dataclass(frozen=True)
 class Segment:
-    """Segment of a run. Its frame `last` is the frame `first` of the next segment.
+    """Segment of a run, from its frame `first` to its frame `last`.
 
-    state_std (s,): standard deviation of a state that corresponds to the sensor's noise.
+    The last frame of a segment is the first frame of the next segment. reference: the run's
+    reference at the frames of the segment. state_std (s,): standard deviation of a state that
+    corresponds to the sensor's noise.
     """
 
     run: LoopModel
@@ -75,22 +78,29 @@ class Segment:
     def simulate(
         self, parameters: Array, state: Array, sensitivities: bool = False
     ) -> ClosedLoopRun:
-        """Simulate the model from a state (s,). The first segment starts in equilibrium.
+        """Simulate the model from a state (s,).
 
-        Raises LoopFailure if the segment cannot be simulated.
+        The first segment starts in equilibrium, whatever the state. Raises LoopFailure if the
+        segment cannot be simulated.
         """
         run = self.run
         chart = self.chart
         count = len(chart.freedoms)
         coordinates, rates, integral = np.split(state, [count, 2 * count])
         pose = chart.pose(coordinates)
-        at_rest = np.zeros(count)
+        servo_integral = np.zeros(count)
         start = None
         # Only the first segment begins in equilibrium.
         if self.first:
             before, latencies = commands_before(run, self.first)
             start = StartState(
-                pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies
+                pose,
+                chart.lifted(rates),
+                integral,
+                servo_integral,
+                before,
+                pose,
+                latencies=latencies,
             )
         frames = slice(self.first, self.last + 1)
         commands = run.logged[frames]
@@ -118,9 +128,9 @@ def segments(run: LoopModel) -> list[Segment]:
     free = run.robot.geometry.chart.basis
     covariance = free.T @ run.covariance @ free
     jacobian = run.robot.coordinate_jacobian(run.reference.poses[0])
-    place = np.sqrt(np.diag(covariance))
-    joint = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
-    std = np.concatenate([place, BANDWIDTH * place, joint / BANDWIDTH])
+    coordinate_std = np.sqrt(np.diag(covariance))
+    joint_std = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    std = np.concatenate([coordinate_std, BANDWIDTH * coordinate_std, joint_std / BANDWIDTH])
     poses = run.reference.poses
     rates = run.reference.rates
     found = []
@@ -133,29 +143,32 @@ def segments(run: LoopModel) -> list[Segment]:
 def measured_states(chain: list[Segment], parameters: Array, low_pass: Filter) -> Array:
     """Return the states (segments, s) at the starts of a run's segments.
 
-    They are filtered poses and rates, and the integrals of the joint PID. At the start of the run,
-    the integrals are those that hold the model with parameters (p,) at rest.
+    They are filtered coordinates of the platform, their rates, and the integrals of the joint PID.
+    At the start of the run, the integrals are those that hold the model with parameters (p,) at
+    rest.
     """
     run = chain[0].run
     rate_hz = run.settings.timing.frame_rate_hz
     measured = run.robot.geometry.chart.coordinates(run.without_gaps())
-    place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
+    filtered, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
     _, _, command_integral = effective_command(run, low_pass)
-    angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
+    angle_integral = running_integral(
+        run.robot.inverse_kinematics(run.robot.pose(filtered)), rate_hz
+    )
     servo = run.settings.servo
     drives = run.settings.drives
     rest = equilibrium(
         run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives
     )
-    states = np.hstack([place, rate, rest.joint_integral + command_integral - angle_integral])
+    states = np.hstack([filtered, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)
 
 
 def end_state(run: ClosedLoopRun, chart: Chart) -> Array:
     """Return the state (s,) at the last frame of a run of a robot with this chart."""
-    place = chart.coordinates(run.pose[-1])
-    rate = chart.coordinates(run.pose_rate[-1])
-    return np.concatenate([place, rate, run.joint_integral[-1]])
+    coordinates = chart.coordinates(run.pose[-1])
+    rates = chart.coordinates(run.pose_rate[-1])
+    return np.concatenate([coordinates, rates, run.joint_integral[-1]])
 
 
 @dataclass
@@ -163,7 +176,7 @@ class MultipleShooting:
     """Least-squares problem in a robot's p parameters, for `bounded_least_squares.minimise`.
 
     chains: segments of each record. states: states (segments, s) of each record at the latest
-    linearisation. For other parameters they are extrapolated by that linearisation.
+    linearisation. For other parameters, the states are extrapolated by that linearisation.
     """
 
     problem: OutputErrorProblem
@@ -185,8 +198,8 @@ class MultipleShooting:
                     run = part.simulate(parameters, states[k])
                     total += float(np.sum(part.whitened(run.pose - part.measured) ** 2))
                     if not part.ends_the_run:
-                        gap = end_state(run, part.chart) - states[k + 1]
-                        total += float(np.sum((gap / part.state_std) ** 2))
+                        jump = end_state(run, part.chart) - states[k + 1]
+                        total += float(np.sum((jump / part.state_std) ** 2))
         except DynamicsError:
             return np.inf
         return total
@@ -206,15 +219,15 @@ class MultipleShooting:
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
             count = states.shape[1]
-            # Nothing depends on the first state. These identity rows keep it unchanged, and make
-            # the elimination possible.
+            # Nothing depends on the first state. These identity rows keep this state unchanged, and
+            # make the elimination possible.
             carried = np.eye(count, count + size + 1)
             eliminated = []
             for k, part in enumerate(chain):
                 following = None if part.ends_the_run else states[k + 1]
                 rows = _linearised(part, parameters, states[k], following)
                 cost += float(np.sum(rows[:, -1] ** 2))
-                # Columns for the next state are inserted.
+                # Columns of zeros for the next state are inserted.
                 carried = np.insert(carried, [count] * count, 0.0, axis=1)
                 triangle = np.asarray(np.linalg.qr(np.vstack([carried, rows]), mode="r"))
                 eliminated.append(triangle[:count])
@@ -246,18 +259,18 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
     by_parameters = np.asarray(run.pose_sensitivity)
     end_by_state = np.asarray(run.end_start_sensitivity)
     end_by_parameters = np.asarray(run.end_sensitivity)
-    counts = float(part.first > 0)
+    depends = float(part.first > 0)
     size = len(part.state_std)
     values = part.whitened(run.pose - part.measured)
-    own = counts * part.whitened(by_state[:, :, :size])
+    own = depends * part.whitened(by_state[:, :, :size])
     rows = np.column_stack([own, np.zeros_like(own), part.whitened(by_parameters), values])
     if following is None:
         return rows
-    own = counts * end_by_state[:size, :size]
-    gap = end_state(run, part.chart) - following
+    own = depends * end_by_state[:size, :size]
+    jump = end_state(run, part.chart) - following
     # Continuity rows are in standard deviations of a state.
-    joint = np.column_stack([own, -np.eye(size), end_by_parameters[:size], gap])
-    return np.vstack([rows, joint / part.state_std[:, None]])
+    continuity = np.column_stack([own, -np.eye(size), end_by_parameters[:size], jump])
+    return np.vstack([rows, continuity / part.state_std[:, None]])
 
 
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
@@ -268,10 +281,11 @@ def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
     """
     moved = states.copy()
     size = states.shape[1]
-    following: Array = np.zeros(size)
+    # Step of the state at the start of a segment, from the last segment to the first.
+    state_step: Array = np.zeros(size)
     for k in reversed(range(len(states))):
         triangle = eliminated[k]
-        right = triangle[:, size : 2 * size] @ following + triangle[:, 2 * size :] @ step
-        following = np.asarray(-np.linalg.solve(triangle[:, :size], right), dtype=float)
-        moved[k] += following
+        known = triangle[:, size : 2 * size] @ state_step + triangle[:, 2 * size :] @ step
+        state_step = np.asarray(-np.linalg.solve(triangle[:, :size], known), dtype=float)
+        moved[k] += state_step
     return moved

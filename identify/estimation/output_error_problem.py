@@ -1,8 +1,8 @@
 """Output error: difference of measured and modelled poses (eq. 32, figure 3).
 
 There are two ways to drive the model. In the closed loop, as in the paper, the model has the servo
-around it and follows the reference. Its ideal sensor has the same sampling, delay and hold, and
-loses the same frames as the real sensor. Driven by commands, the joints of the model get the logged
+around it and follows the reference. Its ideal sensor has the same sampling, delay and hold as the
+real sensor, and loses the same frames. Driven by commands, the joints of the model get the logged
 commands, which contain the effect of the sensor's noise on the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance, and a
@@ -30,8 +30,8 @@ class OutputErrorProblem:
     """Least-squares problem in a robot's parameters over one or several records.
 
     It is solved by `bounded_least_squares.minimise`, until one of the criteria `stop` holds.
-    low_pass: filter of measured poses for the linear fits at the start of a search. With `physical`
-    only masses and inertias that a rigid body can have are allowed.
+    low_pass: filter of measured poses for the linear fits at the start of a search. With
+    `physical`, only masses and inertias that a rigid body can have are allowed.
     """
 
     runs: tuple[LoopModel, ...]
@@ -43,7 +43,7 @@ class OutputErrorProblem:
 
     @property
     def bounds(self) -> ParameterBounds:
-        """Bounds of a search."""
+        """Bounds of the parameters."""
         return parameter_bounds(self.guess, self.physical)
 
     def driven_by_commands(self) -> "OutputErrorProblem":
@@ -52,7 +52,7 @@ class OutputErrorProblem:
 
     @property
     def bends(self) -> bool:
-        """True if the model is not linear in its common errors.
+        """True if a model with residuals whitened for common errors is not linear in them.
 
         The model is nonlinear if the servo measures poses with these errors, or if there are errors
         in the loop or of bodies.
@@ -66,8 +66,8 @@ class OutputErrorProblem:
     def has(self, errors: Sequence[Array], within: float) -> bool:
         """Return whether the model of each run contains these common errors (k,).
 
-        A difference of up to `within` standard deviations is allowed. Errors that a model cannot
-        contain are first limited to those that it can.
+        A difference of up to `within` standard deviations (`LoopModel.in_deciding_stds`) is
+        allowed. Errors that a model cannot contain are first limited to values that it can contain.
         """
         pairs = zip(self.runs, errors, strict=True)
         return all(
@@ -109,7 +109,7 @@ class OutputErrorProblem:
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
         """Return the cost and the triangular form of its linearisation.
 
-        See `bounded_least_squares.Problem`.
+        See `bounded_least_squares.Problem`. Raises LoopFailure if the model is unstable.
         """
         known, known_jacobian = self.known(parameters)
         size = len(parameters)
@@ -136,7 +136,7 @@ class OutputErrorProblem:
         The Jacobian is (k, p). Both are in standard deviations.
         """
         guess = self.guess
-        place, measured = self.anchor.row(guess.layout)
-        rows = np.vstack([guess.rows, place])
+        anchor_rows, measured = self.anchor.row(guess.layout)
+        rows = np.vstack([guess.rows, anchor_rows])
         values = np.concatenate([guess.values / guess.std, measured])
         return rows @ parameters - values, rows

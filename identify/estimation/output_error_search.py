@@ -1,11 +1,11 @@
 """Searches for the optimum of the output error, one after the other.
 
-The linear warm start comes first. The search for the command-driven output error follows, which has
-few local minima. The search for the closed-loop output error is last, because stick-slip gives it
-narrow local minima. Both searches end by the criteria of eq. 35. In the first search, errors
-that all poses have in common are treated as noise, because far from the optimum they would hide the
-relevant residuals. If the model is unstable with both the warm start and the initial guess,
-multiple shooting finds a stable model.
+The linear warm start comes first. The command-driven output error, which has few local minima, is
+minimised next. The closed-loop output error is minimised last, because stick-slip gives it narrow
+local minima. All searches end by the criteria of eq. 35. If poses have errors in common, a search
+that ignores them precedes the others, because far from the optimum these errors would explain the
+relevant residuals. It is left out if the motion is far from linear in the errors. If the model is
+unstable with both the warm start and the initial guess, multiple shooting finds a stable model.
 """
 
 from dataclasses import dataclass, replace
@@ -28,15 +28,16 @@ from identify.progress import Advance, Progress
 from identify.record.stored_common_errors import FRICTION, kind_of
 
 LINEARISATIONS = 6  # largest number of linearisations in the common errors
-# Linearisations after which steps of the common errors are halved, because they can alternate.
+# Number of linearisations after which steps of the common errors are halved, because full steps can
+# alternate.
 FULL_STEPS = 2
-# Change of the most likely common errors, in standard deviations, at which the loop ends.
+# Change of the most likely common errors, in standard deviations, up to which they have converged.
 SETTLED = 0.02
-MISSED = 1.2  # mean squared residual above which the search is repeated from another start
+MISSED = 1.2  # mean squared residual above which a search may have gone wrong
 
-# Change of common errors with a wide prior at which they count as near their optimum. It is in the
-# standard deviations of `LoopModel.in_deciding_stds`, which are those of the errors for known
-# parameters. For unknown parameters they are far larger, and the change is a small part of them.
+# The same as SETTLED for records that begin in motion, whose common errors have wide priors. The
+# standard deviations are those of `LoopModel.in_deciding_stds`, for known parameters. For unknown
+# parameters the errors are far less certain, so that this change is small.
 NEAR = 1.0
 
 # Relative change of the cost at which multiple shooting ends. Finer searches follow it.
@@ -47,7 +48,7 @@ CLOSE_ENOUGH = 1e-2
 class Search:
     """Problem, and the solution of the search for its optimum.
 
-    The problem contains the common errors that are most likely at the optimum.
+    The models of the problem contain the common errors that are most likely at the optimum.
     """
 
     problem: OutputErrorProblem
@@ -70,10 +71,13 @@ class Search:
 def output_error_searches(
     problem: OutputErrorProblem, warm: Array, closed_loop: bool, progress: Progress
 ) -> dict[str, Search]:
-    """Search from the warm start (p,), and return the searches by name in their order.
+    """Search from the warm start (p,), and return the searches by name.
 
-    closed_loop: True if the last search uses the closed loop, False if it uses the logged commands.
-    Raises EstimationError if no stable model is found.
+    The names are multiple_shooting, noise_alone, command_driven and closed_loop, in this order.
+    Searches that are not needed are left out. closed_loop: True if the final search uses the closed
+    loop, False if it uses the logged commands. If the command-driven result misses the record, its
+    search can be repeated from the closed-loop result. Raises EstimationError if no stable model is
+    found.
     """
     found = {}
     driven = problem.driven_by_commands()
@@ -82,8 +86,8 @@ def output_error_searches(
         found["multiple_shooting"] = Search(driven, shoot(driven, warm, progress))
         start = found["multiple_shooting"].solution.parameters
     has_common = any(run.common.all_names for run in problem.runs)
-    most = (1 + closed_loop + has_common) * problem.stop.max_iterations
-    with progress.stage("identify", most) as advance:
+    allowed = (1 + closed_loop + has_common) * problem.stop.max_iterations
+    with progress.stage("identify", allowed) as advance:
         starts = [start, problem.guess.values] if has_common else [start]
         if has_common and not any(_bends_far(run) for run in driven.runs):
             found["noise_alone"] = Search(driven, search(driven, start, advance))
@@ -95,11 +99,11 @@ def output_error_searches(
                 errors_in_models(searched.problem, searched.solution.parameters)
             )
             start = _closed_loop_start(problem, searched.solution.parameters)
-            found["closed_loop"] = last = search_with_common_errors(problem, [start], advance)
-            ended = last.solution.parameters
+            found["closed_loop"] = final = search_with_common_errors(problem, [start], advance)
+            ended = final.solution.parameters
             cost = searched.solution.costs[-1]
             if searched.missed and any(_bends_far(run) for run in driven.runs):
-                driven = driven.having(errors_in_models(last.problem, ended))
+                driven = driven.having(errors_in_models(final.problem, ended))
                 found["command_driven"] = search_with_common_errors(driven, [ended], advance)
             elif searched.missed and searched.problem.cost(ended) < cost:
                 found["command_driven"] = search_with_common_errors(driven, [ended], advance)
@@ -109,10 +113,10 @@ def output_error_searches(
 def search_with_common_errors(
     problem: OutputErrorProblem, starts: list[Array], advance: Advance
 ) -> Search:
-    """Minimise a problem with its common errors, from the best of some parameters (p,).
+    """Minimise a problem with its common errors, from the best of several starts (p,).
 
     The model is linearised in the common errors about their most likely values. The search is
-    repeated until these values converge.
+    repeated until these values converge, at most LINEARISATIONS times.
     """
     first, begin = problem, start = _with_common_errors(problem, starts)
     in_motion = any(run.begins_in_motion for run in problem.runs)
@@ -126,7 +130,7 @@ def search_with_common_errors(
             other, start = over_growing_window(first, begin) if in_motion else _warm_again(problem)
             again = search(other, start, lambda n=1: None)
         except DynamicsError:
-            other, again = problem, solution  # unstable from there, so the first result stays
+            other, again = problem, solution  # no stable model there, so the first result stays
         if again.costs[-1] < solution.costs[-1]:
             problem = other
             solution = again
@@ -157,8 +161,8 @@ def _warm_again(problem: OutputErrorProblem) -> tuple[OutputErrorProblem, Array]
 def _bends_far(run: LoopModel) -> bool:
     """Return whether a run has common errors in which its motion is far from linear.
 
-    These are a start in motion and constants of friction. With wrong values of these errors, a
-    search would find parameters far from the optimum.
+    These are errors of a start in motion and, under the logged commands, of constants of friction.
+    With wrong values of these errors, a search would find parameters far from the optimum.
     """
     rubs = any(kind_of(name) == FRICTION for name in run.common.loop_std)
     return run.begins_in_motion or (run.driven and rubs)
@@ -172,8 +176,8 @@ def search(
 ) -> Solution:
     """Minimise one output-error problem from parameters (p,), within its bounds.
 
-    shooting: multiple-shooting form that is minimised in place of the problem. At the end,
-    `advance` has been called for all iterations that the problem allows.
+    shooting: multiple-shooting form of the problem, which is minimised instead if it is given. At
+    the end, `advance` has been called for all iterations that the problem allows.
     """
     bounds = problem.bounds
     coordinates = bounds.coordinates(start)
@@ -216,7 +220,7 @@ def shoot(problem: OutputErrorProblem, warm: Array, progress: Progress) -> Solut
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
     """Return the better of warm start and initial guess (p,), within the bounds.
 
-    It is None if the model is unstable with both.
+    None is returned if the model is unstable with both.
     """
     first, second = _candidates(problem, warm)
     ahead = _reuses_sensitivities(problem)
@@ -226,15 +230,18 @@ def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
 
 
 def _reuses_sensitivities(problem: OutputErrorProblem) -> bool:
-    """Return whether a search can reuse the sensitivities of a run with its first parameters.
+    """Return whether a search can reuse the sensitivities of a run at the start of the search.
 
-    It cannot if `physical` changes the coordinates, or if errors of bodies change the run.
+    This is impossible if `physical` changes the coordinates, or if errors of bodies change the run.
     """
     return not problem.physical and not any(run.common.body_std for run in problem.runs)
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
-    """Return the better of the command-driven solution (p,) and the guess, in the closed loop."""
+    """Return the better of the command-driven solution (p,) and the guess, in the closed loop.
+
+    Raises EstimationError if the closed loop is unstable with both.
+    """
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(
@@ -247,20 +254,21 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
 def _with_common_errors(
     problem: OutputErrorProblem, starts: list[Array]
 ) -> tuple[OutputErrorProblem, Array]:
-    """Return the problem with its common errors, and the best of some parameters (p,).
+    """Return the problem with its common errors, and the best of several starts (p,).
 
-    The modes of the errors are evaluated at the returned parameters. A single start must be stable.
+    The modes of the errors are evaluated at the best start. The model must be stable with at least
+    one start.
     """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])
     first, *others = map(problem.bounds.nearest, starts)
-    # The search most likely begins at the first start.
+    # The search most likely begins at the first start, so sensitivities are computed there.
     cost = problem.cost(first, ahead=_reuses_sensitivities(problem))
-    inside = [first] if np.isfinite(cost) else []
-    inside += [start for start in others if np.isfinite(problem.cost(start))]
-    whitened = problem.with_common_errors(inside[0])
-    best = min(inside, key=whitened.cost)
-    return (whitened if best is inside[0] else problem.with_common_errors(best)), best
+    stable = [first] if np.isfinite(cost) else []
+    stable += [start for start in others if np.isfinite(problem.cost(start))]
+    whitened = problem.with_common_errors(stable[0])
+    best = min(stable, key=whitened.cost)
+    return (whitened if best is stable[0] else problem.with_common_errors(best)), best
 
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:

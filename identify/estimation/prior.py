@@ -26,7 +26,7 @@ class StartingGuess:
     """Knowledge of a robot's parameters before the experiment.
 
     values, std (p,): values and their standard deviations, SI. drive: law of the drives. Gains that
-    it does not read are fixed at zero.
+    this law does not read are fixed at zero.
     """
 
     layout: ParameterLayout
@@ -71,9 +71,10 @@ def starting_guess(
 ) -> StartingGuess:
     """Return the initial guess that follows from a parameter set of the robot file.
 
-    relative_std: standard deviation of each parameter, as a fraction of its size. known: values and
-    standard deviations that replace the guess for some parameters, by name. Raises ScenarioError,
-    with the valid names, if there is no such set.
+    relative_std: standard deviation of each parameter, as a fraction of its size (`typical_sizes`).
+    known: values and standard deviations that replace the guess for some parameters, by name.
+    Raises ScenarioError if the robot has no such set, or the model no parameter of a name in
+    `known`.
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
@@ -92,9 +93,9 @@ def starting_guess(
                 f"identification.prior: the model of {robot.name} has no {name}; full bodies are "
                 "set by model.inertia, and friction of passive joints by model.passive_friction"
             )
-        place = robot.layout.names.index(name)
-        values[place] = prior.value
-        std[place] = prior.std
+        index = robot.layout.names.index(name)
+        values[index] = prior.value
+        std[index] = prior.std
     guess = StartingGuess(robot.layout, values, std, drive)
     # The guess refers to these arrays, so it changes with them.
     values[guess.fixed] = 0.0
@@ -112,18 +113,18 @@ def model_guess(robot: Robot, model: Model, settings: Identification) -> Startin
     )
 
 
-# Largest negligible holding torque, as a share of the torque to accelerate by GRAVITY.
+# Largest negligible holding torque, as a fraction of the torque to accelerate by GRAVITY.
 WEIGHTLESS = 0.01
 
 GRAVITY = 9.81  # m/s^2
 
 
 def holding_torque(robot: Robot, dynamic: Array) -> float:
-    """Return the mean torque, N m, or force, N, that the joints hold at the home pose.
+    """Return the mean absolute torque, N m, or force, N, that the joints hold at the home pose.
 
     dynamic (p,): dynamic parameters. If the holding torque is negligible, as for a robot in a
-    horizontal plane, the mean torque to accelerate the platform by GRAVITY along each axis is
-    returned.
+    horizontal plane, the result is the mean absolute torque that accelerates the platform by
+    GRAVITY along one of its translational axes.
     """
     home = robot.home_pose
     axes = robot.geometry.chart.basis.T
@@ -139,9 +140,10 @@ def holding_torque(robot: Robot, dynamic: Array) -> float:
 def typical_sizes(robot: Robot, values: Array, torque: float) -> Array:
     """Return the size (p,) of each parameter: its own value or, for friction, the holding torque.
 
-    The torque is in N m, or N. Data sheets rarely state friction, but friction above the holding
-    torque would mean a broken joint. First moments and products of inertia have the sizes of
-    `asymmetry`.
+    torque: holding torque, N m, or force, N. Data sheets rarely state friction, but friction above
+    the holding torque would mean a broken joint. Friction of passive joints has the size of
+    `passive_torque`. First moments and products of inertia have the sizes of `asymmetry`. The size
+    of any other parameter without a positive value is 1.
     """
     layout = robot.layout
     sizes = np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
@@ -175,5 +177,5 @@ def asymmetry(robot: Robot, values: Array) -> Array:
 
 
 def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
-    """Return which parameters (p,) are friction parameters."""
+    """Return which parameters (p,) are the friction of actuated joints."""
     return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)

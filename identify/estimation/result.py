@@ -50,11 +50,11 @@ class IdentificationResult:
     Attributes
     ----------
     layout : ParameterLayout
-        Names, places and units of the p parameters.
+        Names, indices and units of the p parameters.
     nominal : Robot
         Robot before the identification.
     drive : DriveChoice
-        Law of the drives.
+        Law of the drives, and how it was chosen.
     initial, warm_start, estimate : ndarray, shape (p,)
         Initial guess, linear estimate, and final estimate.
     std, covariance : ndarray, shapes (p,) and (p, p)
@@ -66,26 +66,32 @@ class IdentificationResult:
     identifiable : ndarray of bool, shape (p,)
         True for identified parameters.
     prior_share : ndarray, shape (p,)
-        Share of the variance due to errors of the initial guess.
+        Fraction of the variance due to errors of the initial guess.
     common_share : dict of ndarray, shape (p,)
-        Share of the variance due to each kind of error that all poses have in common.
+        Fraction of the variance due to each kind of error that all poses have in common.
     groups, group_intervals
         Estimates of the base parameters, and their 95 % intervals.
     bounded : BoundedEstimate
         Estimate within bounds, which states the distribution of every quantity.
+    conditioning : Conditioning
+        How much better the records determine some parameters than others.
+    scale_anchor : ScaleAnchor
+        Measurement that fixes the common factor of all parameters.
+    common_errors : CommonErrorEstimates
+        Estimates of the errors that all poses of the first record have in common.
     base_rank : int
-        Number of independent groups that the trajectory excites by the paper's rule.
+        Number of independent groups that the references excite, by the paper's rule.
     iterations, evaluations : int
         Counts over all searches.
     stop_reason : str
-        Reason why the last search ended.
+        Reason why the final search ended.
     searches, costs : tuple
         Names of the searches in their order, and the cost after each iteration of each.
     active_bounds : tuple of str
         Bounds that limit the estimate, such as "platform.Izz <= Ixx + Iyy".
     noise_ratio, expected_noise_ratio, noise_ratio_std : float
-        Mean squared whitened residual, its expected value for the sensor's noise alone, and its
-        standard deviation for noise alone.
+        Mean squared whitened residual, and its expected value and standard deviation for the
+        sensor's noise alone.
     whiteness : Whiteness
         Test of the residuals of the model that is driven by the logged commands.
     driven_estimate : ndarray, shape (p,)
@@ -93,7 +99,9 @@ class IdentificationResult:
     driven_misfit : Misfit
         Misfit of the command-driven model.
     notes, warnings : tuple of str
-        Decisions when the record was read, and what may be wrong.
+        Decisions when the records were read, with estimates of their clocks, and what may be wrong.
+    seconds : dict of float
+        Times that drive, warm_start, search and uncertainty took, s.
     """
 
     layout: ParameterLayout
@@ -234,7 +242,7 @@ class IdentificationResult:
 
     @property
     def whole_covariance(self) -> Array:
-        """Covariance (p + k, p + k) of the p parameters and the k common errors of all poses."""
+        """Covariance (p + k, p + k) of the p parameters and the k `common_errors`."""
         common = self.common_errors
         return np.block(
             [
@@ -284,7 +292,8 @@ class IdentificationResult:
     def _assumptions(self) -> dict[str, dict[str, Any]]:
         """Return how much each kind of assumption on bodies and passive joints widens intervals.
 
-        Each entry has the identified parameter whose interval is widened most, and the factor.
+        Each entry has the identified parameter whose interval is widened most, and the factor by
+        which its standard deviation grows.
         """
         shown = np.flatnonzero(self.identifiable)
         found = {}
@@ -377,7 +386,7 @@ def result_html(result: IdentificationResult) -> str:
 def relative_uncertainty_png(result: IdentificationResult) -> bytes:
     """Draw the change from the initial guess and the standard deviation of identified parameters.
 
-    Both are in percent of the estimate.
+    Both are in percent of the estimate. Estimates of zero are left out.
     """
     from matplotlib.figure import Figure
 

@@ -36,8 +36,8 @@ def measured_parameter(anchor: str, layout: ParameterLayout) -> str:
     return {"platform_mass": "platform.mass", "joint_gain": layout.joint_pid_names[0]}[anchor]
 
 
-# Standard deviation of an ordinary instrument, by units. A balance measures the platform's mass. A
-# gain comes from the data of the controller.
+# Standard deviation of an ordinary instrument, by the unit of the measured parameter. A balance
+# measures the platform's mass. A gain comes from the data sheet of the controller.
 DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
 
 
@@ -50,8 +50,8 @@ def default_std(name: str, layout: ParameterLayout) -> float:
 class ScaleAnchor:
     """Measurement that fixes the scale.
 
-    value and std: measured value of a parameter and its standard deviation, SI. They are None if no
-    parameter was measured.
+    name: one of ANCHORS. value and std: measured value of a parameter and its standard deviation,
+    SI. They are None if no parameter was measured.
     """
 
     name: str
@@ -59,9 +59,10 @@ class ScaleAnchor:
     std: float | None = None
 
     def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
-        """Return the measurement as k equations, in standard deviations.
+        """Return the measurement as k equations in the parameters, in standard deviations.
 
-        They have a matrix (k, p) and a right side (k,). k is 1, or 0 if no parameter was measured.
+        They are returned as a matrix (k, p) and a right-hand side (k,). k is 1, or 0 if no
+        parameter was measured.
         """
         if self.value is None or self.std is None:
             return np.zeros((0, len(layout.names))), np.zeros(0)
@@ -73,7 +74,7 @@ class ScaleAnchor:
 def measured_anchor(
     name: str, std: float | None, layout: ParameterLayout, true: Array, rng: np.random.Generator
 ) -> ScaleAnchor:
-    """Return a simulated measurement of the anchor.
+    """Return the anchor of this name. If it is in MEASURING, it has a simulated measurement.
 
     std: standard deviation of the instrument, None for the default. true (p,): true parameters of
     the robot.
@@ -81,9 +82,9 @@ def measured_anchor(
     if name not in MEASURING:
         # These anchors have no measured parameter. The record under a load states the load.
         return ScaleAnchor(name)
-    spread = default_std(name, layout) if std is None else std
-    measured = true[layout.names.index(measured_parameter(name, layout))]
-    return ScaleAnchor(name, float(measured + spread * rng.standard_normal()), spread)
+    noise_std = default_std(name, layout) if std is None else std
+    true_value = true[layout.names.index(measured_parameter(name, layout))]
+    return ScaleAnchor(name, float(true_value + noise_std * rng.standard_normal()), noise_std)
 
 
 def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
@@ -96,8 +97,8 @@ def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
 def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
     """Return the measurement of the scale anchor in a robot's record.
 
-    Raises RecordError if the record has no anchor, or if its value or standard deviation is not a
-    finite number > 0.
+    Raises RecordError if the record has no valid anchor, or if the value or the standard deviation
+    of an anchor in MEASURING is not a finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
     if name not in ANCHORS:

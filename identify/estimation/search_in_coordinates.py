@@ -1,10 +1,10 @@
 """Searches in the coordinates of `bounds` in place of the parameters.
 
-The parameters are a function of the coordinates. A linear function is linearised together with the
-problem. The function of log-Cholesky coordinates is curved. The problem is then linearised in the
-parameters only, and a step follows the curved function to the least linearised cost. This needs no
-run of the model. If the curved function were linearised too, steps would be short where the data
-determine the parameters well.
+The parameters are a function of the coordinates. If this function is linear, the problem is
+linearised in the coordinates. The function of log-Cholesky coordinates is curved. The problem is
+then linearised in the parameters only, and a step follows the curved function to the least
+linearised cost. Such a step needs no run of the model. If the curved function were linearised too,
+steps would be short where the data determine the parameters well.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ class InCoordinates:
         return cost, factor @ self.bounds.slope(coordinates), residual
 
     def parameters(self, coordinates: Array) -> Array:
-        """Return the parameters (p,) of coordinates (p,), infinite or NaN for far steps."""
+        """Return the parameters (p,) of coordinates (p,). They can be infinite or NaN far away."""
         # The exponentials of log-Cholesky coordinates can make a body larger than any number.
         with np.errstate(over="ignore", invalid="ignore"):
             return self.bounds.parameters(coordinates)
@@ -52,7 +52,7 @@ class InCoordinates:
 
 @dataclass(frozen=True)
 class _LinearInParameters(InCoordinates):
-    """Problem in coordinates that is linearised in the parameters."""
+    """Problem whose unknowns are coordinates, but which is linearised in the parameters."""
 
     def linearise(self, coordinates: Array) -> Linearisation:
         """Return the cost at coordinates (p,), and the linearisation at their parameters."""
@@ -61,7 +61,7 @@ class _LinearInParameters(InCoordinates):
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Problem |residual + factor @ (parameters - at)|^2."""
+    """Problem to minimise |residual + factor @ (parameters - at)|^2 over the parameters."""
 
     at: Array
     factor: Array
@@ -88,8 +88,8 @@ def minimise_in_coordinates(
 ) -> Solution:
     """Minimise a least-squares problem in coordinates of bounds.
 
-    Start, scale and solution are coordinates (p,). For the other arguments see
-    `bounded_least_squares.minimise`.
+    start, scale (p,): coordinates at the start, and their typical changes. The parameters of the
+    solution are coordinates, too. For the other arguments see `bounded_least_squares.minimise`.
     """
     arguments = start, bounds.lower, scale, criteria, on_iteration, ahead
     if not bounds.log_cholesky:
@@ -107,9 +107,9 @@ def _step_along_curve(
     scale: Array,
     radius: float,
 ) -> tuple[Array, float]:
-    """Return the step of coordinates (p,) to the least linearised cost in the box, and its gain.
+    """Return the step of coordinates (p,) to the least linearised cost in the box.
 
-    factor, residual: linearisation in the parameters.
+    The second result is the predicted gain. factor, residual: linearisation in the parameters.
     """
     linearised = _Linearised(bounds.parameters(coordinates), factor, residual)
     found = minimise(

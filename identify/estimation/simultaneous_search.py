@@ -1,8 +1,8 @@
 """Simultaneous search for the parameters and for common errors with wide priors.
 
 Examples of such errors are the state at a start in motion, and the clock of the commands. They move
-the optimum of the parameters far away. A search that eliminates them is right only near the errors
-about which the model was linearised. Here they are unknowns like the parameters. The search
+the optimum of the parameters far away. A search that eliminates these errors is right only near the
+values about which the model was linearised. Here they are unknowns like the parameters. The search
 minimises
 
     |r(p, z)|^2 + |z|^2 + |prior(p)|^2
@@ -32,7 +32,7 @@ def with_likely_errors(
     """Return the problem with its most likely common errors, and the optimal parameters (p,).
 
     problem: result of `with_common_errors` at the parameters start (p,). Raises LoopFailure if the
-    model is unstable with them.
+    model is unstable at the start or with the result.
     """
     bounds = problem.bounds
     joint = JointProblem(problem, tuple(JointRun.of(run, start) for run in problem.runs))
@@ -73,11 +73,11 @@ class JointRun:
         """Return the joint run of a model that was whitened for common errors at start (p,)."""
         modes = run.whitened_modes.reshape(-1, run.whitened_modes.shape[2])
         rest = np.delete(modes, run.contained, axis=1)
-        alone = replace(run, common=replace(run.common, geometry=None), marginal=None)
+        unwhitened = replace(run, common=replace(run.common, geometry=None), marginal=None)
         # Runs that are already simulated remain valid, because whitening does not change them.
-        alone.known_runs.update(run.known_runs)
+        unwhitened.known_runs.update(run.known_runs)
         others = Marginal.of(rest) if rest.size else None
-        return cls(alone, start, modes[:, run.contained], others)
+        return cls(unwhitened, start, modes[:, run.contained], others)
 
     def modes_at(self, run: LoopModel, parameters: Array) -> Array:
         """Return the modes (m, k) of the unknown errors of a run at parameters (p,)."""
@@ -87,25 +87,23 @@ class JointRun:
         return np.asarray(seen.reshape(self.modes.shape))
 
     def whiten(self, rows: Array) -> Array:
-        """Return rows (m,) or (m, k) that are whitened for the other errors, too.
-
-        The given rows are in standard deviations of the noise.
-        """
+        """Return rows (m,) or (m, k) in standard deviations of the noise, whitened for `others`."""
         return rows if self.others is None else self.others.whiten(rows)
 
 
 @dataclass(frozen=True)
 class JointProblem:
-    """Least-squares problem in the coordinates of the parameters and in errors of each run.
+    """Least-squares problem in the coordinates of the parameters and in the errors of each run.
 
-    See `bounded_least_squares.Problem`.
+    The unknowns are the coordinates, and then the errors run by run. See
+    `bounded_least_squares.Problem`.
     """
 
     problem: OutputErrorProblem
     parts: tuple[JointRun, ...]
 
     def runs_at(self, unknowns: Array) -> tuple[Array, list[LoopModel]]:
-        """Return the parameters (p,), and the runs with the errors, that the unknowns contain."""
+        """Return the parameters (p,) of the unknowns, and the runs with the errors among them."""
         bounds = self.problem.bounds
         coordinates, errors = np.split(unknowns, [len(bounds.lower)])
         runs = []
@@ -147,10 +145,10 @@ class JointProblem:
             # Modes come first, because their run is cached and also gives the residuals.
             modes = one.modes_at(run, parameters)
             missed, shown = run.linearised(parameters)
-            left = one.whiten(missed.ravel())
-            cost += float(left @ left + errors @ errors)
+            whitened = one.whiten(missed.ravel())
+            cost += float(whitened @ whitened + errors @ errors)
             columns = np.column_stack([shown.reshape(missed.size, -1), modes])
-            reduced = triangular_factor(one.whiten(columns), left)
+            reduced = triangular_factor(one.whiten(columns), whitened)
             own = slice(first, first + len(errors))
             rows = np.zeros((len(reduced) + len(errors), len(unknowns) + 1))
             filled = rows[: len(reduced)]

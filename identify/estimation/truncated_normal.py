@@ -3,8 +3,8 @@
 The truncated distribution is approximated by expectation propagation (Minka 2001; Cunningham et
 al. 2011, "Gaussian probabilities and expectation propagation"). Each bound is replaced by a normal
 factor. The factor is chosen such that mean and variance along the bound's direction agree with
-those of the distribution that is truncated there. This is repeated for all bounds in turn until
-nothing changes. For a single bound, mean and covariance are exact.
+those of the distribution that is truncated there. All bounds are visited in turn until their
+factors no longer change. For a single bound, mean and covariance are exact.
 """
 
 from dataclasses import dataclass
@@ -15,16 +15,23 @@ from scipy.special import log_ndtr
 from identify.arrays import Array
 
 FAR = 8.0
-"""Distance of a bound, in standard deviations, from which it has no effect."""
+"""Distance of the mean inside a bound, in standard deviations, above which the bound is ignored."""
 
 DEEP = 100.0
-"""Distance beyond a bound, in standard deviations, from which series replace the formulas."""
+"""Distance of the mean beyond a bound, in standard deviations, above which a series is used.
+
+The exact formulas would lose all digits there.
+"""
 
 SWEEPS = 100
 """Largest number of passes over all bounds."""
 
 SETTLED = 1e-9
-"""Largest change of a factor, in standard deviations, at which the passes end."""
+"""Tolerance below which the passes end.
+
+It applies to the change of the mean, in standard deviations, and to the relative change of the
+precision along each bound's direction.
+"""
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,8 @@ class TruncatedNormal:
     """Normal distribution that is truncated at the bounds directions (k, p) @ x >= lower (k,).
 
     mean (p,), covariance (p, p): moments of the truncated distribution. precision, weighted (k,):
-    precision of each bound's normal factor, and precision times its mean.
+    precision of each bound's normal factor, and precision times mean of this factor. Both are zero
+    for a bound without effect.
     """
 
     mean: Array
@@ -44,74 +52,82 @@ class TruncatedNormal:
     def marginals(self, rows: Array) -> tuple[Array, Array]:
         """Return mean and standard deviation (n,) of the quantities rows (n, p) @ x.
 
-        They are those of a normal distribution that is not truncated at the quantity's own bound
-        yet, if it has one.
+        If a quantity is a positive multiple of a bounded one, the factor of this bound is taken out
+        again. The quantity's distribution is then the returned normal distribution, truncated at
+        the bound.
         """
         mean = rows @ self.mean
         variance = np.einsum("gi,ij,gj->g", rows, self.covariance, rows)
         norms = np.linalg.norm(self.directions, axis=1)
-        # the cosine of the angle between each quantity and each bound's direction
-        along = rows @ self.directions.T
-        parallel = along >= (1 - 1e-12) * np.linalg.norm(rows, axis=1)[:, None] * norms
-        for n, k in np.argwhere(parallel & (along > 0) & (self.precision != 0)):
-            scale = along[n, k] / norms[k] ** 2
-            alone = 1.0 / variance[n] - self.precision[k] / scale**2
-            mean[n] = (mean[n] / variance[n] - self.weighted[k] / scale) / alone
-            variance[n] = 1.0 / alone
+        # Scalar products of each quantity with each bound's direction.
+        products = rows @ self.directions.T
+        parallel = products >= (1 - 1e-12) * np.linalg.norm(rows, axis=1)[:, None] * norms
+        for n, k in np.argwhere(parallel & (products > 0) & (self.precision != 0)):
+            scale = products[n, k] / norms[k] ** 2
+            remaining = 1.0 / variance[n] - self.precision[k] / scale**2
+            mean[n] = (mean[n] / variance[n] - self.weighted[k] / scale) / remaining
+            variance[n] = 1.0 / remaining
         return mean, np.sqrt(variance)
 
 
 def truncated(mean: Array, covariance: Array, directions: Array, lower: Array) -> TruncatedNormal:
-    """Return a normal distribution of mean (p,) and covariance (p, p) within bounds.
+    """Return the normal distribution with mean (p,) and covariance (p, p), truncated at bounds.
 
     directions (k, p), lower (k,): the bounds directions @ x >= lower. If the passes do not
-    converge, the distribution is returned without bounds.
+    converge, or if the distribution without one bound's factor has no positive variance, the
+    distribution is returned without bounds.
     """
-    whole = TruncatedNormal(
+    untruncated = TruncatedNormal(
         mean, covariance, directions, np.zeros(len(lower)), np.zeros(len(lower))
     )
-    found = np.array(mean, dtype=float)
-    spread = np.array(covariance, dtype=float)
-    # natural parameters of the factors: precision, and precision times mean
+    new_mean = np.array(mean, dtype=float)
+    new_covariance = np.array(covariance, dtype=float)
+    # Natural parameters of the factors: precision, and precision times mean.
     precision = np.zeros(len(lower))
     weighted = np.zeros(len(lower))
     for _ in range(SWEEPS):
         change = 0.0
-        for k, (direction, least) in enumerate(zip(directions, lower, strict=True)):
-            along = spread @ direction
-            variance = float(direction @ along)
+        for k, (direction, bound) in enumerate(zip(directions, lower, strict=True)):
+            # Covariance of x with the bounded quantity.
+            cross = new_covariance @ direction
+            variance = float(direction @ cross)
             if variance <= 0.0:
-                continue  # the prior fixes this quantity
-            centre = float(direction @ found)
-            left = 1.0 / variance - precision[k]
-            if left <= 0.0:
-                return whole
-            alone = (centre / variance - weighted[k]) / left
-            new = _factor(alone, 1.0 / left, float(least))
-            by_precision, by_weighted = new[0] - precision[k], new[1] - weighted[k]
-            precision[k], weighted[k] = new
+                continue  # the covariance leaves this quantity no freedom
+            centre = float(direction @ new_mean)
+            # The cavity is the distribution without the factor of this bound.
+            cavity_precision = 1.0 / variance - precision[k]
+            if cavity_precision <= 0.0:
+                return untruncated
+            cavity_mean = (centre / variance - weighted[k]) / cavity_precision
+            factor = _factor(cavity_mean, 1.0 / cavity_precision, float(bound))
+            by_precision, by_weighted = factor[0] - precision[k], factor[1] - weighted[k]
+            precision[k], weighted[k] = factor
             gain = 1.0 / (1.0 + by_precision * variance)
-            found += along * (gain * (by_weighted - by_precision * centre))
-            spread -= np.outer(along, along) * (gain * by_precision)
+            new_mean += cross * (gain * (by_weighted - by_precision * centre))
+            new_covariance -= np.outer(cross, cross) * (gain * by_precision)
             step = gain * (by_weighted - by_precision * centre) * variance**0.5
             change = max(change, abs(step), abs(by_precision) * variance)
         if change < SETTLED:
-            return TruncatedNormal(found, spread, directions, precision, weighted)
-    return whole
+            return TruncatedNormal(new_mean, new_covariance, directions, precision, weighted)
+    return untruncated
 
 
 def _factor(mean: float, variance: float, lower: float) -> tuple[float, float]:
-    """Return precision, and precision times mean, of the normal factor that replaces a bound."""
+    """Return precision, and precision times mean, of the normal factor that replaces a bound.
+
+    mean, variance: moments of the bounded quantity without this factor.
+    """
     std = variance**0.5
     beyond = (lower - mean) / std
     if beyond < -FAR:
         return 0.0, 0.0
     if beyond > DEEP:
-        moved = beyond + 1.0 / beyond
-        share = beyond**-2
+        shift = beyond + 1.0 / beyond
+        ratio = beyond**-2
     else:
-        moved = float(np.exp(-0.5 * beyond**2 - log_ndtr(-beyond))) / np.sqrt(2.0 * np.pi)
-        share = 1.0 - moved * (moved - beyond)
-    truncated = variance * share
-    precision = 1.0 / truncated - 1.0 / variance
-    return precision, (mean + std * moved) / truncated - mean / variance
+        shift = float(np.exp(-0.5 * beyond**2 - log_ndtr(-beyond))) / np.sqrt(2.0 * np.pi)
+        ratio = 1.0 - shift * (shift - beyond)
+    # Mean and variance of the truncated quantity are mean + std * shift and variance * ratio.
+    truncated_variance = variance * ratio
+    precision = 1.0 / truncated_variance - 1.0 / variance
+    return precision, (mean + std * shift) / truncated_variance - mean / variance

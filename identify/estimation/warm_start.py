@@ -14,9 +14,10 @@ torque balance of one joint. Its dry friction is known only while the joint slip
 near rest are left out. The equation is homogeneous. The scale anchor and, weakly, the initial guess
 determine the common factor.
 
-This equation is for the PID. In other laws of the drives the torque is also proportional to the
-gains. It is therefore the sum of the gains, each times the derivative of the torque with respect to
-it. The derivatives of a cascade depend on ratios of the gains, taken from the previous fit.
+This equation is for the PID. In other laws of the drives, multiplying all gains by one factor also
+multiplies the torque by this factor. The torque is therefore the sum of all gains, each times the
+derivative of the torque with respect to this gain. The derivatives of a cascade depend on ratios of
+the gains, taken from the previous fit.
 
 One standard deviation of a common error of the poses or of the geometry shifts theta by e. An error
 of the latency, of the zeros or of the scale shifts U instead. In the equation, shifts are
@@ -46,11 +47,11 @@ from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import LATENCY, SCALE, Marginal
 from identify.scenario import Filter
 
-# Share of the record left out at either end, where filtered derivatives are inaccurate.
+# Fraction of the record left out at either end, where filtered derivatives are inaccurate.
 EDGE_FRACTION = 0.02
-# Velocity above which a joint counts as slipping, as a share of its RMS velocity.
+# Speed above which a joint counts as slipping, as a fraction of its velocity's standard deviation.
 SLIPPING_SHARE = 0.5
-# Number of solutions of a fit. Each solution is weighted by the residual of the one before.
+# Number of solutions of a fit. Each is weighted by the RMS residual of the previous one.
 REWEIGHTINGS = 3
 
 
@@ -58,7 +59,7 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
     """Fit parameters (p,) to the measured poses and commands of the problem's runs.
 
     Each run has its own unknown torques at the start. The effect of a known payload and commanded
-    torques are on the right side. The size of the residuals is estimated from the fit, so that the
+    torques are on the right-hand side. The RMS residual is estimated from the fit, so that the
     initial guess has the right weight.
     """
     guess = problem.guess
@@ -67,29 +68,29 @@ def linear_warm_start(problem: OutputErrorProblem) -> Array:
     layout = guess.layout
     drives = problem.runs[0].settings.drives
     law = drives.joint_law(layout.split(guess.values)[3])
-    matrix, right, common = _stacked(problem, law)
+    matrix, right_side, common = _stacked(problem, law)
     least = least_values(layout)
     lower = np.concatenate([least, np.full(matrix.shape[1] - count, -np.inf)])
-    rows = _condensed(matrix, right, common)
+    rows = _condensed(matrix, right_side, common)
     for _ in range(REWEIGHTINGS):
         whitened = rows / noise
         if common.shape[1]:
             whitened = Marginal.of(common / noise).whiten(whitened)
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
         residual = whitened @ np.append(solution, -1.0)
-        noise = max(noise * float(np.sqrt(np.sum(residual**2) / len(right))), 1e-9)
+        noise = max(noise * float(np.sqrt(np.sum(residual**2) / len(right_side))), 1e-9)
         if law.lx.any():  # the columns of a cascade depend on the gains
             found = np.maximum(solution[:count], SMALLEST_SHARE * guess.values)
             law = drives.joint_law(layout.split(found)[3])
-            matrix, right, common = _stacked(problem, law)
-            rows = _condensed(matrix, right, common)
+            matrix, right_side, common = _stacked(problem, law)
+            rows = _condensed(matrix, right_side, common)
     return np.maximum(solution[:count], least)
 
 
 def _condensed(matrix: Array, right: Array, common: Array) -> Array:
-    """Return the matrix and the right side of equations as one array (rows, u + 1).
+    """Return the matrix and the right-hand side of equations as one array (rows, u + 1).
 
-    Without common errors it is reduced to its triangular factor, which is equivalent.
+    Without common errors, the array is reduced to its triangular factor, which is equivalent.
     """
     return np.column_stack([matrix, right]) if common.shape[1] else triangular_factor(matrix, right)
 
@@ -97,40 +98,43 @@ def _condensed(matrix: Array, right: Array, common: Array) -> Array:
 def _stacked(problem: OutputErrorProblem, law: JointLaw) -> tuple[Array, Array, Array]:
     """Return the equations of all runs, N m or N.
 
-    They are the matrix (rows, p + n runs), the right side (rows,), and the common errors (rows, k).
+    The results are the matrix (rows, p + n runs), the right-hand side (rows,), and the effects of
+    common errors (rows, k). Under torque commands, the matrix is (rows, p), and there are no common
+    errors. Rows of joints that do not slip are left out.
     """
     matrices = []
-    right = []
+    right_sides = []
     common = []
     runs = [run.on_grid() for run in problem.runs]
     layout = runs[0].robot.layout
     count = len(layout.names)
     joints = layout.joints
-    for place, run in enumerate(runs):
+    for number, run in enumerate(runs):
         balance, slipping = joint_balance(run, run.without_gaps(), problem.low_pass, law)
         columns = balance[slipping]
         if run.settings.drives.torques:
-            # Commanded torques do not depend on gains, so they are on the right side.
+            # Commanded torques do not depend on gains, so they are on the right-hand side.
             columns[:, layout.joint_pid] = 0.0
             matrices.append(columns[:, :count])
             torque, _, _ = effective_command(run, problem.low_pass)
-            right.append(torque[slipping] - columns[:, :count] @ run.payload)
+            right_sides.append(torque[slipping] - columns[:, :count] @ run.payload)
             common.append(np.zeros((len(columns), 0)))
             continue
         matrix = np.zeros((len(columns), count + joints * len(runs)))
         matrix[:, :count] = columns[:, :count]
-        matrix[:, count + joints * place :][:, :joints] = columns[:, count:]
+        matrix[:, count + joints * number :][:, :joints] = columns[:, count:]
         matrices.append(matrix)
-        right.append(-columns[:, :count] @ run.payload)
+        right_sides.append(-columns[:, :count] @ run.payload)
         common.append(_common_torques(run, problem.guess, problem.low_pass)[slipping])
-    return np.concatenate(matrices), np.concatenate(right), np.concatenate(common)
+    return np.concatenate(matrices), np.concatenate(right_sides), np.concatenate(common)
 
 
 def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> Array:
-    """Return the torques (N, n, k), N m or N, that common errors add to the balance of every joint.
+    """Return the torques (N, n, 2 k), N m or N, that common errors add to every joint's balance.
 
-    The torques are for one standard deviation of each error of poses, geometry and latency, with
-    the gains of the initial guess.
+    The torques are for one standard deviation of each of k errors of poses, geometry and loop, with
+    the gains of the initial guess. The parts by the proportional gain come first, and then those by
+    the integral gain.
     """
     common = run.common
     moved = []
@@ -152,7 +156,8 @@ def _common_torques(run: LoopModel, guess: StartingGuess, low_pass: Filter) -> A
 def _moved_commands(stds: Mapping[str, float], command: Array, rate: Array) -> Array:
     """Return the changes (N, n, k) of commands (N, n) by one standard deviation of each error.
 
-    The errors are those of latency, zeros and scale. rate (N, n): rate of the commands.
+    The errors are those of the latency, of the scale, and of the zeros of the joints in their
+    order. rate (N, n): rate of the commands.
     """
     zeros = iter(np.eye(command.shape[1]))
     changes = [
@@ -182,10 +187,10 @@ def joint_balance(
     -------
     columns : ndarray, shape (N, n, p + n)
         Columns of the balance, N m or N per unit of each unknown. The columns of the dynamic
-        parameters give the joint's torque. The columns of the gains and of the torques at the
-        start follow. They give the controller's torque with the opposite sign.
+        parameters give the joint's torque. The columns of the gains, and then those of the torques
+        at the start, give the controller's torque with the opposite sign.
     slipping : ndarray of bool, shape (N, n)
-        True for frames in which a joint slips.
+        True for frames in which a joint slips, except at both ends of the record.
     """
     robot = run.robot
     rate_hz = run.settings.timing.frame_rate_hz
@@ -221,8 +226,8 @@ def joint_balance(
 def effective_command(run: LoopModel, low_pass: Filter) -> tuple[Array, Array, Array]:
     """Return the filtered command that acts on the joints, its rate, and its integral, per frame.
 
-    The rate is the rate in the joint PID, the held difference of two commands. A held command lags
-    by half a frame, and a ramped command by a whole frame.
+    The rate is that of the joint PID, the held difference of two commands. In addition to the
+    latency, a held command lags by half a frame on average, and a ramped command by a whole frame.
     """
     commands = run.logged
     timing = run.settings.timing
@@ -245,8 +250,8 @@ def _acted(
 ) -> tuple[Array, Array, Array]:
     """Return the results of `effective_command` for commands with individual latencies.
 
-    The acting command is integrated from arrival to arrival, and the filtered rates of the
-    integrals are returned.
+    What acts between two arrivals is integrated exactly. The derivative of the integral, filtered,
+    is the command or its rate.
     """
     rate_hz = timing.frame_rate_hz
     period = 1.0 / rate_hz
@@ -256,11 +261,11 @@ def _acted(
     differences = np.diff(commands, axis=0, prepend=commands[:1])
 
     def acting(values: Array, ramped: float) -> Array:
-        """Return the mean command in each frame. ramped: 1 for ramps, 0 for jumps."""
+        """Return the filtered acting values. ramped: 1 if they change in ramps, 0 if in jumps."""
 
         def since(which: NDArray[np.intp] | slice, duration: Array) -> Array:
-            """Return the integral of the acting command, over a duration since its arrival."""
-            # During the first frame, a ramp lags behind the command.
+            """Return the integral of the acting values over a duration since their arrival."""
+            # During the first frame period, a ramp lags behind the command.
             behind = np.minimum(duration, period)
             behind = behind - behind**2 / (2 * period)
             return (
@@ -301,17 +306,18 @@ def running_integral(samples: Array, rate_hz: float) -> Array:
 def bounded_fit(
     matrix: Array, right: Array, guess: StartingGuess, anchor: ScaleAnchor, lower: Array
 ) -> Array:
-    """Return the unknowns (u,) >= lower of whitened equations (rows, u), with guess and anchor.
+    """Return the least-squares solution (u,) >= lower of whitened equations (rows, u).
 
-    The first p unknowns are the parameters. The unknowns after them have no prior.
+    The guess and the anchor are added as equations. The first p unknowns are the parameters. The
+    others have no prior.
     """
     size = matrix.shape[1]
     known_size = len(guess.values)
     extra = size - known_size
     triangle = triangular_factor(matrix, right)[:size]
     prior = np.eye(known_size, size) / guess.std[:, None]
-    place, measured = anchor.row(guess.layout)
-    known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
+    anchor_rows, measured = anchor.row(guess.layout)
+    known = np.vstack([triangle[:, :size], prior, np.pad(anchor_rows, ((0, 0), (0, extra)))])
     values = np.concatenate([triangle[:, size], guess.values / guess.std, measured])
     scale = np.concatenate([guess.std, np.ones(extra)])
     solved = lsq_linear(known * scale, values, bounds=(lower / scale, np.inf), method="bvls")
