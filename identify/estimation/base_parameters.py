@@ -209,10 +209,7 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
-    """Return the regression matrix H (m n, p) of a reference of n frames, sampled at `rate_hz`.
-
-    m: number of coordinates in which the platform can move.
-    """
+    """Return the regression matrix H (m n, p) of a reference with n frames, for m coordinates."""
     acceleration, _ = spline_derivatives(reference.rates, rate_hz)
     twist = robot.twist(reference.poses, reference.rates)
     twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
@@ -221,11 +218,7 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 
 def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
-    """Return the indices of the pivots among columns of length one, and `BaseParameters.gap`.
-
-    preference: number of each column. Of the columns that are long enough, the one with the lowest
-    number becomes the next pivot.
-    """
+    """Return the indices of the pivots among columns of length one, and `BaseParameters.gap`."""
     remainder = columns.copy()
     smallest = 1.0
     chosen: list[int] = []
@@ -235,7 +228,7 @@ def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[
         if longest <= DEPENDENT:
             return np.array(chosen), (longest, smallest)
         allowed = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
-        # The longest column would depend on the motion, so a fixed order is used.
+        # The longest column would depend on the motion, so the one with the lowest number is used.
         pivot = int(allowed[np.argmin(preference[allowed])])
         smallest = min(smallest, float(lengths[pivot]))
         chosen.append(pivot)

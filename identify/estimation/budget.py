@@ -164,8 +164,7 @@ def parameter_budget(
 ) -> Budget:
     """Return the budget of a robot's p parameters.
 
-    The first p rows and columns of the covariance and of its parts by source are those of the
-    parameters. Further ones are left out.
+    The first p rows and columns of the covariance and of its parts are those of the parameters.
     """
     names = layout.names
     parts = {key: np.diag(part)[: len(names)] for key, part in sources.items()}
@@ -174,10 +173,7 @@ def parameter_budget(
 
 
 def together(budgets: Sequence[Budget]) -> Budget:
-    """Return one budget with the quantities and the sources of all budgets.
-
-    A source that a budget lacks adds nothing to the quantities of this budget.
-    """
+    """Return one budget with the quantities and the sources of all budgets."""
     sources = [key for key in SOURCES if any(key in one.sources for one in budgets)]
     rows = [
         np.stack(

@@ -79,8 +79,7 @@ def conditioning(
     group_std = np.sqrt(base.combinations**2 @ guess.std[:count] ** 2)
     prior_std = np.concatenate([group_std, guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # The motion depends on a base parameter as it does on its pivot, so both have the same
-    # information.
+    # The motion depends in the same way on a base parameter and on its pivot.
     scaled = information[np.ix_(seen, seen)] * np.outer(prior_std, prior_std)
     # The common factor changes all values in proportion. This direction is removed.
     free = null_space((values / prior_std)[None])

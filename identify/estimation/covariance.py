@@ -8,9 +8,8 @@ makes the response nonlinear. Therefore the experiment is repeated on the identi
 random noise. Each repetition gives residuals r. With their Jacobian J with respect to the
 parameters, the scores J^T r have the same covariance as those of the real record. With W the
 information of data and prior, the covariance of the estimate is W^-1 (cov(J^T r) + prior
-information) W^-1. The prior information is that of the initial guess and of the scale anchor. The
-part of the covariance due to the guess is the effect of errors of the guess, which are the same in
-every record.
+information) W^-1. The prior information includes that of the initial guess. The part of the
+covariance due to the guess is the effect of errors of the guess, which all records share.
 
 A model driven by the logged commands has white residuals, and W^-1 is the whole covariance. If a
 model misses the record by more than noise explains, the effect of its error on the scores is added

@@ -138,7 +138,7 @@ class Evidence:
     """Evidence of a record for a law.
 
     cost: cost at the optimum. misfit: cost of the poses alone, divided by the number of their
-    components. narrowed: ln det W - ln det P, see the module docstring.
+    components. narrowed: ln det W - ln det P.
     """
 
     cost: float
@@ -147,10 +147,7 @@ class Evidence:
 
 
 def evidence(found: Search) -> Evidence:
-    """Return the evidence for the law of a finished search.
-
-    Raises LoopFailure if the model is unstable at the optimum.
-    """
+    """Return the evidence of a finished search. Raises LoopFailure for an unstable model."""
     parameters = found.solution.parameters
     judged = found.linearised()
     cost, factor, _ = judged.linearise(parameters)

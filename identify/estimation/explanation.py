@@ -78,10 +78,7 @@ class Misfit:
 
     @property
     def share_of_model(self) -> float:
-        """Fraction of the mean squared residual that is above its expected value for noise alone.
-
-        It is zero if the excess is not significant.
-        """
+        """Fraction of the mean squared residual above its expected value, zero if insignificant."""
         return 1 - self.expected / self.found if self.significant else 0.0
 
     @property
@@ -129,10 +126,7 @@ def coloured_score_covariance(residuals: Array, jacobian: Array, ok: NDArray[np.
 
 
 def spectral_density(residuals: Array, ok: NDArray[np.bool_]) -> Array:
-    """Return the spectral density (f, 6, 6) of residuals (n, 6) of the good frames, `ok` (N,).
-
-    f: number of frequencies of a real transform of the zero-padded frames.
-    """
+    """Return the spectral density (f, 6, 6) of residuals (n, 6) of the good frames, `ok` (N,)."""
     count = len(ok)
     rows = np.zeros((count, 6))
     rows[ok] = residuals
@@ -262,10 +256,7 @@ class Explanation:
 
     @property
     def hidden(self) -> bool:
-        """True if the model's error dominates under the logged commands, but not in the estimate.
-
-        This can happen if the estimate is for the closed loop.
-        """
+        """True if the model's error dominates only under the logged commands."""
         return self.driven_misfit.decides and not self.misfit.decides
 
     @property

@@ -48,10 +48,7 @@ def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...
 
 
 def _outside(robot: Robot, estimate: Array, covariance: Array) -> list[str]:
-    """Return a warning for each full body whose centre of mass lies outside of the drawn body.
-
-    It lies outside if it is farther from its nominal position than the drawn body reaches.
-    """
+    """Return a warning for each full body whose centre of mass is outside of the drawn body."""
     layout = robot.layout
     reaches = robot.geometry.body_reaches
     said = []

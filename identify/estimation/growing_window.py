@@ -21,10 +21,7 @@ SHORTEST_S = 0.5
 """Length of the window that is tried first, s. It is a few periods of the joint loop."""
 
 LEAST_GROWTH = 1.05
-"""Ratio of the lengths of consecutive windows up to which the model may miss the longer one.
-
-Above this ratio, a window that the model misses is shortened.
-"""
+"""Ratio of consecutive windows up to which a window that the model misses is not shortened."""
 
 MOST_WINDOWS = 30
 """Largest number of windows that are searched. Then the search ends within the record."""
@@ -38,9 +35,8 @@ def over_growing_window(
 ) -> tuple[OutputErrorProblem, Array]:
     """Return the problem with its most likely common errors, and the optimal parameters (p,).
 
-    The parameters are optimal for the longest window that was reached, which is normally the whole
-    record. start (p,): parameters within the bounds. Raises LoopFailure if the model is unstable
-    with the result.
+    They are for the longest window that was reached, normally the whole record. start (p,):
+    parameters within the bounds. Raises LoopFailure if the model is unstable with the result.
     """
     known, parameters = problem, start
     reached_s = SHORTEST_S / 2.0

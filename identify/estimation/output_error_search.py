@@ -2,7 +2,7 @@
 
 The linear warm start comes first. The command-driven output error, which has few local minima, is
 minimised next. The closed-loop output error is minimised last, because stick-slip gives it narrow
-local minima. All searches end by the criteria of eq. 35. If poses have errors in common, a search
+local minima. Both searches end by the criteria of eq. 35. If poses have errors in common, a search
 that ignores them precedes the others, because far from the optimum these errors would explain the
 relevant residuals. It is left out if the motion is far from linear in the errors. If the model is
 unstable with both the warm start and the initial guess, multiple shooting finds a stable model.
@@ -238,10 +238,7 @@ def _reuses_sensitivities(problem: OutputErrorProblem) -> bool:
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
-    """Return the better of the command-driven solution (p,) and the guess, in the closed loop.
-
-    Raises EstimationError if the closed loop is unstable with both.
-    """
+    """Return the better of the command-driven solution (p,) and the guess, in the closed loop."""
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(

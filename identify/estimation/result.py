@@ -1,7 +1,4 @@
-"""Result of an identification: estimates with their uncertainty and judgement.
-
-It can be shown as a table, as JSON, in one line, and in a notebook.
-"""
+"""Result of an identification, also as a table, as JSON, in one line, and in a notebook."""
 
 from __future__ import annotations
 
@@ -73,12 +70,9 @@ class IdentificationResult:
         Estimates of the base parameters, and their 95 % intervals.
     bounded : BoundedEstimate
         Estimate within bounds, which states the distribution of every quantity.
-    conditioning : Conditioning
-        How much better the records determine some parameters than others.
-    scale_anchor : ScaleAnchor
-        Measurement that fixes the common factor of all parameters.
-    common_errors : CommonErrorEstimates
-        Estimates of the errors that all poses of the first record have in common.
+    conditioning, scale_anchor, common_errors
+        Conditioning of the estimate, the measurement that fixes the common factor, and estimates of
+        the errors that all poses of the first record have in common.
     base_rank : int
         Number of independent groups that the references excite, by the paper's rule.
     iterations, evaluations : int
@@ -94,14 +88,13 @@ class IdentificationResult:
         sensor's noise alone.
     whiteness : Whiteness
         Test of the residuals of the model that is driven by the logged commands.
-    driven_estimate : ndarray, shape (p,)
-        Estimate with the command-driven model. It is `estimate` if no closed-loop search followed.
-    driven_misfit : Misfit
-        Misfit of the command-driven model.
+    driven_estimate, driven_misfit : ndarray, shape (p,), and Misfit
+        Estimate and misfit of the command-driven model. This estimate is `estimate` if no
+        closed-loop search followed.
     notes, warnings : tuple of str
-        Decisions when the records were read, with estimates of their clocks, and what may be wrong.
+        Decisions when the records were read, estimates of their clocks, and what may be wrong.
     seconds : dict of float
-        Times that drive, warm_start, search and uncertainty took, s.
+        Durations of the steps, s.
     """
 
     layout: ParameterLayout
@@ -292,8 +285,7 @@ class IdentificationResult:
     def _assumptions(self) -> dict[str, dict[str, Any]]:
         """Return how much each kind of assumption on bodies and passive joints widens intervals.
 
-        Each entry has the identified parameter whose interval is widened most, and the factor by
-        which its standard deviation grows.
+        Each entry has the identified parameter whose interval is widened most, and the factor.
         """
         shown = np.flatnonzero(self.identifiable)
         found = {}

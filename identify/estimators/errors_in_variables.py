@@ -18,8 +18,8 @@ and Vandewalle, "The total least squares problem", SIAM 1991, chapter 10).
 
 Directions that the motion does not determine better than the initial guess are fixed at the guess
 first (truncation), because noise would dominate them. Both methods remove the bias, but not the
-scatter. If the errors are large, the difference of the normal matrix and the matrix of the errors
-is nearly singular, and the standard deviations are large.
+scatter. If the errors are large, the normal matrix minus the second moments of the errors is nearly
+singular, and the standard deviations are large.
 """
 
 import time
@@ -47,14 +47,17 @@ from identify.estimators.least_squares import (
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 MAX_ITERATIONS = 10  # largest number of simulated runs
-STEP_TOLERANCE = 0.05  # largest last step of every parameter, as a share of its standard deviation
+# Step of every parameter, as a fraction of its standard deviation, up to which the iterations have
+# converged.
+STEP_TOLERANCE = 0.05
 
 
 @estimator("torque, IV", uses="poses, torque")
 def instrumental_variables(evidence: Evidence) -> Estimate:
     """Estimate with instruments from simulated runs, starting at weighted least squares.
 
-    Each run simulates the current estimate. Raises EstimationError if its model is unstable.
+    Each run simulates the current estimate. Raises EstimationError if the model of an estimate is
+    unstable, or if the record has no joint channels.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -82,7 +85,7 @@ def iv_fit(
     """Solve Z^T (W x - tau) = 0 in whitened rows, with the initial guess as a prior.
 
     instruments: Z (2 m, u). noise (2 m,): standard deviations of the rows, N m or N. Returns the
-    unknowns x (u,) and their covariance (u, u).
+    unknowns x (u,), moved to within their bounds, and their covariance (u, u) without bounds.
     """
     values, std = prior_of(guess)
     rows = equations.whitened(noise)
@@ -92,10 +95,11 @@ def iv_fit(
     normal = (z.T @ rows.matrix) * np.outer(std, std) + prior
     moment = std * (z.T @ (rows.right - rows.matrix @ values))
     inverse = np.linalg.inv(normal)
-    spread = (z.T @ z) * np.outer(std, std) + prior
-    covariance = inverse @ spread @ inverse.T * np.outer(std, std)
+    # Covariance of Z^T (W x - tau), with the prior.
+    scores = (z.T @ z) * np.outer(std, std) + prior
+    covariance = inverse @ scores @ inverse.T * np.outer(std, std)
     unknowns = values + std * (inverse @ moment)
-    return nearest_admissible(guess.layout, unknowns, spread / np.outer(std, std), std), covariance
+    return nearest_admissible(guess.layout, unknowns, scores / np.outer(std, std), std), covariance
 
 
 def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters: Array) -> Array:
@@ -116,17 +120,17 @@ def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters
 # Number of disturbed copies of a record. Few are enough, because each has thousands of rows.
 DRAWS = 4
 SHOWN = 3.0  # factor by which the motion must determine a direction better than the prior
-# Smallest last entry of the singular vector, relative to its largest, that gives a solution. The
-# last entry belongs to the right side of the equations.
+# Last entry of the singular vector, as a fraction of its largest entry, below which there is no
+# solution. The last entry belongs to the right-hand side of the equations.
 NOT_GENERIC = 1e-12
 
 
 @estimator("torque, total LS", uses="poses, torque")
 def total_least_squares(evidence: Evidence) -> Estimate:
-    """Estimate by total least squares with drawn errors of the columns.
+    """Estimate by total least squares with sampled errors of the columns.
 
     Raises EstimationError if the solution is not generic, which means that the torques have no part
-    in it.
+    in the singular vector, or if the record has no joint channels.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)
@@ -144,8 +148,10 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     blocks = ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std))))
     for block, columns in blocks:
         matrix = rows.matrix[block, columns]
-        right = rows.right[block]
-        solution, covariance = _fit_block(matrix, right, errors[:, block], columns, values, std)
+        right_side = rows.right[block]
+        solution, covariance = _fit_block(
+            matrix, right_side, errors[:, block], columns, values, std
+        )
         unknowns[columns] += std[columns] * solution
         deviations[columns] *= np.sqrt(np.diag(covariance))
     admissible = nearest_admissible(guess.layout, unknowns, information(rows, guess), std)
@@ -156,12 +162,15 @@ def total_least_squares(evidence: Evidence) -> Estimate:
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
     """Solve matrix x = right by generalised total least squares in the determined directions.
 
-    matrix (n, p)             Matrix. Its rows have the standard deviation 1.
-    right (n,)                Right side. The prior of x is 0 with standard deviation 1.
+    The prior of each entry of x is 0 with the standard deviation 1. In the other directions, the
+    solution is the prior.
+
+    matrix (n, p)             Matrix of equations with the standard deviation 1.
+    right (n,)                Right-hand side.
     errors (draws, n, p + 1)  Sampled errors of (matrix | right).
 
     Returns the solution x (p,), and its covariance (p, p) to first order. Raises EstimationError if
-    the entry of the right side in the singular vector is zero.
+    the entry of the right-hand side in the singular vector is zero to rounding.
     """
     size = matrix.shape[1]
     _, singular, directions = np.linalg.svd(matrix, full_matrices=False)
@@ -199,7 +208,7 @@ def _fit_block(
 
 
 def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) -> Array:
-    """Sample errors (draws, 2 n, u + 1) of the whitened columns and right side.
+    """Return sampled errors (draws, 2 m, u + 1) of the whitened columns and right-hand side.
 
     They follow from random noise of poses and torques.
     """
@@ -212,9 +221,9 @@ def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) 
     for _ in range(DRAWS):
         disturbed = poses + rng.standard_normal(poses.shape) @ factor.T
         torque = channels.torque + channels.torque_std * rng.standard_normal(channels.torque.shape)
-        again = torque_equations(evidence.problem, run, disturbed, torque, equations.slipping)
+        copy = torque_equations(evidence.problem, run, disturbed, torque, equations.slipping)
         differences = np.column_stack(
-            [again.matrix - equations.matrix, again.right - equations.right]
+            [copy.matrix - equations.matrix, copy.right - equations.right]
         )
         drawn.append(differences / noise[:, None])
     return np.stack(drawn)

@@ -66,7 +66,7 @@ class Estimate:
 
     seconds: duration without the computation of standard deviations. iterations: steps of a search,
     or solutions of a linear fit. evaluations: simulated runs of the model. A run with sensitivities
-    counts once.
+    counts once. note: remark on the estimation, such as why a search ended.
     """
 
     parameters: Array
@@ -79,9 +79,9 @@ class Estimate:
 
 @dataclass(eq=False)
 class Estimator:
-    """Estimating function with a title, and a text that names its inputs other than the commands.
+    """Estimating function with a title. It is called like the function.
 
-    It is called like the function.
+    uses: inputs of the function other than the commands, in words.
     """
 
     title: str

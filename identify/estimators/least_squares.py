@@ -35,9 +35,10 @@ from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
 from identify.model.loop_model import LoopModel
 
-# Prior standard deviation of the torques at the start, N m, so large that it has no effect.
+# Prior standard deviation of the torques at the start, N m. It is so large that it has no effect.
 UNKNOWN_TORQUE = 1e3
-UNKNOWN_FORCE = 1e6  # prior standard deviation of the forces at the start, N, of joints that slide
+# The same for the forces, N, of joints that slide.
+UNKNOWN_FORCE = 1e6
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,12 @@ class TorqueEquations:
     layout                          Layout of the parameters, the first of the u unknowns. The
                                     torques of the joints at the start follow.
     matrix, right (2 m, u) and (2 m,)
-                                    Coefficients and right side.
-    kind (2 m,)                     Index of the joint, plus the number of joints in rows of the
-                                    controller.
-    correlation                     Samples that count as one independent sample. After a low-pass
-                                    filter with cutoff f there are 2 f independent samples per
-                                    second.
+                                    Coefficients and right-hand side.
+    kind (2 m,)                     Index of the joint. In rows of the controller, the number of
+                                    joints is added to the index.
+    correlation                     Number of samples that count as one independent sample. After a
+                                    low-pass filter with cutoff f there are 2 f independent samples
+                                    per second.
     slipping (N, joints)            True for the frames and joints of the rows.
     """
 
@@ -102,11 +103,11 @@ def torque_equations(
     # The balance has the controller's torque with the opposite sign.
     matrix[len(columns) :, after_dynamic] = -columns[:, after_dynamic]
     joint = np.nonzero(rows)[1]
-    # The torque of a known payload is on the right side.
-    right = np.concatenate([filtered - columns[:, dynamic] @ run.payload[dynamic], filtered])
+    # The torque of a known payload is on the right-hand side.
+    right_side = np.concatenate([filtered - columns[:, dynamic] @ run.payload[dynamic], filtered])
     correlation = max(1.0, rate_hz / (2 * low_pass.cutoff_hz))
     kind = np.concatenate([joint, joint + layout.joints])
-    return TorqueEquations(layout, matrix, right, kind, correlation, rows)
+    return TorqueEquations(layout, matrix, right_side, kind, correlation, rows)
 
 
 def lower_bounds(layout: ParameterLayout) -> Array:
@@ -126,7 +127,8 @@ def nearest_admissible(
 ) -> Array:
     """Return the unknowns (u,) within their bounds that are nearest to given unknowns.
 
-    The metric is the information matrix (u, u). scale (u,): sizes of the unknowns.
+    The metric is the information matrix (u, u). scale (u,): typical magnitudes of the unknowns,
+    which improve the conditioning.
     """
     lower = lower_bounds(layout)
     if (unknowns >= lower).all():
@@ -195,7 +197,7 @@ def encoder_route(evidence: Evidence) -> Estimate:
     This is the conventional method without a camera. Forward kinematics of a parallel robot has no
     closed form. Newton's method solves all instants at once, each from its desired pose, which is
     always near the true pose. The note states the time for this. Raises EstimationError if there is
-    no pose for the angles near the desired pose.
+    no pose for the angles near the desired pose, or if the record has no joint channels.
     """
     began = time.perf_counter()
     run = evidence.run
@@ -248,7 +250,8 @@ def fit_equations(
     """Return the unknowns (u,) of the equations, and the standard deviations (2 m,) of the rows.
 
     The standard deviations, N m or N, come from the residuals of each joint, if weighted, or else
-    of all joints together. They account for the correlation due to the filter.
+    of all joints together. Rows of the dynamics and of the controller are kept apart. The standard
+    deviations account for the correlation due to the filter.
     """
     # Without weights there are only two groups, the rows of dynamics and of controllers.
     groups = equations.kind if weighted else equations.kind // equations.layout.joints

@@ -72,13 +72,13 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
 def _searched(problem: OutputErrorProblem, closed_loop: bool) -> Estimate:
     began = time.perf_counter()
     warm = linear_warm_start(problem)
-    # The last search gives the estimate. The searches before it provide its start.
+    # The final search gives the estimate. The searches before it provide its start.
     searches = list(output_error_searches(problem, warm, closed_loop, SilentProgress()).values())
     seconds = time.perf_counter() - began
-    last = searches[-1].solution
+    final = searches[-1].solution
     std = estimate_uncertainty(
-        searches[-1].linearised(), last.parameters, mixed_generator(ROUTES_UNCERTAINTY)
+        searches[-1].linearised(), final.parameters, mixed_generator(ROUTES_UNCERTAINTY)
     ).std
     iterations = sum(one.solution.iterations for one in searches)
     evaluations = sum(one.solution.evaluations for one in searches)
-    return Estimate(last.parameters, std, seconds, iterations, evaluations, last.stop_reason)
+    return Estimate(final.parameters, std, seconds, iterations, evaluations, final.stop_reason)

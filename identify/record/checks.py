@@ -1,8 +1,8 @@
 """Checks that a record is suitable for an identification.
 
 A record must come from this robot and loop, be long enough, and contain motion. It must begin at
-rest and be in m and rad. Each check raises EstimationError with its finding. Frames are counted
-from 0.
+rest and be in m and rad. If a check fails, it raises EstimationError with its finding. Frames are
+counted from 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,13 +26,14 @@ from identify.record.recording import check_record, is_timed, poses
 from identify.scenario import Excitation, Filter, Timing
 from identify.trajectory import FourierTrajectory
 
-MINIMUM_GOOD_SHARE = 0.5  # smallest share of measured frames
-# Largest difference of a reference from the integral of its rate, as a share of its travel.
+MINIMUM_GOOD_SHARE = 0.5  # smallest allowed fraction of measured frames
+# Largest difference of a reference from the integral of its rate, as a fraction of its travel.
 REFERENCE_GAP = 0.05
-# Difference, m or rad, that counts as rounding. For frame rates it is a relative difference.
+# Largest difference, m or rad, that counts as rounding. For frame rates it is a relative
+# difference.
 ROUNDING = 1e-9
-# Largest difference of two mirrored entries of a covariance that counts as rounding. Its unit is
-# the product of the two standard deviations.
+# Largest difference of two mirrored entries of a covariance that counts as rounding, as a fraction
+# of the product of the two standard deviations.
 ASYMMETRY = 1e-6
 
 
@@ -83,22 +84,22 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
 def check_trajectory(
     record: xr.Dataset, trajectory: FourierTrajectory, timing: Timing, duration_s: float
 ) -> None:
-    """Check that the reference is the exciting trajectory (eq. 37) at all its frames.
+    """Check that a record's reference is the exciting trajectory (eq. 37) in all frames.
 
     duration_s: duration of the excitation, s.
     """
-    asked = timing.frame_times(duration_s)
-    if record.sizes["time"] != len(asked):
+    times = timing.frame_times(duration_s)
+    if record.sizes["time"] != len(times):
         raise EstimationError(
-            f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "
+            f"the record has {record.sizes['time']} frames, and the scenario asks for {len(times)} "
             f"(excitation.duration_s = {duration_s:g} s): the record is of another experiment"
         )
-    gap = np.abs(poses(record, "reference") - trajectory.pose(asked))
-    if not gap.max() <= ROUNDING:
-        frame, worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
+    error = np.abs(poses(record, "reference") - trajectory.pose(times))
+    if not error.max() <= ROUNDING:
+        frame, worst = np.unravel_index(int(np.argmax(error)), error.shape)
         raise EstimationError(
             f"the record's reference is not the exciting trajectory: its {POSE[worst]} differs by "
-            f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: "
+            f"{error[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {times[frame]:.2f} s: "
             "the record is of another experiment"
         )
 
@@ -106,8 +107,8 @@ def check_trajectory(
 def check_reference(reference: Reference, rate_hz: float) -> None:
     """Check that the reference moves, and that its poses are the integral of its rates.
 
-    A motion faster than half the frame rate looks like a slow motion in the poses. The rates reveal
-    it.
+    A motion with frequencies above half the frame rate looks like a slow motion in the poses. The
+    rates reveal such a motion.
     """
     poses = reference.poses
     rates = reference.rates
@@ -121,12 +122,12 @@ def check_reference(reference: Reference, rate_hz: float) -> None:
     times = np.arange(len(poses)) * (1.0 / rate_hz)
     integral = make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()
     # the range of the difference does not depend on the constant of integration
-    gap = np.ptp(integral(times) - poses, axis=0)
-    worst = int(np.argmax(gap - REFERENCE_GAP * travel))
-    if gap[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
+    error = np.ptp(integral(times) - poses, axis=0)
+    worst = int(np.argmax(error - REFERENCE_GAP * travel))
+    if error[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
         raise EstimationError(
             f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and differs from the "
-            f"integral of its rate by up to {gap[worst]:.3g}: it has harmonics above half of "
+            f"integral of its rate by up to {error[worst]:.3g}: it has harmonics above half of "
             f"{rate_hz:g} Hz, or the rate is not its derivative"
         )
 
@@ -200,9 +201,9 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
 
     Later computations read only one triangle of each matrix.
     """
-    gap = np.abs(covariances - covariances.transpose(0, 2, 1))
+    asymmetry = np.abs(covariances - covariances.transpose(0, 2, 1))
     std = np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
-    excess = gap - ASYMMETRY * std[:, :, None] * std[:, None, :]
+    excess = asymmetry - ASYMMETRY * std[:, :, None] * std[:, None, :]
     if excess.max() <= 0:
         return
     worst, row, column = np.unravel_index(int(np.argmax(excess > 0)), excess.shape)
@@ -214,18 +215,19 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
     )
 
 
-REST_RATE = 0.05  # largest initial rate of a reference, as a share of its largest rate
-# Largest distance of the first measured pose from the reference. It is a share of the largest
-# travel of the positions, or of the angles.
+REST_RATE = 0.05  # largest initial rate of a reference at rest, as a fraction of its largest rate
+# Largest distance of the first measured pose from the reference, as a fraction of the largest
+# travel of the reference's positions, or of its angles.
 REST_POSE = 0.1
-# Largest distance of a measured pose from the reference, as a multiple of its travel. The same
-# limit holds for commands and the joint coordinates of the reference.
+# The same for all other measured poses. It is also the largest distance of commands from the joint
+# coordinates of the reference, or of the measured motion of a timed record, as a multiple of the
+# largest travel of these coordinates.
 TRAVELS = 2.0
-# Difference of commands from the inverse kinematics that is always allowed. It is a share of the
-# joints' travel limit. The real geometry differs from the robot file.
+# Distance of commands from these joint coordinates that is always allowed, as a fraction of the
+# joints' travel limit, because the real geometry differs from the robot file.
 BUILT = 0.05
 
-# Factors of positions and of angles for units that records have by mistake.
+# Factors that convert positions to m, and angles to rad, from units that records have by mistake.
 OTHER_UNITS = {
     "mm": (1e-3, 1.0),
     "degrees": (1.0, np.pi / 180),
@@ -240,7 +242,7 @@ def check_plausible(
 
     measured (N, 6): poses, NaN where lost. ok (N,): true for measured frames. logged (N, n): joint
     commands, or None. Raises EstimationError with the frame, the finding, and the units in which
-    the record would fit.
+    the record would fit, if there are any.
     """
     _check_reach(robot, reference.poses, "the reference")
     _check_rest(reference)
@@ -271,7 +273,7 @@ def _check_reach(robot: Robot, poses: Array, what: str) -> None:
 
 
 def begins_at_rest(rates: Array) -> bool:
-    """Return whether the rates (N, 6) of a reference begin near zero."""
+    """Return whether the rates (N, 6) of a reference begin near zero, by REST_RATE."""
     return bool((np.abs(rates[0]) <= REST_RATE * np.abs(rates).max(axis=0)).all())
 
 
@@ -298,14 +300,14 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
     limits = np.full(len(ok), TRAVELS)
     limits[0] = REST_POSE
 
-    def gaps(poses: Array) -> Array:
+    def distances(poses: Array) -> Array:
         return np.asarray(np.where(ok[:, None], np.abs(poses - reference.poses), 0.0) / usual)
 
     def near(poses: Array) -> bool:
-        return bool((gaps(poses) <= limits[:, None]).all())
+        return bool((distances(poses) <= limits[:, None]).all())
 
     if not near(measured):
-        found = gaps(measured)
+        found = distances(measured)
         frame = int(np.argmax(found.max(axis=1) > limits))
         worst = int(np.argmax(found[frame]))
         rest = "the record does not begin at rest, or " if frame == 0 else ""
@@ -342,7 +344,7 @@ def _check_commands(robot: Robot, poses: Array, logged: Array, what: str) -> Non
 
 
 def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
-    """Return a hint at the units in which poses (N, 6) would fit, or an empty string."""
+    """Return a hint about the units in which poses (N, 6) would fit, or an empty string."""
     for units, (position, angle) in OTHER_UNITS.items():
         if fits(poses * np.repeat([position, angle], 3)):
             return f"; in {units} it would fit, and records are in m and rad"
@@ -355,7 +357,7 @@ LONG_GAP_S = 0.5
 
 
 def long_gap_warnings(ok: NDArray[np.bool_], rate_hz: float) -> tuple[str, ...]:
-    """Return a warning if many consecutive frames (N,) were lost, which weakens the estimate."""
+    """Return a warning if the longest gap in `ok` (N,) exceeds LONG_GAP_S, and so weakens a fit."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], ~ok, [0]])))
     if not len(edges):
         return ()

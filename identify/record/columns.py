@@ -23,12 +23,13 @@ FRAMES = "frames"  # unit of times that count frames at the rate of the timing
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6}  # metres in each unit of length
 # Radians in each unit of angle.
 ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "turn": 6.283185307179586}
-# Number of columns of each convention but the Euler sequences, which have three.
+# Number of columns of each convention, except the Euler sequences, which have three.
 COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vector": 3}
 
 COVARIANCES = (6, 21, 36)
 COVARIANCES_SAID = "6 standard deviations, 21 of the upper triangle, or 36 row by row"
 
+# Pattern of an Euler sequence. Two successive turns are never about the same axis.
 EULER = r"euler_(?!.*(.)\1)([xyz]{3}|[XYZ]{3})"
 
 EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
@@ -92,12 +93,12 @@ class Log(Section):
 
     @property
     def is_own(self) -> bool:
-        """Whether these columns have rows of their own."""
+        """True if these columns have rows of their own, and do not share those of the poses."""
         return not (self.file is None and self.topic is None and self.time is None)
 
 
 class PoseColumns(Log):
-    """Columns of the measured poses, or with the same keys of the desired poses."""
+    """Columns of the measured poses. Those of the desired poses have the same keys."""
 
     position: list[str] = Field(
         description="columns of x, y and z of the position", min_length=3, max_length=3
@@ -185,9 +186,9 @@ class PoseColumns(Log):
 class CommandColumns(Log):
     """Columns of the joint commands.
 
-    If they name the time of the poses again, a row may hold a pose, a command or both. Otherwise
-    each row of the poses holds a command. A joint coordinate of the robot file is sign · unit ·
-    (column - zero).
+    Without file, topic and time, each row of the poses holds a command. If file, topic and time are
+    again those of the poses, a row can hold a pose, a command or both. Otherwise commands have rows
+    of their own. A joint coordinate of the robot file is sign · unit · (column - zero).
     """
 
     names: list[str] = Field(description="columns of the commands of joints 1, 2, ...")
@@ -224,7 +225,7 @@ class CommandColumns(Log):
 
 
 class Columns(Section):
-    """Columns of a log that are called otherwise than those of a record."""
+    """Columns of a log whose names differ from those of a record."""
 
     measured: PoseColumns
     command: CommandColumns
@@ -234,12 +235,12 @@ class Columns(Section):
 
     @property
     def holds_events(self) -> bool:
-        """Whether poses and commands are rows of one table, with one column of times.
+        """True if poses and commands are rows of one table, with one column of times.
 
-        Commands then name the time of the poses again. A row without a pose is no lost pose.
+        Commands then name the time of the poses again. A row without a pose is not a lost pose.
         """
-        places = [(log.file, log.topic, log.time) for log in (self.measured, self.command)]
-        return places[0] == places[1]
+        sources = [(log.file, log.topic, log.time) for log in (self.measured, self.command)]
+        return sources[0] == sources[1]
 
     @model_validator(mode="after")
     def _agree(self) -> "Columns":

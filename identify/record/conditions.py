@@ -5,9 +5,9 @@ record states the name of the law, and whether its commands are joint commands o
 without this information was made with the servo.
 
 Times of commands. A command acts from the instant at which it is written to the drives. If the
-latency jitters, it differs from command to command, and a model with the mean latency is a
-different loop. If a record holds no such times, the model uses the latency of the timing. The times
-are readings of one clock. They do not show the error of the stated mean latency
+latency jitters, a model in which each command has the mean latency is a different loop. If a record
+does not hold the times of its commands, the model uses the latency of the timing. The times are
+readings of one clock. They do not show the error of the stated mean latency
 (`timing.latency_std_s`).
 
 Drift. The drift watch reports whether the cameras drifted during the run.
@@ -32,7 +32,7 @@ TORQUE_UNITS = {"rad": "N m", "m": "N"}  # unit of torque commands, by the unit 
 
 
 def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
-    """Store with a record its control law and the kind of its commands."""
+    """Store a record's control law, and whether its commands are torques, with the record."""
     record.attrs |= {"law": law, "torque_commands": np.int8(drives.torques)}
     said = record["command"].attrs
     units = TORQUE_UNITS[said["units"]] if drives.torques else said["units"]
@@ -41,7 +41,7 @@ def store_law(record: xr.Dataset, law: str, drives: Drives) -> None:
 
 
 def recorded_law(record: xr.Dataset) -> str:
-    """Return the name of a record's law. Raises RecordError if the attribute is no name."""
+    """Return the name of a record's law. Raises RecordError if the attribute is not a name."""
     law = record.attrs.get("law", SERVO)
     if not isinstance(law, str) or not law:
         raise RecordError(
@@ -126,8 +126,9 @@ def command_time_warnings(records: Sequence[xr.Dataset], timing: Timing) -> tupl
 def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
     """Return the logged latency of each frame's command (N,) in s.
 
-    Returns None if all commands have the latency of the timing. Raises EstimationError for a
-    latency that is longer than a loop can have.
+    Returns None if the record does not hold the times of its commands, or if all commands have the
+    latency of the timing. Raises EstimationError for a latency of more than MAX_DELAY_FRAMES
+    frames, which a loop cannot have.
     """
     if COMMAND_TIME not in record:
         return None

@@ -42,8 +42,8 @@ that of the poses is estimated with timing.clock_offset_std_s and timing.clock_d
 
 # Largest size of a table, bytes. An hour at 60 Hz takes a hundred million bytes.
 LARGEST = 200_000_000
-# Beginnings of the columns that `cmmsim measure` writes in addition to those of a record. These
-# columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
+# Beginnings of the names of columns that `cmmsim measure` writes in addition to those of a record.
+# These columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
 BESIDE = ("pair", "stickers", "why", "common_")
 
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
@@ -109,7 +109,7 @@ class Table:
     lines: tuple[int, ...]
 
     def telemetry(self) -> Telemetry:
-        """Return the logs of the table, whose rows hold a pose, a command and a reference each.
+        """Return the logs of the table. They share the times of its rows.
 
         Raises RecordError with the line if the times do not increase, or `measured_ok` is wrong.
         """
@@ -136,7 +136,7 @@ class Table:
     def _measured_ok(self) -> NDArray[np.bool_]:
         """Return whether the pose of each row (N,) was measured.
 
-        In such a row, no measured cell is empty. In a table with measured_ok, that cell is 1.
+        If it was, no measured cell is empty and the cell measured_ok, if the table has one, is 1.
         """
         whole = np.asarray(np.isfinite(self.groups["measured"]).all(axis=1))
         if "ok" not in self.groups:
@@ -168,8 +168,8 @@ def symmetric(triangles: Array) -> Array:
 def read_table(path: Path, robot: Robot) -> Table:
     """Read the table of a robot's record.
 
-    Raises RecordError if the file does not exist, a column is missing or unknown, a cell is not a
-    number, or there are no rows.
+    Raises RecordError if the file does not exist, a column is missing, unknown or doubled, a cell
+    is not a number, or there are no rows.
     """
     groups = columns_of(robot)
     lines = lines_of(path)
@@ -189,7 +189,8 @@ def read_table(path: Path, robot: Robot) -> Table:
 def lines_of(path: Path, separators: str = ",") -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that is neither empty nor a comment.
 
-    Of several possible separators, the most frequent one in the first line with any of them counts.
+    Of several possible separators, the one that is most frequent in the first line with any of them
+    is used. Raises RecordError if the file cannot be read.
     """
     content = read_bytes(path, f"record {path}", RecordError, LARGEST)
     # Spreadsheets write a byte order mark at the beginning, which utf-8-sig removes.
@@ -213,7 +214,7 @@ def lines_of(path: Path, separators: str = ",") -> Iterator[tuple[int, list[str]
 def _checked_header(
     path: Path, number: int, header: list[str], groups: Mapping[str, Group]
 ) -> list[str]:
-    """Return the names of the groups in a header. Raises RecordError if a group is incomplete."""
+    """Return the names of the groups in a header. Raises RecordError if the header is not valid."""
     if len(header) == 1 and ";" in header[0]:
         raise RecordError(
             f"{path} line {number}: cells are separated by semicolons, and must be by commas"

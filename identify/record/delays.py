@@ -1,12 +1,12 @@
 """Delays of a log: of the motion behind its commands, and of commands behind the servo's poses.
 
-The lag of the motion is found by correlation. It is the sum of the lag of the drives, the latency,
-and the difference of the clocks with which poses and commands are logged.
+The lag of the motion is determined by correlation. It is the sum of the lag of the drives, the
+latency, and the difference of the clocks with which poses and commands are logged.
 
-The delay of the servo is found from the sensor's noise. The visual servo computes a command from
-each measured pose, so the noise of the pose appears in the commands after the delay. The delay is
-the sum of the latency and the difference of the clocks. Drives and friction do not affect it. If no
-servo used these poses, the commands do not have their noise.
+The delay of the servo is determined from the sensor's noise. The visual servo computes a command
+from each measured pose, so the noise of the pose appears in the commands after the delay. The delay
+is the sum of the latency and the difference of the clocks. Drives and friction do not affect it. If
+no servo used these poses, their noise does not appear in the commands.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,9 @@ from identify.record.telemetry import Telemetry
 FINEST_S = 1e-3
 # Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion.
 CLOSE_S = 1.0
-ALIKE = 0.02  # difference of correlations below which the smaller lag is taken
+# Difference of correlations up to which the smaller lag is taken. Five times this is the distance
+# of a good correlation from one.
+ALIKE = 0.02
 FEWEST = 8  # smallest number of poses that overlap with commands
 
 
@@ -44,8 +46,8 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
     command_time (M,)   Times of the commands, s.
     command (M, n)      Joint commands.
 
-    The lag is at most half the duration. The correlation is zero if there is no motion, or times do
-    not overlap.
+    The lag is at most half the duration of the shorter log. Lag and correlation are zero if there
+    is no motion, there are too few rows, the times do not overlap, or no correlation is positive.
     """
     if min(len(time), len(command_time)) < FEWEST:
         return MotionLag(0.0, 0.0)
@@ -69,9 +71,9 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
         best += 1 if found[best + 1] > found[best - 1] else -1
     shift = 0.0
     if 0 < best < len(lags) - 1:
-        before, at, after = found[best - 1 : best + 2]
-        bend = before - 2 * at + after
-        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+        before, peak, after = found[best - 1 : best + 2]
+        curvature = before - 2 * peak + after
+        shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return MotionLag(float(lags[best] + shift * step), float(found[best]))
 
 
@@ -91,7 +93,8 @@ def _correlation(time: Array, coordinates: Array, command_time: Array, command: 
 
 REACH_S = 0.5  # largest delay, s, of either sign that is tried
 PARTS = 4  # number of tried delays per time between two poses
-# Smallest correlation, in standard deviations of the correlation of independent noises.
+# Correlation below which no delay is stated, in standard deviations of the correlation of
+# independent noises.
 CERTAIN = 6.0
 
 
@@ -116,7 +119,10 @@ class ServoDelay:
 
 
 def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
-    """Return the delay of the servo's commands, or None if they show no noise of the poses."""
+    """Return the delay of the servo's commands.
+
+    Returns None if the commands show no noise of the poses, or too few poses are in reach.
+    """
     log = telemetry.poses
     time = log.time[log.ok]
     poses = np.asarray(robot.pose(robot.coordinates(log.pose[log.ok])))
@@ -139,20 +145,20 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
             for delay in delays
         ]
     )
-    # A command is held until the next, so that PARTS delays in a row correlate. Take their middle.
+    # A command is held until the next, so PARTS successive delays correlate. Take their middle.
     best = int(np.argmax(np.convolve(np.abs(found), np.ones(PARTS), mode="same")))
     correlation = float(found[best])
     if abs(correlation) * np.sqrt(noise.size) < CERTAIN:
         return None
     held = _held(telemetry, rows, moments, time[windows.rows] + delays[best])[0]
-    each = moments[held] - time[windows.rows]
+    row_delays = moments[held] - time[windows.rows]
     since = time[windows.rows] - time[windows.rows].mean()
-    median = float(np.median(each))
-    drift = float(since @ (each - median) / (since @ since))
+    median = float(np.median(row_delays))
+    drift = float(since @ (row_delays - median) / (since @ since))
     return ServoDelay(
         median,
         drift,
-        float(np.median(np.abs(each - median - drift * since))),
+        float(np.median(np.abs(row_delays - median - drift * since))),
         correlation,
         float(np.median(np.diff(telemetry.commands.time))),
     )
@@ -171,8 +177,8 @@ def _held(
     command = telemetry.commands.command[rows]
     changed = np.concatenate([[True], (np.diff(command, axis=0) != 0).any(axis=1)])
     first = np.maximum.accumulate(np.where(changed, np.arange(len(rows)), 0))
-    places = np.maximum(np.searchsorted(moments[rows], time, side="right") - 1, 0)
-    return rows[first[places]], command[places]
+    newest = np.maximum(np.searchsorted(moments[rows], time, side="right") - 1, 0)
+    return rows[first[newest]], command[newest]
 
 
 def _correlation_of_noises(one: Array, other: Array) -> float:

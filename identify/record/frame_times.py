@@ -1,7 +1,7 @@
 """Times of poses: those that a log states, or frames one period apart.
 
 Cameras are triggered by a clock, but logs round times or write them late. Poses of a moving robot
-show which times are right. As a function of the right times, they lie on smoother curves.
+show which times are right, because they lie on smoother curves as a function of the right times.
 """
 
 import numpy as np
@@ -10,9 +10,11 @@ from identify.arrays import Array
 from identify.record.smoothness import local_misfit
 
 GAP = 1.5  # time between two rows, as a multiple of the usual time, above which rows are missing
-# Largest distance of a stated time from a frame, in periods, at which it can be of that frame.
+# Largest distance of a stated time from a frame, in periods, at which the time can belong to this
+# frame.
 FARTHEST = 0.4
-BETTER = 0.97  # largest ratio of two misfits at which the smaller one decides
+# Ratio of the misfit at the frames to that at the stated times, below which the frames are taken.
+BETTER = 0.97
 
 
 def mean_rate(times: Array) -> float:
@@ -30,9 +32,9 @@ def frame_grid(times: Array, rate_hz: float) -> Array | None:
     """Return times (N,) of frames one period apart that are nearest to stated times (N,), s.
 
     Frames can be missing. The period is fitted to the times, and is near that of rate_hz. Returns
-    None if some time is too far from every frame.
+    None if some time is too far from every frame, or two times are nearest to the same frame.
     """
-    steps = np.rint(np.diff(times) * rate_hz)
+    steps = np.rint(np.diff(times) * rate_hz)  # in frames
     frames = np.concatenate([[0.0], np.cumsum(steps)])
     if (steps < 1).any():
         return None
@@ -42,9 +44,9 @@ def frame_grid(times: Array, rate_hz: float) -> Array | None:
 
 
 def likelier_times(times: Array, poses: Array, covariance: Array, rate_hz: float) -> Array:
-    """Return the times (N,) at which poses were more likely seen, s.
+    """Return the times (N,), s, at which poses are more likely to have been seen.
 
-    These are the stated times (N,), or the nearest frames.
+    These are the stated times, or the nearest frames if the poses are smoother there.
 
     times (N,)         Stated times of measured poses, s.
     poses (N, 6)       Measured poses, without lost ones.

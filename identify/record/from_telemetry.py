@@ -1,8 +1,9 @@
 """Record of a run from its logs of poses, commands and the reference.
 
-A log becomes a record on the grid of frames if its rows are on this grid, if it has a reference and
-begins at rest, and if it shows every pose that the servo used. Its model can close its own loop.
-Every other log becomes a record with times of its own, whose model the commands drive.
+A log becomes a record on the grid of frames if its rows are on this grid and hold a command each,
+if it has a reference and begins at rest, if it shows every pose that the servo used, and if poses
+and commands have one clock. The model of such a record can close its own loop. Every other log
+becomes a record with times of its own, whose model the commands drive.
 
 Gross errors are left out, and what was decided is noted in the record.
 """
@@ -28,8 +29,8 @@ from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, Refere
 from identify.record.timed_record import build_timed_record
 from identify.scenario import Timing
 
-MOST_GROSS = 0.1  # largest share of poses that can be gross errors
-# Smallest relative difference of the rate of rows from the frame rate that is an error.
+MOST_GROSS = 0.1  # largest fraction of the measured poses that can be gross errors
+# Relative difference of the rate of rows from the frame rate above which the log is refused.
 OTHER_RATE = 0.05
 NAMED = 10  # largest number of gross errors whose times a note names
 # Attribute of a record with what was decided when its file was read, as a JSON list.
@@ -43,7 +44,8 @@ def record_of(
 
     scenario_toml: scenario that the record states. stated (6, 6): covariance of the poses if the
     log holds none. Raises RecordError if more than a tenth of the poses are gross errors, if no
-    command is logged, if clocks do not overlap, or as `build_record` and `build_timed_record` do.
+    command is logged, if clocks do not overlap, if rows of one table have another rate than the
+    timing, or as `build_record` and `build_timed_record` do.
     """
     ok = telemetry.poses.ok
     covariances = telemetry.poses.covariance
@@ -112,10 +114,10 @@ def reading_notes(records: Sequence[xr.Dataset]) -> tuple[str, ...]:
 
 
 def rates(reference: ReferenceLog, frame_period_s: float) -> Array:
-    """Return the rates (N, 6) of a reference, from its log or from a spline through it."""
+    """Return the rates (N, 6) of a reference, from its log or from a spline through its poses."""
     if reference.rate is not None:
         return reference.rate
-    # A record that is too short for a spline is refused later, by the check of its length.
+    # A record that is too short for a spline is refused later, because of its length.
     if len(reference.pose) < 6:
         return np.zeros_like(reference.pose)
     times = np.arange(len(reference.pose)) * frame_period_s
@@ -227,7 +229,10 @@ def _seen_but_lost(telemetry: Telemetry) -> bool:
 
 
 def _event_times(telemetry: Telemetry, timing: Timing) -> tuple[Array, Array, list[str]]:
-    """Return the times of poses (N,) and of the action of commands (M,), s, and notes on them."""
+    """Return the times (N,) of poses, the times (M,) at which commands act, s, and notes.
+
+    The times of poses are the logged ones, or frames if these are likelier.
+    """
     poses = telemetry.poses
     commands = telemetry.commands
     rate_hz = timing.frame_rate_hz
@@ -259,7 +264,8 @@ def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
     """Return the rows (M,) that issue a command.
 
     An empty row issues none. If a logger is faster than the controller, most rows repeat the
-    command before, and only those that change it issue one.
+    previous command, and only rows with another command issue one. Raises RecordError if no row
+    holds a command.
     """
     given = np.array(np.isfinite(commands.command).all(axis=1))
     if commands.written is not None:
@@ -276,9 +282,9 @@ def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
 def _gaps(telemetry: Telemetry, acting: Array, kept: NDArray[np.bool_]) -> tuple[Array, list[str]]:
     """Return the times (k, 2) of the last and the first command around gaps, s, and notes.
 
-    In a gap, rows of commands and of poses are missing. The last command was held if only commands
-    are missing, or if the command after the missing rows equals the one before them. Otherwise, the
-    commands in the gap are not known.
+    In a gap, rows of commands and of poses are missing, and the commands are unknown. If only rows
+    of commands are missing, or if the commands before and after the missing rows are equal, the
+    command was held and there is no gap.
     """
     rows = telemetry.commands.time
     poses = telemetry.poses.time

@@ -1,7 +1,7 @@
 """Geometry that servo and estimator know: from the robot file, or calibrated from static poses.
 
 The true robot differs from the known robot by dg, a single random draw with the covariance of the
-calibration. To first order the measured poses are the poses of the model plus J dg. J is the
+calibration. To first order, the poses of the true robot are those of the model plus J dg. J is the
 derivative of the model's poses with respect to the geometric numbers. The servo uses the known
 geometry throughout.
 
@@ -51,7 +51,7 @@ def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = Non
 
     The geometry comes from the robot file, from an earlier calibration, or from the calibration in
     the folder of a run. Raises ScenarioError if the file does not exist, its covariance is missing
-    or not valid, or the calibration is of another robot.
+    or not valid, the calibration is of another robot, or a folder is needed and None is given.
     """
     if settings.exact:
         return KnownGeometry(nominal)
@@ -86,7 +86,7 @@ def known_geometry(nominal: Robot, settings: Geometry, folder: Path | None = Non
 
 
 def _check_same(said: str, found: Robot, nominal: Robot, settings: Geometry) -> None:
-    """Raise ScenarioError if a calibration is of another robot. The message names the number."""
+    """Raise ScenarioError if a calibration is of another robot, by its legs and numbers."""
     there = found.geometry
     here = nominal.geometry
     if [type(leg) for leg in there.legs] != [type(leg) for leg in here.legs]:
@@ -139,31 +139,31 @@ class GeometryErrors:
         return self._noticed[0]
 
     def modes(self, poses_of: Callable[[Robot], Array]) -> Array:
-        """Return the changes (N, 6, g) of a run's poses along each direction.
+        """Return the changes (N, 6, g) of a run's poses by each column of `factor`.
 
-        The changes are zero along unnoticed directions. poses_of: function that returns the poses
-        (N, 6) of a run of a robot near the known robot.
+        The changes are set to zero for unnoticed directions. poses_of: function that returns the
+        poses (N, 6) of a run of a robot near the known robot.
         """
         found = [*in_threads(poses_of, [robot for pair in self._moved for robot in pair])]
         modes = np.zeros((*self.poses.shape, len(self.covariance)))
-        for place, (more, less) in enumerate(zip(found[::2], found[1::2], strict=True)):
-            modes[:, :, place] = (more - less) / 2.0
+        for column, (more, less) in enumerate(zip(found[::2], found[1::2], strict=True)):
+            modes[:, :, column] = (more - less) / 2.0
         return modes
 
     def joints(self, poses: Array) -> Array:
         """Return the changes (N, n, k) of the joint coordinates along each noticed direction.
 
-        poses (N, 6): poses of the platform.
+        poses (N, 6): poses of the platform, which are held.
         """
         chart = self.robot.geometry.chart
         held = chart.pose(chart.coordinates(poses))
-        apart = [
+        differences = [
             more.inverse_kinematics(held) - less.inverse_kinematics(held)
             for more, less in self._moved
         ]
-        if not apart:
+        if not differences:
             return np.zeros((len(poses), self.robot.layout.joints, 0))
-        return np.stack(apart, axis=2) / 2.0
+        return np.stack(differences, axis=2) / 2.0
 
     @cached_property
     def _noticed(self) -> tuple[Array, int]:
@@ -201,7 +201,7 @@ def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Arra
 
 
 def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
-    """Return the covariance (g, g) of the geometric numbers of a record's robot, or None.
+    """Return the covariance (g, g) of a robot's geometric numbers, or None if a record has none.
 
     Raises RecordError if it is for other numbers, or if it is not finite or not a covariance.
     """

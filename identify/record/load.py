@@ -6,8 +6,9 @@ of the platform, and moments of inertia about c along the axes of the platform. 
 its inertia about the origin of the frame to the inertial parameters of the platform. If c is not
 the origin, the platform is a full body.
 
-A record holds the experimenter's values of these figures and their standard deviations. Records
-that state the same figures were made with the same load.
+These seven figures, m, c and the three moments, describe the load. A record holds the
+experimenter's values of the figures and their standard deviations. Records that state the same
+figures were made with the same load.
 """
 
 import numpy as np
@@ -23,13 +24,14 @@ from identify.scenario.payload import FIGURES, check_load_std, check_moments
 # Attributes of a record with the figures of a load. The standard deviation of each attribute has
 # the same name with `_std` at the end.
 ADDED = tuple(f"payload_{figure}" for figure in FIGURES)
-CENTRE = slice(1, 4)  # places of the centre of mass among the figures
+CENTRE = slice(1, 4)  # indices of the centre of mass among the figures
 
 
 def load_parameters(layout: ParameterLayout, figures: Array) -> Array:
     """Return the change (p,) of a robot's parameters by the figures (7,) of a load.
 
-    Raises RecordError for a load off the origin if the platform is no full body.
+    Raises RecordError if the load's centre of mass is off the origin and the platform is no full
+    body.
     """
     return _of_platform(layout, full_body(figures[0], figures[CENTRE], np.diag(figures[4:])))
 
@@ -37,7 +39,7 @@ def load_parameters(layout: ParameterLayout, figures: Array) -> Array:
 def load_errors(layout: ParameterLayout, figures: Array, std: Array) -> Array:
     """Return the changes (p, 7) of a robot's parameters by one standard deviation of each figure.
 
-    They are of first order. Raises the RecordError of `load_parameters`.
+    The changes are of first order. Raises the RecordError of `load_parameters`.
     """
     mass, x, y, z = figures[:4]
     square = [y * y + z * z, x * x + z * z, x * x + y * y]
@@ -51,7 +53,7 @@ def load_errors(layout: ParameterLayout, figures: Array, std: Array) -> Array:
 
 
 def _of_platform(layout: ParameterLayout, body: Array) -> Array:
-    """Return parameters (p,) with a full body (10,) added to the platform, and zeros otherwise."""
+    """Return the change (p,) of all parameters by a full body (10,) on the platform."""
     if not layout.full[0] and (body[1:4].any() or body[7:].any()):
         raise RecordError(
             "the load's centre of mass is not in the origin of the platform frame, but the "
@@ -74,8 +76,9 @@ def payload_vector(
     """Return the change (p,) of a robot's parameters by a load.
 
     `inertia_kg_m2` are the moments about the load's centre of mass, and `centre_m` is this centre
-    in the frame of the platform. For a load at the origin, the standard deviations of its figures
-    give the standard deviations of the change. Raises the RecordError of `load_parameters`.
+    in the frame of the platform. For a load at the origin the change is linear in mass and moments.
+    Given their standard deviations, the function then returns those of the change. Raises the
+    RecordError of `load_parameters`.
     """
     return load_parameters(layout, np.array([mass_kg, *centre_m, *inertia_kg_m2], dtype=float))
 
@@ -85,14 +88,15 @@ def store_payload(
 ) -> None:
     """Store a load (p,) with the record made under it.
 
-    std (p,): standard deviations of the load's mass and moments. If None, the load is known
+    payload (p,): change of the parameters, as of `payload_vector`. std (p,): standard deviations of
+    the load's mass and moments. If None, the load is known exactly. The centre counts as known
     exactly. `store_load` also stores a standard deviation of the centre.
     """
     deviations = np.zeros(len(layout.names)) if std is None else std
-    body, spread = (layout.bodies_of(one[layout.dynamic])[0] for one in (payload, deviations))
+    body, body_std = (layout.bodies_of(one[layout.dynamic])[0] for one in (payload, deviations))
     centre, inertia = about_centre(body) if body[0] else (np.zeros(3), np.zeros((3, 3)))
     figures = np.array([body[0], *centre, *np.diagonal(inertia)])
-    store_load(record, figures, np.array([spread[0], 0.0, 0.0, 0.0, *spread[4:7]]))
+    store_load(record, figures, np.array([body_std[0], 0.0, 0.0, 0.0, *body_std[4:7]]))
 
 
 def store_load(record: xr.Dataset, figures: Array, std: Array) -> None:
@@ -117,13 +121,13 @@ def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array
     figures = np.zeros(len(ADDED))
     std = np.zeros(len(ADDED))
     try:
-        for place, (name, (figure, unit)) in enumerate(zip(ADDED, FIGURES.items(), strict=True)):
-            placed = figure in "xyz"
-            value = stated.get(name, 0.0 if placed else None)
-            figures[place] = _number(name, value, unit, least=-1e6 if placed else 0.0)
-            std[place] = _number(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
-            if not placed:
-                check_load_std(f"{name}_std", std[place], name, figures[place], unit)
+        for index, (name, (figure, unit)) in enumerate(zip(ADDED, FIGURES.items(), strict=True)):
+            of_centre = figure in "xyz"
+            value = stated.get(name, 0.0 if of_centre else None)
+            figures[index] = _number(name, value, unit, least=-1e6 if of_centre else 0.0)
+            std[index] = _number(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
+            if not of_centre:
+                check_load_std(f"{name}_std", std[index], name, figures[index], unit)
         check_moments({name: float(stated[name]) for name in ADDED[4:]})
     except ValueError as error:
         raise RecordError(f"the record's attribute {error}") from None
@@ -131,7 +135,7 @@ def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array
 
 
 def _number(name: str, value: object, unit: str, least: float = 0.0) -> float:
-    """Return an attribute's value, which must be a finite number >= `least`."""
+    """Return an attribute's value, which must be a number from `least` to below 1e6."""
     number = as_number(value)
     if not least <= number < 1e6:
         raise RecordError(

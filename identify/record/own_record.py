@@ -2,9 +2,9 @@
 
 A netCDF record contains its scenario and its scale anchor. A log is a CSV table, an export of
 motion capture or a bag of ROS 2, and has a TOML file of the same name beside it. That file is a
-scenario; only its sections robot, timing, servo, model, filter, identification and payload are
-used. Its additional table `[record]` holds further measurements, and `[columns]` says what the
-columns of a log are called.
+scenario, of which only the sections robot, timing, servo, model, filter, identification and payload
+are used. Its additional table `[record]` holds further measurements, and `[columns]` states the
+names of the columns of a log.
 """
 
 from collections.abc import Iterator, Mapping
@@ -46,13 +46,13 @@ from identify.scenario.settings_file import one_line
 
 DESCRIPTION = "record"  # name of the table of a log's TOML file with further measurements
 COLUMNS = "columns"  # name of the table of a log's TOML file with the columns of the log
-# Frame rate, Hz, that no record has. A scenario refuses rates above its own, lower limit.
+# Frame rate, Hz, from which planned runs are not adapted. A scenario refuses such a rate later.
 MOST_HZ = 1e6
-TABLES = (".csv", ".tsv", ".txt")  # endings of the names of tables
+TABLES = (".csv", ".tsv", ".txt")  # suffixes of tables
 
 
 class Measured(Section):
-    """Measurements beside the poses: the value of the scale anchor, and the accuracy of poses."""
+    """Measurements in addition to the poses: the scale anchor, and the accuracy of poses."""
 
     anchor_value: float | None = quantity(
         None,
@@ -92,7 +92,7 @@ def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a path is a log or the description of one, by its name or as a folder."""
+    """Return whether a path is a log or the description of one, by its suffix or as a bag."""
     return path.suffix.lower() in (*TABLES, ".toml") or is_bag(path)
 
 
@@ -122,9 +122,10 @@ class Description:
 
 
 def read_telemetry(path: Path, about: Description, robot: Robot) -> Telemetry:
-    """Read the log that a description describes, and the files that it names.
+    """Read a log and the files that its description names.
 
-    Raises RecordError. The message names the row.
+    Raises RecordError if a file cannot be read, the description lacks needed columns, or a row is
+    wrong. The message names the row.
     """
     columns = about.columns
     if columns is not None and (path.suffix != ".toml" or columns.measured.file is not None):
@@ -143,7 +144,10 @@ def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
 
 
 def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: Robot) -> list[str]:
-    """Return what is likely wrong with a log, and the convention of rotations that would fit."""
+    """Return what is likely wrong with a log, as sentences.
+
+    They name the convention of rotations with which the log would fit, if there is one.
+    """
     found = suspicions(telemetry, robot)
     columns = about.columns
     if columns is None:
@@ -156,12 +160,12 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
             with suppress(RecordError):
                 yield convention, read_telemetry(path, tried, robot)
 
-    # A wrong order also turns signs and correlations of joints, so that it is judged first.
+    # A wrong order also changes signs and correlations of joints, so the order is judged first.
     if columns.measured.convention in EULER_ORDERS:
-        share = unexplained(telemetry, robot)
-        if share > EXPLAINED:
-            shares = {convention: unexplained(one, robot) for convention, one in others()}
-            if said := better_order(share, shares):
+        fraction = unexplained(telemetry, robot)
+        if fraction > EXPLAINED:
+            fractions = {convention: unexplained(one, robot) for convention, one in others()}
+            if said := better_order(fraction, fractions):
                 return [said]
     if found:
         fitting = (convention for convention, one in others() if fits(one, robot))
@@ -213,9 +217,10 @@ def read_description(path: Path, log: Path) -> Description:
 
 
 def with_whole_frames(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a scenario whose planned runs have whole frames at the rate of a record.
+    """Return a scenario whose planned runs last a whole number of frames at a record's rate.
 
-    A record does not read these runs, and can have any rate.
+    A scenario must have such durations. An identification does not read them, and the record can
+    have any rate. Durations that the content states remain.
     """
     timing = content.get("timing")
     rate = timing.get("frame_rate_hz") if isinstance(timing, Mapping) else None

@@ -79,9 +79,10 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
 
 @lru_cache(maxsize=8)
 def _scenario_of(text: str, folder: Path) -> Scenario:
-    """Read the scenario of records, with paths relative to the current folder, `folder`.
+    """Read the scenario of records, from a cache.
 
-    It is cached, because records of one experiment share it, and are checked several times.
+    Records of one experiment share a scenario, and are checked several times. Paths in it are
+    relative to the current folder, so this `folder` is part of the key of the cache.
     """
     return scenario_from_toml(text, "the record's attribute scenario")
 
@@ -108,7 +109,7 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
     """Check that a record is of a robot with this name and, if stated, with this geometry.
 
     Raises EstimationError if the name or a number of the geometry differs. The message names the
-    first such number. Raises RecordError if the geometry cannot be read.
+    number. Raises RecordError if the geometry cannot be read, or its numbers have other shapes.
     """
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(
@@ -124,12 +125,12 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
             raise RecordError(
                 f"{name} in the record's {ROBOT} has shape {theirs.shape}, expected {known.shape}"
             )
-        gap = np.abs(theirs - known)
-        if not gap.max() <= ROUNDING:
-            worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
-            place = "".join(f"[{k + 1}]" for k in worst)
+        error = np.abs(theirs - known)
+        if not error.max() <= ROUNDING:
+            worst = np.unravel_index(int(np.argmax(error)), error.shape)
+            indices = "".join(f"[{k + 1}]" for k in worst)
             raise EstimationError(
-                f"the record is of another robot {robot.name!r}: {name}{place} was "
+                f"the record is of another robot {robot.name!r}: {name}{indices} was "
                 f"{theirs[worst]:.9g} when it was made, the robot file says {known[worst]:.9g}"
             )
 
@@ -163,7 +164,7 @@ def _read(text: object) -> dict[str, Array]:
 class RunFiles:
     """Contents of the files of a run. Each file is read once, at its first use.
 
-    Raises RecordError for a damaged file.
+    Reading a damaged file raises RecordError.
     """
 
     def __init__(self, folder: RunFolder) -> None:

@@ -19,8 +19,8 @@ from identify.scenario.settings_file import starting_toml
 
 SCHEMA = Path(__file__).parent / "record.schema.json"
 
-SHOWN_ROWS = 2
-WIDTH = 96
+SHOWN_ROWS = 2  # number of example rows
+WIDTH = 96  # largest length of a comment line, without "# " in tables
 # Sections of a scenario that describe the recorded experiment or that an identification reads.
 SECTIONS = ("robot", "timing", "servo", "model", "filter", "identification", "payload")
 
@@ -55,9 +55,9 @@ def table_text(robot: Robot) -> str:
 
 
 def columns_text() -> str:
-    """Return an empty ``[columns]`` with all keys as comments, for a table with other names.
+    """Return ``[columns]`` with all keys as comments, for a table whose columns have other names.
 
-    Keys that must be answered have the value "?", and the others their default.
+    Keys that the user must state have the value "?". The others have their default.
     """
     lines = [
         "",
@@ -96,7 +96,7 @@ def _relative(path: Path, folder: Path) -> str:
 def description_text(
     robot: Robot, name_or_path: str, table: str, rate_hz: float = FRAME_RATE_HZ
 ) -> str:
-    """Return the text of the TOML file for a table: robot, timing, servo and scale.
+    """Return the text of the TOML file for a table, with SECTIONS of a scenario and DESCRIPTION.
 
     The user replaces the example values. `rate_hz` is the frame rate.
     """

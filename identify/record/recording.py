@@ -71,7 +71,7 @@ VARIABLES: Variables = {
 
 STRETCH = "stretch"  # variable of a record with the number of the stretch that each pose belongs to
 
-# Variables of a record whose commands have times of their own. It needs no reference.
+# Variables of a record whose commands have times of their own. Such a record needs no reference.
 TIMED: Variables = {
     STRETCH: (
         ("time",),
@@ -140,8 +140,8 @@ def build_record(
     Raises
     ------
     RecordError
-        A shape is wrong, a number of a measured frame is not finite, or an entry of `measured_ok`
-        is neither 1 nor 0.
+        A shape is wrong, a number is not finite (other than of a lost pose), times do not increase,
+        a time of a command is impossible, or an entry of `measured_ok` is neither 1 nor 0.
     """
     logged = {} if command_time is None else {COMMAND_TIME: np.asarray(command_time, dtype=float)}
     record = described_dataset(
@@ -196,8 +196,7 @@ def record_groups(record: xr.Dataset, truth: xr.Dataset | None = None) -> dict[s
 def read(path: Path | str, run: str = "") -> xr.Dataset:
     """Read and check the record of a file, or of one of its runs (``"run01"``), without the truth.
 
-    Raises RecordError if the file is truncated, a variable is missing, a shape is wrong, or a
-    number is not finite.
+    Raises RecordError if the file is truncated, or if `check_record` finds a fault.
     """
     return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
 
@@ -265,9 +264,9 @@ def variables_of(record: xr.Dataset) -> Variables:
 
 
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
-    """Check that a record is complete, of the right shapes, and finite where measured. Return it.
+    """Return a record after a check of its variables, their shapes and numbers, and its times.
 
-    Raises RecordError with the first fault.
+    Only numbers of lost poses can be NaN. Raises RecordError with the first fault.
     """
     variables = variables_of(record)
     check_variables(record, variables, source)

@@ -11,7 +11,8 @@ from identify.arrays import Array
 # Effect below which a direction of the errors is omitted. The effect is the norm over all frames,
 # in standard deviations of the noise.
 NOTICED = 0.1
-ROUNDING = 1e-9  # asymmetry or negative eigenvalue of a correlation matrix that counts as rounding
+# Largest asymmetry or negative eigenvalue of a correlation matrix that counts as rounding.
+ROUNDING = 1e-9
 
 
 def covariance_fault(covariance: Array) -> str:
@@ -40,13 +41,13 @@ def factor(covariance: Array) -> Array:
 
 
 def noticed_directions(root: Array, seen: Array) -> tuple[Array, int]:
-    """Turn a factor of a covariance so that its columns are independent directions.
+    """Rotate a factor of a covariance so that the effects of its columns are orthogonal.
 
     root (k, k)    Factor of the covariance.
     seen (..., k)  Effect of each column on the measurements, in standard deviations of their noise.
 
-    Returns the turned factor (k, k), with the most noticed direction first, and the number of
-    noticed directions.
+    Returns the rotated factor (k, k), with the most noticed direction first, and the number of
+    noticed directions, whose effect is above NOTICED.
     """
     sizes, turns = np.linalg.svd(np.linalg.qr(seen.reshape(-1, len(root)), mode="r"))[1:]
     return np.asarray(root @ turns.T), int(np.sum(sizes > NOTICED))

@@ -19,8 +19,8 @@ TRUSTED = 9  # number of these neighbours that must be right
 SUBSETS = 30  # number of polynomials that are tried for each pose
 DEGREE = 6  # degree of the polynomial. It follows motions up to a tenth of the frame rate.
 LONGEST = 2.5  # longest time between two poses of a polynomial, as a multiple of the usual time
-# Squared distance from the prediction above which a pose is a gross error. It is in units of its
-# variance. For noise alone, its mean is six.
+# Squared distance from the prediction above which a pose is a gross error. It is the squared
+# Mahalanobis distance, whose mean is six for noise alone.
 GROSS = 100.0
 MEDIAN = float(chdtri(6, 0.5))  # median of this squared distance for noise alone
 FEWEST = 30  # smallest number of poses in which wrong ones are searched
@@ -56,7 +56,7 @@ class Windows:
 
 
 def windows_of(times: Array) -> Windows:
-    """Return the rows at times (N,), s, that have enough neighbours on either side."""
+    """Return the rows at times (N,), s, that have NEIGHBOURS / 2 neighbours on either side."""
     half = NEIGHBOURS // 2
     rows = np.arange(half, max(len(times) - half, half))
     if not len(rows):
@@ -70,7 +70,8 @@ def windows_of(times: Array) -> Windows:
 def wrong_poses(log: PoseLog, covariance: Array) -> NDArray[np.bool_]:
     """Return which poses (N,) of a log are single gross errors.
 
-    covariance (6, 6): covariance of a pose. If there are too few poses, none counts as wrong.
+    covariance (6, 6): covariance of a pose. If there are too few poses, or the covariance is not
+    valid, no pose counts as wrong.
     """
     wrong = np.zeros(len(log.ok), dtype=bool)
     good = np.flatnonzero(log.ok)
@@ -84,8 +85,9 @@ def wrong_poses(log: PoseLog, covariance: Array) -> NDArray[np.bool_]:
 def local_misfit(times: Array, poses: Array, covariance: Array) -> float:
     """Return the mean squared distance of poses (N, 6) from local polynomials, per component.
 
-    It is in variances of the noise, and about one if the motion is a smooth function of the times
-    (N,), s. The largest tenth of all distances is left out, because a motion can have kinks.
+    The distance is in units of the noise variance, and about one if the motion is a smooth function
+    of the times (N,), s. The largest tenth of all distances is left out, because a motion can have
+    kinks.
     """
     white = _whitened(poses, covariance)
     neighbours, powers, _ = _windows(times, np.arange(len(times)))
@@ -98,9 +100,9 @@ def gross_errors(times: Array, poses: Array, covariance: Array) -> NDArray[np.in
     """Return the rows of single poses that are wrong.
 
     A wrong pose is far from the polynomial through its neighbours, and the neighbours are near the
-    polynomial. At a kink of the motion, all poses are far from it. Neighbours can be wrong as well.
-    Of several polynomials through most neighbours, the one nearest to most of them is used (least
-    trimmed squares).
+    polynomial. At a kink of the motion, the neighbours are far from it, too. Neighbours can also be
+    wrong. Of several polynomials through TRUSTED neighbours, the one that is nearest to TRUSTED of
+    them is used (least trimmed squares).
 
     times, poses (N,) and (N, 6)  Times, s, and measured poses, without lost ones.
     covariance (6, 6)             Covariance of a pose.
@@ -144,13 +146,13 @@ def _still_wrong(
     """Return the sorted rows of wrong poses that are also far from right poses alone.
 
     A right pose beside wrong poses can be far from a polynomial through the wrong ones. wrong:
-    rows, the least wrong first. least: smallest mean squared distance of neighbours.
+    rows, the least wrong first. least: lower limit of the mean squared distance of neighbours.
     """
     for row in wrong:
         others = np.delete(np.arange(len(times)), wrong[wrong != row])
-        place = np.searchsorted(others, [row])
-        # Consecutive wrong poses leave a gap, so that a longer time between poses is allowed.
-        neighbours, powers, reached = _windows(times[others], place, 2 * LONGEST)
+        index = np.searchsorted(others, [row])
+        # Consecutive wrong poses leave a gap, so a longer time between poses is allowed.
+        neighbours, powers, reached = _windows(times[others], index, 2 * LONGEST)
         squared, leftover = _predicted(white[[row]], powers, white[others[neighbours]])
         if reached[0] and squared[0] <= GROSS * max(least, leftover[0]):
             wrong = wrong[wrong != row]
@@ -158,7 +160,7 @@ def _still_wrong(
 
 
 def _whitened(poses: Array, covariance: Array) -> Array:
-    """Return poses (N, 6) in standard deviations of the noise, with angles without jumps."""
+    """Return poses (N, 6) with unwrapped angles, whitened by the covariance of the noise."""
     continuous = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3:], axis=0)])
     return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), continuous.T).T)
 
@@ -168,8 +170,8 @@ def _windows(
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
     """Return the neighbours (k, NEIGHBOURS) of rows (k,), and the powers of their times.
 
-    The powers (k, NEIGHBOURS, DEGREE + 1) are of times relative to the row. The last array (k,)
-    is false where the window spans a gap, across which a polynomial does not reach.
+    The powers (k, NEIGHBOURS, DEGREE + 1) are of times relative to the row, scaled to at most one.
+    The third array (k,) is False where the window spans a gap, across which no polynomial reaches.
     """
     first = np.clip(rows - NEIGHBOURS // 2, 0, len(times) - NEIGHBOURS - 1)
     window = first[:, None] + np.arange(NEIGHBOURS + 1)
@@ -189,19 +191,20 @@ def _predicted(white: Array, powers: Array, values: Array) -> tuple[Array, Array
     other poses from the polynomials, per component and degree of freedom.
     """
     base, weights = _weights(powers)
-    along = base.transpose(0, 2, 1) @ values
-    left = values - base @ along
+    coefficients = base.transpose(0, 2, 1) @ values
+    residuals = values - base @ coefficients
     freedom = white.shape[1] * (powers.shape[1] - powers.shape[2])
-    leftover = np.sum(left**2, axis=(1, 2)) / freedom
-    predicted = np.einsum("kp,kpc->kc", weights, along)
+    leftover = np.sum(residuals**2, axis=(1, 2)) / freedom
+    predicted = np.einsum("kp,kpc->kc", weights, coefficients)
     variance = 1.0 + np.sum(weights**2, axis=1)
     return np.sum((white - predicted) ** 2, axis=1) / variance, leftover
 
 
 def _weights(powers: Array) -> tuple[Array, Array]:
-    """Return an orthonormal basis (k, q, p) of powers (k, q, p), and weights (k, p) along it.
+    """Return an orthonormal basis (k, q, p) of powers (k, q, p), and weights (k, p).
 
-    The weighted sum of a polynomial's coefficients in the basis is its value at the row.
+    The sum of a polynomial's coefficients in the basis, times the weights, is the value of the
+    polynomial at the row.
     """
     base, triangle = np.linalg.qr(powers)
     # At the row itself all powers but the first are zero.
@@ -210,8 +213,9 @@ def _weights(powers: Array) -> tuple[Array, Array]:
 
 
 NORMAL = 1.4826  # ratio of the standard deviation of normal numbers to their median magnitude
-MOVING = 0.99  # share of the power of a motion that lies below its highest frequency
-MOVES = 2.0  # smallest standard deviation of a moving component, as a multiple of that of its noise
+MOVING = 0.99  # fraction of the power of a motion that lies below its highest frequency
+# Standard deviation of a component, as a multiple of that of its noise, above which it moves.
+MOVES = 2.0
 SEGMENTS = 4  # number of segments of the spectrum, not counting those that overlap two others
 SHORTEST = 128  # smallest number of frames of a segment, if the record has that many
 
@@ -234,8 +238,8 @@ class Spectrum:
 
     frequency (F,)  Frequencies, Hz.
     power (F, 6)    Power of each entry of a pose, m2/Hz and rad2/Hz.
-    highest_hz      Frequency below which 99 % of the power of the positions and of the angles lies,
-                    zero if nothing moves.
+    highest_hz      Frequency below which 99 % of the power lies, the higher one of positions and
+                    angles. It is zero if nothing moves.
     """
 
     frequency: Array
@@ -247,7 +251,7 @@ def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     """Return the spectrum of poses (N, 6) that were measured at times (N,).
 
     Poses are interpolated at N evenly spaced times. Positions or angles that move no more than
-    their noise (6,), m and rad, have no highest frequency.
+    MOVES times their noise (6,), m and rad, have no highest frequency.
     """
     # imported here, because it imports scipy.stats, for which a process of a study must not wait
     from scipy.signal import welch
@@ -261,6 +265,6 @@ def spectrum(time: Array, poses: Array, noise: Array) -> Spectrum:
     for kind in (slice(0, 3), slice(3, 6)):
         total = np.cumsum(power[:, kind].sum(axis=1))
         if (values[:, kind].std(axis=0) > MOVES * noise[kind]).any():
-            place = int(np.searchsorted(total, MOVING * total[-1]))
-            highest = max(highest, float(frequency[place]))
+            index = int(np.searchsorted(total, MOVING * total[-1]))
+            highest = max(highest, float(frequency[index]))
     return Spectrum(frequency, power, highest)

@@ -23,25 +23,28 @@ from identify.record.telemetry import Telemetry
 TRIED = 200  # number of poses with which other units and axes are tried
 # Lags, s, of the motion behind the commands that are tried with other units and axes.
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
-# Times, s, of the taps of the filter by which a joint follows its command.
+# Times, s, of the taps of the filter by which a joint follows its command, relative to the lag.
 FILTER_S = (-0.1, -0.05, 0.0, 0.05, 0.1)
-# Share of the motion left unexplained by the commands below which no other order is tried.
+# Fraction of the joints' motion that the commands may leave unexplained. Above it, other orders are
+# tried.
 EXPLAINED = 0.02
-# Largest ratio of the unexplained shares of two orders at which the other one counts as right.
+# Largest ratio of the unexplained fraction of another order to that of the stated one at which the
+# other one counts as right.
 BETTER = 0.25
-# Largest ratio of the unexplained shares of two orders between which the motion cannot choose.
+# Largest ratio of the unexplained fraction of an order to that of the best one at which the motion
+# cannot choose between both.
 EQUAL = 1.5
-# Smallest share of poses in reach. With a smaller share, other units and axes are tried.
+# Smallest fraction of poses in reach. With a smaller fraction, other units and axes are tried.
 IN_REACH = 0.5
-# Smallest correlation of a joint with its command that counts as the same motion. It is also the
-# smallest share of poses in reach with units and axes that fit.
+# Correlation of a joint with its command above which both are the same motion. It is also the
+# smallest fraction of poses in reach with units and axes that fit.
 FITS = 0.9
-# Largest correlation of a joint with its command that counts as the opposite direction.
+# Correlation of a joint with its command below which their directions are opposite.
 OPPOSES = -0.8
-# Largest difference, rad, of a joint's zero from a whole turn that counts as that turn.
+# Difference, rad, of a joint's offset from a whole number of turns below which it is such a number.
 NEAR_TURN = 0.3
-# Largest difference of a joint's zero, as a share of its travel limit. Drives without an integral
-# hold a joint away from its command.
+# Largest offset of a joint from its command, as a fraction of its travel limit, that needs no other
+# zero. Drives without an integral hold a joint away from its command.
 ZERO = 0.5
 SCALE = 2.0  # largest factor between two units that count as the same one. Loops overshoot and lag.
 
@@ -64,7 +67,8 @@ ANGLES_TRIED = {
 
 NAMES = ("x", "y", "z")
 
-# Columns whose orders and signs are tried: their places, their names, and the other columns.
+# Columns whose orders and signs are tried: their slice of a pose, their names, and the other
+# columns.
 COLUMNS = {
     "position": (slice(0, 3), NAMES, "orientation"),
     "angles": (slice(3, 6), POSE[3:], "position"),
@@ -87,10 +91,11 @@ def fits(telemetry: Telemetry, robot: Robot) -> bool:
 
 
 def unexplained(telemetry: Telemetry, robot: Robot) -> float:
-    """Return the share of the joints' motion that the commands do not explain.
+    """Return the fraction of the joints' motion that the commands do not explain.
 
-    Each joint follows its own command through a linear filter with the lags `LAGS_S`. The share is
-    that of the variance, the mean over the joints. It is 1 if too few poses are in reach.
+    Each joint follows its own command through a linear filter with the taps `FILTER_S` about the
+    lag of the motion. The result is the unexplained fraction of the variance, averaged over the
+    joints. It is 1 if too few poses are in reach.
     """
     poses = telemetry.poses
     if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
@@ -98,25 +103,26 @@ def unexplained(telemetry: Telemetry, robot: Robot) -> float:
     time, coordinates = joint_motion(telemetry, robot)
     lag = lag_of(telemetry, robot).seconds
     held = np.stack([_commands_at(telemetry, time - lag + later) for later in FILTER_S], axis=-1)
-    shares = []
+    fractions = []
     for commands, motion in zip(np.moveaxis(held, 1, 0), coordinates.T, strict=True):
-        filtered = np.column_stack([commands, np.ones(len(motion))])
-        left = motion - filtered @ np.linalg.lstsq(filtered, motion, rcond=None)[0]
-        shares.append(left.var() / max(motion.var(), np.finfo(float).tiny))
-    return float(np.mean(shares))
+        taps = np.column_stack([commands, np.ones(len(motion))])
+        residual = motion - taps @ np.linalg.lstsq(taps, motion, rcond=None)[0]
+        fractions.append(residual.var() / max(motion.var(), np.finfo(float).tiny))
+    return float(np.mean(fractions))
 
 
 def better_order(stated: float, shares: Mapping[str, float]) -> str:
-    """Return which conventions of Euler angles fit better than the stated one, or an empty string.
+    """Return a sentence about conventions of Euler angles that fit better than the stated one.
 
-    ``stated`` is the share of the motion that is `unexplained` with the stated convention, and
-    ``shares`` holds those of other ones by their names.
+    It is empty if none fits much better. ``stated`` is the fraction of the motion that is
+    `unexplained` with the stated convention. ``shares`` holds these fractions of other conventions,
+    by their names.
     """
     best = min(shares.values(), default=1.0)
     if best > BETTER * stated:
         return ""
-    right = sorted((share, name) for name, share in shares.items() if share <= EQUAL * best)
-    named = " or ".join(repr(name) for _, name in right)
+    fitting = sorted((share, name) for name, share in shares.items() if share <= EQUAL * best)
+    named = " or ".join(repr(name) for _, name in fitting)
     return (
         f"the order of the Euler angles is likely wrong: the commands leave {stated:.0%} of the "
         f"joints' motion unexplained, and {best:.1%} with convention = {named}"
@@ -169,12 +175,12 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
 
 
 def _other_order(telemetry: Telemetry, time: Array, coordinates: Array) -> str:
-    """Return the order of the joints in which all commands fit, or an empty string."""
+    """Return a hint about the order of the joints in which all commands fit, or an empty string."""
     for lag in LAGS_S:
         alike = _correlations(_commands_at(telemetry, time - lag), coordinates)
         joints, order = linear_sum_assignment(-alike)
         if (order != joints).any() and alike[joints, order].min() > FITS:
-            listed = ", ".join(str(place + 1) for place in np.argsort(order))
+            listed = ", ".join(str(column + 1) for column in np.argsort(order))
             return f"in another order they would fit: columns {listed} move joints 1, 2, ..."
     return ""
 
@@ -187,9 +193,10 @@ def _of_joints(
     robot: Robot,
     order: str,
 ) -> Iterator[str]:
-    """Yield wrong directions, units and zeros of joints (k,) that move as their commands do.
+    """Yield sentences on wrong directions, units and zeros of joints (k,) that follow commands.
 
-    `order` says in which other order the commands would fit.
+    `alike` (n,) has the correlations of all joints with their commands. Negative ones count, too.
+    `order` is a hint about another order in which the commands would fit, or empty.
     """
     if not len(joints):
         return
@@ -213,19 +220,19 @@ def _of_joints(
                 f"are {said.partition(' ')[2]} (columns.command.unit)"
             )
             return
-    gaps = np.median(coordinates - held, axis=0)
-    for joint, gap in zip(joints, gaps[joints], strict=True):
-        turns = 0 if prismatic else round(gap / (2 * np.pi))
-        lies = (
-            f"the commands of joint {joint + 1} lie {-gap:.4g} {unit} from the joint coordinates "
-            "of the poses"
+    offsets = np.median(coordinates - held, axis=0)
+    for joint, offset in zip(joints, offsets[joints], strict=True):
+        turns = 0 if prismatic else round(offset / (2 * np.pi))
+        text = (
+            f"the commands of joint {joint + 1} lie {-offset:.4g} {unit} from the joint "
+            "coordinates of the poses"
         )
-        if turns and abs(gap - 2 * np.pi * turns) < NEAR_TURN:
+        if turns and abs(offset - 2 * np.pi * turns) < NEAR_TURN:
             by = "a turn" if abs(turns) == 1 else f"{abs(turns)} turns"
-            yield f"{lies}: its zero is off by {by} (columns.command.zeros)"
-        elif abs(gap) > ZERO * robot.travel_limit:
+            yield f"{text}: its zero is off by {by} (columns.command.zeros)"
+        elif abs(offset) > ZERO * robot.travel_limit:
             yield (
-                f"{lies}, {abs(gap) / robot.travel_limit:.0%} of the travel limit: its zero, or "
+                f"{text}, {abs(offset) / robot.travel_limit:.0%} of the travel limit: its zero, or "
                 "the frame of the poses, differs from the robot file"
             )
 
@@ -246,9 +253,9 @@ def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]
 
 
 def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
-    """Return the units and axes with which the poses would move as the commands do, as a hint.
+    """Return a hint about units and axes with which the poses would move as the commands do.
 
-    Returns an empty string if none fit better than the present ones (mean correlation `alike`).
+    It is empty if none fit much better than the present ones, whose mean correlation is `alike`.
     """
     poses = telemetry.poses
     rows = np.flatnonzero(poses.ok)
@@ -263,7 +270,7 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
             continue
         joints = robot.inverse_kinematics(tried[reached])
         score = max(np.diagonal(_correlations(one[reached], joints)).mean() for one in held)
-        # What changes less is tried first, and only a better fit takes its place.
+        # Smaller changes are tried first. Only a better fit replaces them.
         if score > best + 0.02:
             best = score
             found = said
@@ -295,13 +302,13 @@ def _other_poses(poses: Array) -> Iterator[tuple[str, Array]]:
 
 
 def _commands_at(telemetry: Telemetry, time: Array) -> Array:
-    """Return the commands (N, n) at times (N,), and the nearest where there are none."""
+    """Return the commands (N, n), interpolated at times (N,) and held beyond the first and last."""
     commands = telemetry.commands
     return interpolated(time, commands.time, commands.command)
 
 
 def _all_axes(usual: Sequence[str] = NAMES) -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Yield names and matrices (3, 3) of all choices of axes, those with fewer changes first."""
+    """Yield names and matrices (3, 3) of all choices of axes, those with fewest changes first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
         matrix = np.zeros((3, 3))
@@ -323,7 +330,7 @@ def _with_axes(poses: Array, matrix: Array) -> Array:
 
 
 def _on_chart(poses: Array, robot: Robot) -> Array:
-    """Return poses (N, 6) with only those entries that the platform can change."""
+    """Return poses (N, 6) with the entries that the platform cannot change set to those of home."""
     return np.asarray(robot.pose(robot.coordinates(poses)))
 
 

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from identify.arrays import Array
 from identify.errors import RecordError
 
-TIME_ROUNDING = 1e-3  # largest error of the time between two frames, as a share of the frame period
+# Largest error of the time between two frames, as a fraction of the frame period.
+TIME_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Places of rows in a file, which messages name."""
+    """Numbers of rows in a file, by which messages name the rows."""
 
     source: str
     """File, or file and topic."""
@@ -31,7 +32,7 @@ class Rows:
     """Word for a row: line or message."""
 
     def place(self, row: int) -> str:
-        """Return where a row, counted from 0, is found: ``mine.csv line 12``."""
+        """Return the name of a row, counted from 0, such as ``mine.csv line 12``."""
         return f"{self.source} {self.word} {self.numbers[row]}"
 
 
@@ -68,8 +69,8 @@ class CommandLog:
     written: Array | None = None
     """(M,): times at which the commands were written to the drives, NaN where none was.
 
-    None if they are not logged. A command then acts after its row by the latency of the timing. In
-    a table of commands alone, these are the times of the rows.
+    It is None if these times are not logged. A command then acts one latency of the timing after
+    its row. In a table of commands alone, these are the times of the rows.
     """
 
     def __post_init__(self) -> None:
@@ -111,16 +112,16 @@ class Telemetry:
 
     @property
     def is_one_table(self) -> bool:
-        """Whether each row holds a pose, a command and a reference of the same time."""
+        """True if each row holds a pose and a command, and the reference if there is one."""
         times = [self.commands.time]
         times += [] if self.reference is None else [self.reference.time]
         return all(np.array_equal(time, self.poses.time) for time in times)
 
 
 def check_increasing(time: Array, rows: Rows) -> None:
-    """Check that the times (N,) of rows increase.
+    """Check that the times (N,) of rows are finite and increase.
 
-    Raises RecordError with the first that does not.
+    Raises RecordError with the first row that is wrong.
     """
     strange = np.flatnonzero(~np.isfinite(time))
     if len(strange):

@@ -45,15 +45,16 @@ def build_timed_record(
     measured_covariance : array_like, shape (6, 6) or (N, 6, 6)
         Covariance of the measured poses.
     measured_ok : array_like, shape (N,), optional
-        1 where the pose was measured, 0 where it was lost. The default is 1 where it is finite.
+        1 where the pose was measured, 0 where it was lost. The default is 1 where the pose is
+        finite.
     acting : array_like, shape (M,)
-        Times at which the commands begin to act, s, on the same clock.
+        Times at which the commands begin to act, s, on the same clock. They must not decrease.
     command : array_like, shape (M, n)
         Commands of the n joints, each valid until the next: rad, or m for prismatic joints.
     gaps : array_like, shape (k, 2), optional
         Times of the last known command before and of the first known command after each gap in
         which commands are missing, s. A command that is held is not missing. Poses in a gap are
-        left out, and a model starts anew after it.
+        left out, and a model starts anew after the gap.
     scenario_toml : str
         TOML text with the settings of the run, as `Scenario.to_toml` returns it.
     robot : str
@@ -72,8 +73,8 @@ def build_timed_record(
     Raises
     ------
     RecordError
-        A shape is wrong, a number of a measured pose is not finite, times do not increase, or the
-        times of poses and commands do not overlap.
+        A shape is wrong, a number of a measured pose is not finite, times of poses do not increase
+        or times of commands decrease, or too few poses are measured while commands act.
 
     Examples
     --------
@@ -128,8 +129,9 @@ def build_timed_record(
 def _stretches(times: Array, ok: NDArray[np.bool_], acting: Array, gaps: Array) -> NDArray[np.int_]:
     """Return the number of the stretch of each pose (N,), from 1, and 0 for poses in none.
 
-    A stretch begins with a measured pose, once two of its commands act. It ends with the last pose
-    before the first missing command would act.
+    A stretch begins with the first measured pose after two of its commands began to act. It ends
+    with the last pose before the first missing command would act. Parts with fewer than FEWEST
+    measured poses are no stretches.
     """
     usual = float(np.median(np.diff(acting))) if len(acting) > 1 else 0.0
     known_from = [-np.inf, *gaps[:, 1]]

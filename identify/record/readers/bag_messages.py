@@ -12,7 +12,7 @@ from typing import Any
 LOG_TIME = "log_time"
 
 LISTED = 8  # number of messages of a topic that are searched for the names of its entries
-MOST = 500  # largest number of columns of a topic
+MOST = 500  # largest number of columns of a topic, and of listed entries of an array
 NAMES = ("name", "joint_names")  # entries of a message that name those of its arrays
 CHILD = "child_frame_id"  # entry that names a transform among several
 # Name of an entry of a message, and number or name in its brackets, or None.
@@ -31,7 +31,7 @@ def list_topics(path: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
         for topic, connection in sorted(bag.topics.items()):
             names: dict[str, None] = {LOG_TIME: None}
             kind = str(connection.msgtype)
-            # Names are found without their values, in the order of the message.
+            # The keys of a dictionary keep the order of the message, without duplicates.
             for _, message in islice(_messages(bag, topic), LISTED):
                 names |= dict.fromkeys(islice(_columns(message, message), MOST))
             found[topic] = kind.replace("/msg/", "/"), tuple(names)
@@ -41,13 +41,14 @@ def list_topics(path: Path) -> dict[str, tuple[str, tuple[str, ...]]]:
 def read_messages(
     path: Path, topic: str, names: Sequence[str]
 ) -> tuple[list[int], list[list[Entry]]]:
-    """Return the numbers of the messages that have any of the columns, and the columns.
+    """Return the numbers, from 1, of the messages that have any of the columns, and the columns.
 
-    Times are seconds, as text with all their digits. Raises the exceptions of rosbags.
+    If columns other than times are read, a message must have one of these. Times are seconds, as
+    text with all their digits. Raises the exceptions of rosbags.
     """
     paths = [_steps(name) for name in names]
-    # Every message has a time, so times do not show whether it has an entry.
-    telling = [place for place, name in enumerate(names) if not _is_time(name)]
+    # Every message has a time, so times do not show whether the message has an entry.
+    telling = [index for index, name in enumerate(names) if not _is_time(name)]
     numbers: list[int] = []
     columns: list[list[Entry]] = [[] for _ in names]
     with _opened(path) as bag:
@@ -56,7 +57,7 @@ def read_messages(
                 _seconds(moment) if name == LOG_TIME else _entry(message, steps)
                 for name, steps in zip(names, paths, strict=True)
             ]
-            if telling and all(cells[place] is None for place in telling):
+            if telling and all(cells[index] is None for index in telling):
                 continue
             numbers.append(number)
             for column, cell in zip(columns, cells, strict=True):
@@ -96,13 +97,13 @@ def _steps(name: str) -> list[Step]:
 
 
 def _entry(message: Any, steps: Sequence[Step]) -> Entry:
-    """Return the number at a path in a message, or None if the message has none there."""
+    """Return the number or time at a path in a message, or None if the message has none there."""
     value = message
     for name, key in steps:
         value = getattr(value, name, None)
         if key is not None and value is not None:
-            place = _place(message, value, key)
-            value = value[place] if place is not None and place < len(value) else None
+            index = _place(message, value, key)
+            value = value[index] if index is not None and index < len(value) else None
     if hasattr(value, "nanosec"):
         return _seconds(value.sec * 1_000_000_000 + value.nanosec)
     try:
@@ -112,7 +113,7 @@ def _entry(message: Any, steps: Sequence[Step]) -> Entry:
 
 
 def _place(message: Any, values: Sequence[Any], key: str) -> int | None:
-    """Return the place of an entry by its number or name, or None."""
+    """Return the index of an array's entry with this number or name, or None if there is none."""
     if len(values) and hasattr(values[0], CHILD):
         return next((k for k, one in enumerate(values) if getattr(one, CHILD) == key), None)
     names = _named(message, len(values))
@@ -142,8 +143,8 @@ def _columns(message: Any, value: Any, path: str = "") -> Iterator[str]:
         yield path
     elif hasattr(value, "__len__") and not isinstance(value, (str, bytes)):
         names = _named(message, len(value))
-        for place, one in enumerate(islice(value, MOST)):
-            key = getattr(one, CHILD, names[place] if names else str(place))
+        for index, one in enumerate(islice(value, MOST)):
+            key = getattr(one, CHILD, names[index] if names else str(index))
             yield from _columns(message, _plain(one), f"{path}[{key}]")
 
 

@@ -26,7 +26,7 @@ LIMIT_S = 120  # time limit for reading a topic, s. Bags with images are large.
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a file of its kind, or a folder with its metadata."""
+    """Return whether a path is a bag: a file with one of SUFFIXES, or a folder with METADATA."""
     return path.suffix.lower() in SUFFIXES or (path / METADATA).is_file()
 
 
@@ -48,7 +48,8 @@ class Bag:
     def read(self, topic: str, names: Sequence[str]) -> Stream:
         """Read columns of a topic, without messages that have none of them.
 
-        Raises RecordError for a missing column, with those that the messages have.
+        Raises RecordError if the bag cannot be read, a column is missing, or no message has any of
+        them. The message names the columns of the topic.
         """
         header = self.headers[topic]
         check_columns(header, names, f"{self.path} {topic}")

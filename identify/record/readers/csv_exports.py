@@ -1,7 +1,8 @@
 """Tables as CSV: plain ones, and exports of Motive and Vicon with headers of several lines.
 
-Motive names a body and writes its rotation and position below. Vicon writes a section for each kind
-of data, with the rate, the names of the bodies, the components and their units.
+Motive writes the names of the bodies above the columns of their rotations and positions. Vicon
+writes a section for each kind of data, with the rate, the names of the bodies, the components and
+their units.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +59,10 @@ class LoggedTable:
         return {title: part.header for title, part in self.parts.items()}
 
     def read(self, topic: str, names: Sequence[str]) -> Stream:
-        """Read columns of a section. Raises RecordError for a missing column, with those it has."""
+        """Read columns of a section.
+
+        Raises RecordError if a column or all rows are missing, or a row has a wrong length.
+        """
         part = self.parts[topic]
         source = f"{self.path} {topic}".rstrip()
         check_columns(part.header, names, source)
@@ -72,10 +76,10 @@ class LoggedTable:
                     f"{self.path} line {number} has {len(cells)} cells, and the header has {width} "
                     "columns"
                 )
-        places = {name: part.header.names.index(name) for name in names}
+        indices = {name: part.header.names.index(name) for name in names}
         columns = {
-            name: [cells[place] if place < len(cells) else "" for _, cells in part.rows]
-            for name, place in places.items()
+            name: [cells[index] if index < len(cells) else "" for _, cells in part.rows]
+            for name, index in indices.items()
         }
         return Stream(columns, Rows(str(self.path), tuple(number for number, _ in part.rows)))
 
@@ -84,17 +88,17 @@ def _motive(path: Path, lines: Sequence[Line]) -> Part:
     """Return the table of an export of Motive."""
     pairs = lines[0][1]
     said = dict(zip(pairs[::2], pairs[1::2], strict=False))
-    last = _component_line(path, lines)
-    above = [cells for _, cells in lines[1:last]]
-    # Newer versions name the lines above the columns in their second cell.
+    bottom = _component_line(path, lines)
+    above = [cells for _, cells in lines[1:bottom]]
+    # In newer versions, the second cell of a line of the header says what the line contains.
     named = [cells for cells in above if len(cells) > 1 and cells[1] == "Name"]
     if len(above) < 3:
         raise RecordError(f"{path}: the header of this Motive export has no names of bodies")
     bodies = named[0] if named else above[1]
-    stacked = list(zip_longest(bodies, above[-1], lines[last][1], fillvalue=""))
+    stacked = list(zip_longest(bodies, above[-1], lines[bottom][1], fillvalue=""))
     names = [
-        components if place < 2 else " ".join(filter(None, (body, kind, components)))
-        for place, (body, kind, components) in enumerate(stacked)
+        components if column < 2 else " ".join(filter(None, (body, kind, components)))
+        for column, (body, kind, components) in enumerate(stacked)
     ]
     length = said.get("Length Units", "")
     positions = [kind == POSITION for _, kind, _ in stacked]
@@ -106,7 +110,7 @@ def _motive(path: Path, lines: Sequence[Line]) -> Part:
         _rate(said.get("Export Frame Rate") or said.get("Capture Frame Rate") or ""),
         said.get("Rotation Type"),
     )
-    return Part(header, lines[last + 1 :])
+    return Part(header, lines[bottom + 1 :])
 
 
 POSITION = "Position"  # word above the columns of a position in an export of Motive
@@ -118,27 +122,27 @@ def _vicon(path: Path, lines: Sequence[Line]) -> dict[str, Part]:
     parts = {}
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         section = lines[start:end]
-        last = _component_line(path, section)
-        components = section[last][1]
-        units = section[last + 1][1] if last + 1 < len(section) else []
+        bottom = _component_line(path, section)
+        components = section[bottom][1]
+        units = section[bottom + 1][1] if bottom + 1 < len(section) else []
         bodies: list[str] = []
-        # The name of a body stands above the first of its columns.
-        for place, _ in enumerate(components):
-            above = section[last - 1][1]
-            own = above[place] if place < len(above) else ""
-            bodies.append(own or (bodies[-1] if place > 2 else ""))
+        # The name of a body is above the first of its columns. The first two are frame numbers.
+        for column, _ in enumerate(components):
+            above = section[bottom - 1][1]
+            own = above[column] if column < len(above) else ""
+            bodies.append(own or (bodies[-1] if column > 2 else ""))
         names = [" ".join(filter(None, pair)) for pair in zip(bodies, components, strict=True)]
         stated = {name: unit for name, unit in zip(names, units, strict=False) if unit}
         header = Header(tuple(names), "Vicon", stated, _rate(section[1][1][0]))
-        parts[section[0][1][0]] = Part(header, section[last + 2 :])
+        parts[section[0][1][0]] = Part(header, section[bottom + 2 :])
     return parts
 
 
 def _component_line(path: Path, lines: Sequence[Line]) -> int:
-    """Return the place of the line with the components, which begins with the word Frame."""
-    for place, (_, cells) in enumerate(lines):
+    """Return the index of the line with the components, which begins with the word Frame."""
+    for index, (_, cells) in enumerate(lines):
         if cells[0] == FRAME:
-            return place
+            return index
     raise RecordError(
         f"{path} line {lines[0][0]}: below this line there is no header that begins with {FRAME}"
     )

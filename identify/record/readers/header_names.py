@@ -67,7 +67,7 @@ class Body:
     position: tuple[str, ...]
     orientation: tuple[str, ...]
     convention: str | None
-    """None if the names do not tell it."""
+    """Convention of the orientation, or None if the names do not tell it."""
 
     @property
     def label(self) -> str:
@@ -131,7 +131,7 @@ def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
         if all(one in named for one in angles):
             if angles[0] == "rx" and "qw" in named:
                 return (*(named[one] for one in angles), named["qw"]), "quaternion_xyzw"
-            # The order of the columns often is that of the turns.
+            # The columns are often in the order of the turns, so they keep their order.
             return tuple(column for one, column in named.items() if one in angles), None
     return (), None
 

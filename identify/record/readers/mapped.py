@@ -1,8 +1,8 @@
 """Telemetry from a log whose columns have other names, which ``[columns]`` states.
 
-A pose of the log is (R, p), a rotation and a position in the log's own frame. With our names of the
-axes it is (A R A^T, A p), where A has one entry of 1 or -1 in each row. A with the determinant -1
-makes a left-handed system right-handed.
+A pose of the log is (R, p), a rotation and a position in the log's own frame. In our axes it is
+(A R A^T, A p), where A has one entry of 1 or -1 in each row. If its determinant is -1, A makes a
+left-handed system right-handed.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,9 +34,10 @@ from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
-# Largest deviation of a quaternion's length from one, and of a matrix from a rotation.
+# Largest deviation of a quaternion's length from one, and of R R^T from the identity.
 UNIT_LENGTH = 0.01
-# Largest plausible Euler angle, rad. Larger angles are probably degrees.
+# Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones are probably
+# degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
 
 
@@ -118,7 +119,7 @@ class _Reader:
         return ReferenceLog(time, _near_home(poses, robot), stream.rows)
 
     def _stream(self, log: Log, names: list[str], events: bool) -> Stream:
-        """Return the rows with a time. If rows are events, they also have a cell of the names."""
+        """Return the rows that have a time and, if rows are events, any cell of the columns."""
         path = self.path if log.file is None else self.path.parent / log.file
         file = self.opened.setdefault(path, open_log(path))
         topic = checked_topic(file.headers, log.topic, str(path))
@@ -148,7 +149,7 @@ class _Reader:
 
 
 def _shared(own: Log, measured: PoseColumns) -> Log:
-    """Return the place and time of columns that share the rows of the measured poses."""
+    """Return columns with the file, topic and times of the poses, whose rows they share."""
     place: Mapping[str, object] = {name: getattr(measured, name) for name in Log.model_fields}
     return own.model_copy(update=place)
 
@@ -159,12 +160,16 @@ def _pose_names(log: PoseColumns) -> list[str]:
 
 
 def _since(moments: Iterable[Decimal], start: Decimal) -> Array:
-    """Return times (N,) from the start on, s."""
+    """Return times (N,) since the start, s."""
     return np.array([float(moment - start) for moment in moments])
 
 
 def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured."""
+    """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured.
+
+    Other poses are NaN. Raises RecordError if a mark or a rotation is not valid, or if no pose was
+    measured.
+    """
     position = np.stack([stream.numbers(name) for name in log.position], axis=1)
     orientation = np.stack([stream.numbers(name) for name in log.orientation], axis=1)
     ok = np.asarray(np.isfinite(np.hstack([position, orientation])).all(axis=1))
@@ -199,7 +204,8 @@ def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
 def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -> Array | None:
     """Return the covariances (N, 6, 6) of poses (N, 6), NaN where lost, or None if there are none.
 
-    Small shifts and turns of the tracked body, in axes of the log, move the platform as twists do.
+    The columns are for small shifts and turns of the tracked body in axes of the log. They move the
+    platform as a twist does. Raises RecordError if a covariance of a measured pose is not finite.
     """
     if log.covariance is None:
         return None
@@ -220,7 +226,7 @@ def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -
     axes = _axes(log.axes)
     base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
     turn = base[0].as_matrix() @ axes
-    # turns are axial vectors, which mirrored axes reverse
+    # Turns are axial vectors, which mirrored axes reverse.
     moved = block_diag(turn, np.linalg.det(axes) * turn) * units
     whole = Rotation.from_euler("XYZ", poses[good, 3:])
     lever = (whole * body[0].inv()).apply(body[1])
@@ -232,7 +238,7 @@ def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -
 
 
 def _of_turns(covariances: Array, angles: Array) -> Array:
-    """Return the covariances (N, 6, 6) of small turns from those of Euler angles (N, 3) XYZ."""
+    """Return covariances (N, 6, 6) with small turns in place of Euler angles (N, 3) XYZ, rad."""
     about_x = Rotation.from_euler("X", angles[:, :1])
     about_xy = Rotation.from_euler("XY", angles[:, :2])
     turns = np.tile(np.eye(6), (len(angles), 1, 1))
@@ -265,7 +271,7 @@ def _transform(pose: list[float]) -> tuple[Rotation, Array]:
 
 
 def _rotations(cells: Array, log: PoseColumns, rows: Rows) -> Rotation:
-    """Return the rotations of columns (N, k). Raises RecordError with the row of a wrong one."""
+    """Return the rotations of columns (N, k). Raises RecordError with the first invalid row."""
     named = ", ".join(log.orientation)
     if log.convention.startswith("quaternion"):
         length = np.linalg.norm(cells, axis=1)
@@ -294,14 +300,14 @@ def _rotations(cells: Array, log: PoseColumns, rows: Rows) -> Rotation:
 
 
 def _from_matrices(matrices: Array, named: str, rows: Rows) -> Rotation:
-    """Return the rotations nearest to matrices (N, 3, 3)."""
-    gap = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = np.flatnonzero(gap > UNIT_LENGTH)
+    """Return the rotations nearest to matrices (N, 3, 3). Raises RecordError for other matrices."""
+    deviation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = np.flatnonzero(deviation > UNIT_LENGTH)
     if len(wrong):
         row = int(wrong[0])
         raise RecordError(
             f"{rows.place(row)}: the matrix {named} is not a rotation, its rows are not of length "
-            f"one and at right angles to within {UNIT_LENGTH:g}: {gap[row]:.3g}"
+            f"one and at right angles to within {UNIT_LENGTH:g}: {deviation[row]:.3g}"
         )
     mirrored = np.flatnonzero(np.linalg.det(matrices) < 0)
     if len(mirrored):
@@ -313,7 +319,7 @@ def _from_matrices(matrices: Array, named: str, rows: Rows) -> Rotation:
 
 
 def _near_home(poses: Array, robot: Robot) -> Array:
-    """Return poses (N, 6) whose angles begin within half a turn of home, and do not jump."""
+    """Return poses (N, 6) with unwrapped angles, which begin within half a turn of home."""
     good = np.isfinite(poses).all(axis=1)
     angles = np.unwrap(poses[good, 3:], axis=0)
     turns = np.round((robot.home_pose[3:] - angles[0]) / (2 * np.pi))
@@ -323,7 +329,10 @@ def _near_home(poses: Array, robot: Robot) -> Array:
 
 
 def _joint_coordinates(stream: Stream, given: CommandColumns, robot: Robot) -> Array:
-    """Return commands (M, n) with the units, directions and zeros of the robot file."""
+    """Return commands (M, n) with the units, directions and zeros of the robot file.
+
+    Raises RecordError if the columns do not fit the robot, or a command is empty.
+    """
     joints = robot.layout.joints
     if len(given.names) != joints:
         raise RecordError(

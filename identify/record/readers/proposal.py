@@ -2,8 +2,8 @@
 
 Names tell which columns belong together, and units at the end of a name are taken as they stand.
 What a header does not tell, such as the sequence of three angles, is left to the user as a key with
-the value "?". This value is refused, with the choices, until the user replaces it. If several
-bodies or several groups of columns are possible, the proposal is refused with their names.
+the value "?". A record is refused until the user has replaced this value. If several bodies or
+several groups of commands are possible, there is no proposal, and the error lists them.
 """
 
 import json
@@ -57,7 +57,7 @@ class Proposal:
         return "\n".join(self.lines) + "\n"
 
     def add(self, table: str, key: str, value: str | None, why: str) -> None:
-        """Add an entry, or ask for it with the reason if it is None."""
+        """Add an entry with a comment. If the value is None, the entry is left to the user."""
         if value is None:
             self.asked.append(f"{table}.{key}")
         shown = _text(ASKED if value is None else value)
@@ -104,7 +104,7 @@ def propose(
 
 
 def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, robot: Robot) -> None:
-    """Add the table of a pose. `rows` is the place of the measured poses, or None for their own."""
+    """Add the table of a pose. rows: place of the measured poses, None if this is their table."""
     header = body.place.header
     made.lines += ["", f"[columns.{table}]"]
     cells = _propose_rows(made, table, body.place, rows, [*body.position, *body.orientation])
@@ -177,7 +177,10 @@ def _propose_joints(made: Proposal, joints: Joints, rows: Place, robot: Robot) -
 def _propose_rows(
     made: Proposal, table: str, place: Place, rows: Place | None, names: Sequence[str]
 ) -> Stream:
-    """Add the place and time of a table's rows, if not those of the poses. Return its columns."""
+    """Add file, topic and time of a table, unless it shares the `rows` of the measured poses.
+
+    Returns the columns of the table.
+    """
     if place is rows:
         return place.numbers.read(place.part, names)
     entries = {"file": place.file, "topic": place.topic}
@@ -206,7 +209,7 @@ def _propose_rows(
 
 
 def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> Any:
-    """Return the only entry, or that with a label. Raises RecordError with the labels found."""
+    """Return the only entry, or the entry with a label. Raises RecordError with all labels."""
     labels = [one.label for one in found]
     if label is None and len(found) == 1:
         return found[0]
@@ -223,7 +226,7 @@ def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> 
 
 
 def _unit(header: Header, names: Sequence[str], allowed: Sequence[str]) -> str | None:
-    """Return the unit of columns by their names or the header, or None if neither tells it."""
+    """Return the unit of columns by the header or their names, or None if neither tells it."""
     if "/" in header.kind:  # messages of ROS are in SI units
         return allowed[0]
     stated = {header.units.get(name, "") for name in names}

@@ -38,7 +38,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Stream:
-    """Cells of the requested columns, and the places of their rows."""
+    """Cells of the requested columns, and the numbers of their rows in the file."""
 
     columns: Mapping[str, Sequence[Cell]]
     rows: Rows
@@ -58,7 +58,7 @@ class Stream:
         return Stream(columns, Rows(self.rows.source, numbers, self.rows.word))
 
     def numbers(self, name: str) -> Array:
-        """Return a column (N,). Empty cells are NaN. Raises RecordError with the row."""
+        """Return a column (N,), NaN where empty. Raises RecordError with the row of other text."""
         cells = self.columns[name]
         values = np.empty(len(cells))
         for row, cell in enumerate(cells):
@@ -84,7 +84,7 @@ class Stream:
         """Return the times (N,) of a column in seconds, exactly.
 
         A float would round times since 1970 to a quarter of a microsecond. Raises RecordError with
-        the row.
+        the row if a cell is not a number.
         """
         factor = Decimal(1) / Decimal(rate_hz) if unit == FRAMES else Decimal(TIMES[unit])
         found = []
@@ -119,11 +119,14 @@ class LoggedFile(Protocol):
         """Headers by topic, or by section of an export. A table has one header named ``""``."""
 
     def read(self, topic: str, names: Sequence[str]) -> Stream:
-        """Read columns of a topic. Raises RecordError, and names the columns that there are."""
+        """Read columns of a topic. Raises RecordError if one is missing, and lists the others."""
 
 
 def checked_topic(headers: Mapping[str, Header], topic: str | None, source: str) -> str:
-    """Return the topic, or the only one if None. Raises RecordError with the topics that exist."""
+    """Return the topic, or the only one if it is None.
+
+    Raises RecordError, with all topics, if there is no such topic, or several for None.
+    """
     if topic is None and len(headers) == 1:
         return next(iter(headers))
     if topic in headers:
@@ -134,7 +137,7 @@ def checked_topic(headers: Mapping[str, Header], topic: str | None, source: str)
 
 
 def check_columns(header: Header, names: Sequence[str], source: str) -> None:
-    """Check that a header has each name once. Raises RecordError."""
+    """Check that a header has each name once. Raises RecordError otherwise."""
     for name in names:
         count = header.names.count(name)
         if count > 1:
