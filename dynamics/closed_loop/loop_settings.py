@@ -128,8 +128,8 @@ class ServoGains:
 class FrameTiming:
     """Timing of the frames and of the joint commands.
 
-    The joint PID uses a rate of the command, U_dot: the difference of the last two commands divided
-    by the frame period, even if the command jumps.
+    The joint PID uses a rate of the command, U_dot: the difference of the acting command and the
+    one issued before it, divided by the frame period, even if the command jumps.
 
     Parameters
     ----------
@@ -138,7 +138,8 @@ class FrameTiming:
     latency_s : float
         Time from the exposure of a frame to the arrival of its command, s.
     hold : {"zero", "linear"}
-        With "zero" the command jumps to its new value. With "linear" it ramps to it over one frame.
+        With "zero" the command jumps to its new value. With "linear" it ramps to this value over
+        one frame period.
 
     Raises
     ------

@@ -69,7 +69,7 @@ class LoopProblem:
     """Checked arguments of one run, with its start state.
 
     Frames are one period apart, or at `times` (frames,), s. With `times`, only frames for which
-    `written` (frames,) is True issue a command. Other rows of `commands` repeat the row before.
+    `written` (frames,) is True issue a command. Other rows of `commands` repeat the previous row.
     """
 
     robot: Robot

@@ -14,10 +14,10 @@ from dynamics.errors import SimulationError
 class ClosedLoopRun:
     """Record of a run, one row per frame.
 
-    The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). With groups of inertial
-    parameters, p counts only the parameters that `differentiate_servo` then has. The start state
-    has s = 3 m + n entries, in the order of `StartState`. Fields that were not requested, or that
-    the robot does not have, are None. Poses are in m and rad, joints in rad or m.
+    The robot has n joints, m coordinates and p parameters (rss6: 6, 6, 67). With `groups`, p counts
+    only the parameters for which `differentiate_servo` computes derivatives. The start state has
+    s = 3 m + n entries, in the order of `StartState`. Fields that were not requested, or that the
+    robot does not have, are None. Poses are in m and rad, joints in rad or m.
 
     Attributes
     ----------

@@ -128,12 +128,13 @@ def remember(now: Record, h: float, margin: float) -> None:
 
 @kernel
 def locate_event(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Search for the step length at which the modes cease to hold, up to the last length tried.
+    """Begin the search for the step length at which a mode ceases to hold.
 
-    At this length, the margin crosses zero. `margin` is the one at the end of the last step. The
-    search uses inverse interpolation, and halves the bracket if the interpolation leaves it. The
-    first guess uses the stage at half the step. The margin of a joint that has just started from
-    rest is zero, so that the beginning of its bracket is found by halving.
+    At this length, the margin crosses zero. The search begins with the bracket from zero to the
+    length of the step just tried, which ends with `margin`. It uses inverse interpolation, and
+    halves the bracket if the interpolation leaves it. The first guess uses the stage at half the
+    step. For a joint that has just started from rest, the margin is zero at the beginning of the
+    step, too. Halving then gives the beginning of the bracket.
     """
     now.events_left -= 1
     if now.events_left < 0:
@@ -153,7 +154,7 @@ def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
     """Request the next step of the search for an event.
 
     The bracket is halved until the margin at its beginning is positive. If 40 halvings have found
-    no such bracket, the last step tried is accepted.
+    no such bracket, the step just tried is accepted.
     """
     if now.low_margin < NO_MARGIN and now.trials < 40:
         ask(now, BRACKET, now.high / 2)

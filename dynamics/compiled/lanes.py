@@ -241,7 +241,7 @@ def _own_steps(graph: Graph, everywhere: list[bool], part: int, outputs: list[in
 
 
 def _form(operand: Operand) -> int:
-    """Part of an operand that must be the same in all lanes."""
+    """Number of an operand that must be equal in all lanes: a step, or -1 for other values."""
     return operand if isinstance(operand, int) else -1
 
 

@@ -34,6 +34,7 @@ from dynamics.compiled.operations import type_name
 class MachineFunction:
     """Compiled function.
 
+    `inputs` are the numbers of entries of the inputs, and `outputs` are the shapes of the outputs.
     `address` is the address of the code for a single evaluation (see the module). It is valid as
     long as the object exists. `over_rows` evaluates many rows, but does not exist for a function of
     columns or of several sets of inputs at once. `constants` (c,) are the values of the last

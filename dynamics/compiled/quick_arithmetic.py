@@ -55,7 +55,7 @@ def quickened(graph: Graph) -> Graph:
 
 @cache
 def _approximations() -> dict[str, tuple[ca.Function, int]]:
-    """Functions that replace CasADi's operations, with the number of the output to use."""
+    """Functions that replace CasADi's operations, with the index of the output to use."""
     turning = _sine_and_cosine()
     tangent = _arctangent()
     return {"SIN": (turning, 0), "COS": (turning, 1), "ATAN2": (tangent, 0)}
@@ -64,7 +64,7 @@ def _approximations() -> dict[str, tuple[ca.Function, int]]:
 def _with_approximations(graph: Graph) -> Graph:
     """Replace operations by the functions of `_approximations`."""
     nodes: list[Node] = []
-    # number, in the new graph, of the value of each node of the old one
+    # index, in the new graph, of the value of each node of the old one
     placed: list[int] = []
     inlined: dict[tuple[str, tuple[int, ...]], list[int]] = {}
     for node in graph.nodes:
@@ -82,7 +82,7 @@ def _with_approximations(graph: Graph) -> Graph:
 
 
 def _inlined(nodes: list[Node], function: Graph, operands: tuple[int, ...]) -> list[int]:
-    """Append the values of a function to `nodes`, and return the numbers of its outputs."""
+    """Append the values of a function to `nodes`, and return the indices of its outputs."""
     placed: list[int] = []
     for node in function.nodes:
         if node.operation == "INPUT":

@@ -25,7 +25,8 @@ from dynamics.robot import Robot
 HALF_POWER = 2**-0.5
 DECAYED = 1e-3  # magnitude of eigenvalues below which a motion has decayed within a frame
 SLOWEST = 1e-2  # bandwidth, rad/s, at which the search for a stable lower one ends
-# Largest relative deviation of a designed error from HALF_POWER, and largest lack of damping.
+# Largest accepted relative deviation of the error of a designed servo from HALF_POWER, and largest
+# accepted shortfall of its damping.
 DESIGN_TOLERANCE = 0.02
 
 
@@ -224,8 +225,8 @@ def check_torque_gains(
     """Raise SimulationError if the law computed_torque is too fast. The error states the limit.
 
     The law is too fast if it is unstable near rest, or if its bandwidth exceeds half the frame
-    rate. Beyond that, a torque that acts for a whole frame stops the platform, but hardly moves it
-    back.
+    rate. With a larger bandwidth, a torque that acts for a whole frame stops the platform, but
+    hardly moves it back.
     """
     rate = settings.timing.frame_rate_hz
     radius = torque_radius(model, settings, pose, feedback)

@@ -169,7 +169,7 @@ def legs_of(
 ) -> Iterator[MechanismLeg]:
     """Legs of a simplified mechanism, each as a chain from the base to the platform.
 
-    A chain may consist of two parallel chains of equal bars. The columns of `from_platform` (3, 4)
+    Two parallel chains of equal bars are given as one chain. The columns of `from_platform` (3, 4)
     are the axes and the origin of the platform at home. Bodies without connections are ignored.
     Raises RobotFileError, with the leg and its bodies, for a mechanism of any other form.
     """

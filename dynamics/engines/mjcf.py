@@ -334,7 +334,7 @@ def _add_inertia(body: Xml.Element, reference: np.ndarray, inertia: np.ndarray) 
 
 
 def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
-    """Add the equality of each loop, which closes it, and the motor of each leg."""
+    """Add an equality for each loop, and a motor for each leg."""
     equality = Xml.SubElement(root, "equality")
     actuator = Xml.SubElement(root, "actuator")
     for number in chain.ends:

@@ -29,7 +29,7 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
     ``cmmsim import mjcf``, which limits time and memory.
 
     Raises RobotFileError if MuJoCo refuses the file, or if its mechanism has legs of no known kind.
-    Raises MujocoMissingError if MuJoCo is not installed.
+    Raises MujocoMissingError if MuJoCo is not installed, and MujocoError if it does not load.
     """
     mujoco = import_mujoco()
     _refuse_large(Path(path))

@@ -279,7 +279,8 @@ def _travel(
 ) -> float:
     """Travel limit, rad or m, from the ranges in the file, or a default about home with a note.
 
-    Raises RobotFileError if zero or home is not inside a range.
+    Raises RobotFileError for a range that does not extend beyond the home coordinate on both sides
+    of zero.
     """
     limits = []
     for mechanism_leg in mechanism_legs:
