@@ -1,4 +1,4 @@
-"""Poses, cameras, lens distortion, triangulation, registration, frames from planes, and discs.
+"""Poses, cameras, lens distortion, triangulation, registration, frames from planes, and stickers.
 
-The modules of this package use neither files nor images.
+The modules of this package neither read files nor process images.
 """

@@ -1,8 +1,9 @@
 """A pinhole camera with its lens: distortion, point spread and vignetting.
 
 Pixel coordinates (0, 0) are the centre of the top-left pixel. Camera axes are x right, y down, z
-forward. Ideal pixels are the pixels of the same camera with a perfect lens. In ideal pixels,
-straight lines stay straight, and the linear formulas of epipolar geometry and triangulation hold.
+forward. A perfect lens has no distortion. The ideal pixel of a point is the pixel at which the same
+camera would show it through a perfect lens. In ideal pixels, straight lines stay straight, and the
+linear formulas of epipolar geometry and triangulation hold.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ class PinholeCamera:
     width, height : int
         Size of the image, px.
     aspect : float
-        Ratio of the focal lengths along y and along x.
+        Focal length along y divided by that along x.
     distortion : Distortion
         Distortion of the lens.
 
     Raises
     ------
     ShapeError
-        If a parameter is not a finite number.
+        If focal length, principal point, size or aspect is not a finite number.
     CmmError
         If focal length, aspect or size is not positive.
 
@@ -65,7 +66,7 @@ class PinholeCamera:
     distortion: Distortion = field(default_factory=Distortion)
 
     def __post_init__(self) -> None:
-        figures = (
+        numbers = (
             self.focal_px,
             self.centre_x_px,
             self.centre_y_px,
@@ -74,7 +75,7 @@ class PinholeCamera:
             self.aspect,
         )
         finite_array(
-            figures,
+            numbers,
             (6,),
             "a camera's focal length, principal point, size and aspect are finite numbers",
         )
@@ -109,9 +110,10 @@ class PinholeCamera:
         return self if self.distortion.is_zero else replace(self, distortion=Distortion())
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
-        """Return pixels (..., 2) of points (..., 3) in camera axes, and whether each is seen.
+        """Return pixels (..., 2) of points (..., 3) m in camera axes, and whether each is seen.
 
-        A point is seen if it lies in front of the camera and inside its image.
+        A point is seen if it lies in front of the camera, its pixel lies inside the image, and the
+        distortion model is valid there. The pixel of a point behind the camera is meaningless.
         """
         depth = points[..., 2]
         ahead = depth > 1e-6
@@ -125,8 +127,8 @@ class PinholeCamera:
     def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
         """Return a mask (...) of the pixels (..., 2) that lie inside the image.
 
-        ``margin`` px is the smallest distance to the centres of the outermost pixels; -0.5 allows
-        the complete outermost pixels.
+        A pixel must lie more than ``margin`` px inside the centres of the outermost pixels. With
+        -0.5, the image ends at the outer edges of these pixels.
         """
         return np.all(
             (pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)),
@@ -134,7 +136,10 @@ class PinholeCamera:
         )
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
-        """Return pixels (..., 2) for ideal pixels (..., 2), and a mask of valid ones."""
+        """Return pixels (..., 2) for ideal pixels (..., 2), and a mask (...) of valid ones.
+
+        A pixel is valid if the distortion model is valid there, inside the image or not.
+        """
         if self.distortion.is_zero:
             return ideal, np.ones(ideal.shape[:-1], dtype=bool)
         normalised = (ideal - self.centre) / self.focal_lengths
@@ -143,17 +148,17 @@ class PinholeCamera:
         ) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
 
     def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
-        """Return ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each exists.
+        """Return ideal pixels (..., 2) for pixels (..., 2), and whether each ideal pixel exists.
 
         An ideal pixel that does not exist has a finite but meaningless value.
         """
         if self.distortion.is_zero:
             return pixels, np.ones(pixels.shape[:-1], dtype=bool)
-        normalised, found = self.distortion.undistort((pixels - self.centre) / self.focal_lengths)
-        return normalised * self.focal_lengths + self.centre, found
+        normalised, exists = self.distortion.undistort((pixels - self.centre) / self.focal_lengths)
+        return normalised * self.focal_lengths + self.centre, exists
 
     def distortion_jacobian(self, ideal: Array) -> Array:
-        """Return the derivatives (..., 2, 2) of distorted pixels at ideal pixels (..., 2)."""
+        """Return d(pixel) / d(ideal pixel) (..., 2, 2) at ideal pixels (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
 
@@ -171,9 +176,10 @@ class Optics:
     ``psf_px`` is the standard deviation of the Gaussian point spread, px. ``vignetting`` is the
     fraction of the light that is missing in the corner farthest from the principal point. The loss
     grows with the square of the distance from the principal point. ``aperture`` is the diameter of
-    the aperture, m, and ``focus`` the depth in focus, m. A share ``ghost`` of the light appears
-    again ``ghost_offset`` px beside its place. If all but the focus and the offset are zero, the
-    image is that of a pinhole camera.
+    the aperture, m, and ``focus`` the depth that is in focus, m. A ghost is a copy of the image,
+    shifted by ``ghost_offset`` px (x, y) and multiplied by ``ghost``, that is added to the image.
+    If all but the focus and the offset are zero, the image is that of a pinhole camera. Raises
+    CmmError if ``psf_px`` is negative, or ``vignetting`` is negative or not below 1.
     """
 
     psf_px: float = 0.0
@@ -189,18 +195,22 @@ class Optics:
 
     @property
     def margin_px(self) -> int:
-        """Largest distance, px (an integer), from which light outside a window reaches into it."""
+        """Distance, px (an integer), from which the point spread brings light into a window.
+
+        It holds for objects in focus.
+        """
         return self.reach_px(self.psf_px)
 
     @staticmethod
     def reach_px(psf_px: float) -> int:
-        """Return the reach of a point spread, px (an integer)."""
+        """Return the distance at which a point spread is cut off, px (an integer)."""
         return ceil(PSF_REACH * psf_px)
 
     def spreads_px(self, focal_px: float, depths: Array) -> Array:
         """Return the standard deviations (k,) px of the point spread at ``depths`` (k,), m.
 
-        A blur circle of diameter c has the variance c² / 16 along each axis.
+        The point spread includes defocus. A blur circle of diameter c has the variance c² / 16
+        along each axis.
         """
         circles = focal_px * self.aperture * np.abs(1.0 / self.focus - 1.0 / depths)
         return np.sqrt(self.psf_px**2 + circles**2 / 16.0)
@@ -223,7 +233,7 @@ class Optics:
     ) -> Array:
         """Return the relative illumination (k, size, size) of windows.
 
-        ``corners`` (k, 2) are the first pixels (x, y) of the windows.
+        ``corners`` (k, 2) are the first pixels (x, y), at the top left, of the windows.
         """
         ticks = np.arange(size)
         x = corners[:, 0, None, None] + ticks

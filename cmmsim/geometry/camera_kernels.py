@@ -13,9 +13,10 @@ from cmmsim.geometry.lens_distortion_kernels import distort_point
 
 
 class Cameras(NamedTuple):
-    """Two cameras with ``intrinsics`` (2, 9) and image sizes ``size`` (2, 2), px.
+    """Left and right camera, with ``intrinsics`` (2, 9) and image sizes ``size`` (2, 2), px.
 
-    ``extrinsics`` (2, 4, 4) transform points from their given axes into the axes of each camera.
+    A size is (width, height). ``extrinsics`` (2, 4, 4) are the transforms into the axes of each
+    camera from the axes in which points are given.
     """
 
     intrinsics: Array
@@ -27,20 +28,29 @@ class Cameras(NamedTuple):
 def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
     """Return the pixel u, v of a point in camera axes, and the derivatives of the distortion.
 
-    The derivatives xx, xy, yx, yy of the pixel are with respect to the ideal pixel.
+    The derivatives xx, xy, yx, yy of the pixel are with respect to the ideal pixel; xy is du / dy.
+    The point must not have the depth 0. Whether the camera sees it is not tested.
     """
     u, v, xx, xy, yy = distort_point(
         x_m / depth, y_m / depth, camera[4], camera[5], camera[6], camera[7], camera[8]
     )
-    skewed = camera[0] / camera[1]
-    return camera[0] * u + camera[2], camera[1] * v + camera[3], xx, xy * skewed, xy / skewed, yy
+    focal_ratio = camera[0] / camera[1]
+    return (
+        camera[0] * u + camera[2],
+        camera[1] * v + camera[3],
+        xx,
+        xy * focal_ratio,
+        xy / focal_ratio,
+        yy,
+    )
 
 
 @compiled
 def faces(point: Array, normal: Array, grazing: float) -> bool:
-    """Return True if a sticker at a point (3,) in camera axes faces the camera.
+    """Return True if a sticker at ``point`` (3,) lies in front of the camera and faces it.
 
-    The cosine between its normal and the direction to the camera must exceed ``grazing``.
+    The cosine between its ``normal`` (3,) and the direction to the camera must exceed ``grazing``.
+    Point and normal are in camera axes.
     """
     dot = 0.0
     squared = 0.0
@@ -52,13 +62,19 @@ def faces(point: Array, normal: Array, grazing: float) -> bool:
 
 @compiled
 def length_of(x: float, y: float) -> float:
-    """Return the length of a vector, faster than ``math.hypot``, which guards against overflow."""
+    """Return the length of a vector.
+
+    It is faster than ``math.hypot``, because it has no guard against overflow.
+    """
     return math.sqrt(x * x + y * y)
 
 
 @compiled
 def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) -> float:
-    """Return the relative illumination of pixel (u, v) in an image of size (width, height)."""
+    """Return the relative illumination of pixel (u, v), see ``Optics.illumination``.
+
+    ``size`` is (width, height).
+    """
     if vignetting == 0.0:
         return 1.0
     x = camera[2]
@@ -76,9 +92,10 @@ def point_derivatives(
 ) -> tuple:
     """Return the derivatives of one pixel coordinate with respect to the coordinates of a point.
 
-    ``by_u`` and ``by_v`` are the derivatives of the pixel coordinate with respect to the ideal
-    pixel. ``f_x`` and ``f_y`` are the focal lengths divided by the depth, and ``t_x`` and ``t_y``
-    are the normalised image coordinates of the point.
+    ``move`` (4, 4) transforms the point into camera axes. ``by_u`` and ``by_v`` are the derivatives
+    of the pixel coordinate with respect to the ideal pixel. ``f_x`` and ``f_y`` are the focal
+    lengths divided by the depth, and ``t_x`` and ``t_y`` are the normalised image coordinates of
+    the point.
     """
     in_x = by_u * f_x
     in_y = by_v * f_y

@@ -2,42 +2,42 @@
 
 **Ellipse.** Through a perfect lens the image of a disc is exactly an ellipse. Let C be the centre,
 n the unit normal and R the radius of the disc, in camera axes. Then D = C C' - R² (I - n n') is the
-dual conic of the rim. The camera matrix transforms D to pixels. The last column then gives the
-centre of the ellipse, and the upper left part gives its shape: a symmetric matrix A (2, 2) that
-maps the unit disc onto the ellipse.
+dual conic of the rim. With the camera matrix K, the dual conic in pixels is K D K'. Divided by its
+last entry, it has the ellipse's centre c in the last column, and c c' - A A' in the upper left
+part. The symmetric matrix A (2, 2), the shape, maps the unit disc onto the ellipse: c + A u.
 
 **Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a
-perfect lens the ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f
-(X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to a curve, to which an ellipse is fitted.
-Let J be the Jacobian of the distortion d at c. The curve is then d(c) + J A (u + w), where the
-small w(u) is due to the curvature of d. Let t be the tangent of the unit circle, and J A a the
-shift of the centre of the fitted ellipse. A fit to grey values minimises the squared normal
-distance between curve and ellipse, integrated along the curve. Up to a factor, this is the integral
-of (u'w - u'a)² / |J A t| over the angle of u. Its minimum is at
+perfect lens, and relative to the principal point, the ellipse's centre is f (D13/D33, D23/D33),
+while the circle's centre projects to f (X/Z, Y/Z). Distortion maps the ellipse c + A u, |u| = 1, to
+a curve, to which an ellipse is fitted. Let J be the Jacobian of the distortion d at c. The curve is
+then d(c) + J A (u + w), where the small w(u) is due to the curvature of d. Let t be the tangent of
+the unit circle, and J A a the shift of the centre of the fitted ellipse. A fit to grey values
+minimises the squared normal distance between curve and ellipse, integrated along the curve. Up to a
+factor, this is the integral of (u'w - u'a)² / |J A t| over the angle of u. Its minimum is at
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
-If J A maps the unit circle to a circle, and w_i = ½ H_ijk u_j u_k, this is
-a_i = (H_ijj + 2 H_jij) / 8.
+If J A maps the unit circle to a circle, and w_i = ½ H_ijk u_j u_k, this is a_i = (H_ijj + 2 H_jij)
+/ 8, with sums over repeated indices.
 
 **Coverage.** By Green's theorem the area of the ellipse within a pixel is a sum of two parts. The
-first is the integral of (x - left) dy over the arcs of the rim inside the pixel, where left is the
+first is the integral of (x - x_0) dy over the arcs of the rim inside the pixel, where x_0 is the
 pixel's left side. The second is the integral of dy over the arcs that lie in the same row to the
 right of the pixel. An arc x = c + A u, u = (cos t, sin t), ends where the rim crosses a side of a
 pixel. The integrals of u_i du_j along an arc follow from its ends and its angle. A change of c or A
-moves the rim by v = dc + dA u. It changes the area by the flux of v through the arcs inside the
+moves the rim by v = dc + dA u. The area then changes by the flux of v through the arcs inside the
 pixel, whose outward normal is (dy, -dx). This flux consists of the same integrals.
 
-**Blurred coverage.** Let g_i(x) be the share of light that a Gaussian point spread moves from the
-coordinate x into column i of the pixels, and g_j(y) that from y into row j. The share of light in a
-pixel is then the integral of g_i(x) g_j(y) over the ellipse. By the divergence theorem it is an
-integral along the rim x(t) = c + A (cos t, sin t),
+**Blurred coverage.** Let g_i(x) be the fraction of light that a Gaussian point spread moves from
+the coordinate x into column i of the pixels, and g_j(y) that from y into row j. The light in a
+pixel is then the integral L of g_i(x) g_j(y) over the ellipse; L is 1 in the middle of a large
+ellipse. By the divergence theorem L is also an integral along the rim x(t) = c + A (cos t, sin t),
 
-    share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i.
+    L = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i.
 
-A change of the ellipse moves the rim by v = dc + dA (cos t, sin t), and changes the share by
+A change of the ellipse moves the rim by v = dc + dA (cos t, sin t), and changes L by
 
-    d share = integral of g_i(x) g_j(y) v . n ds.
+    dL = integral of g_i(x) g_j(y) v . n ds.
 
 Both integrands are smooth and periodic in t. The trapezoidal rule therefore converges exponentially
 once its points lie closer than the width of the point spread.
@@ -54,8 +54,9 @@ from cmmsim.geometry.stereo_rig import StereoRig
 
 # Number of points on a distorted ellipse at which the integrals of the fit are evaluated.
 RIM_POINTS = 24
-# Standard deviation of the narrowest point spread that can be modelled.
+# Smallest standard deviation of a point spread that can be modelled, apart from 0.
 NARROWEST_PX = 0.05
+# Derivatives of a symmetric matrix A with respect to A_xx, A_xy and A_yy.
 SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 
 
@@ -84,9 +85,10 @@ def sticker_outlines(
 ) -> tuple[Array, Array]:
     """Return the ellipses of n stickers in both images: centres (2, n, 2) and shapes, px.
 
-    The shapes A are (2, n, 2, 2). ``camera_from_body`` is (4, 4) for all stickers, or (n, 4, 4)
-    with one transform per sticker. Stickers have places (n, 3) m and normals (n, 3) in body axes,
-    and a radius in m. The distortion is linearised within each sticker.
+    The shapes A are (2, n, 2, 2). ``camera_from_body`` leads to the left camera and is (4, 4) for
+    all stickers, or (n, 4, 4) with one transform per sticker. Stickers have positions ``places``
+    (n, 3) m and unit normals (n, 3) in body axes, and a radius in m. They must lie wholly in front
+    of the cameras. The distortion is linearised within each sticker.
     """
     centres = []
     shapes = []
@@ -102,7 +104,7 @@ def sticker_outlines(
 
 
 def distort_outlines(camera: PinholeCamera, middles: Array, shapes: Array) -> None:
-    """Replace ellipses of a perfect lens by those in the camera's image.
+    """Replace ellipses of a perfect lens, in place, by those in the camera's image.
 
     Ellipses have ``middles`` (n, 2) and ``shapes`` (n, 2, 2), px. The distortion is linearised
     within each ellipse.
@@ -150,12 +152,13 @@ def curvature_shift(camera: PinholeCamera, middles: Array, shapes: Array) -> Arr
 
 
 def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
-    """Return the share of light (n, size, size), 0 to 1, in each pixel, and its derivatives.
+    """Return the light (n, size, size) of n bright ellipses in each pixel, and its derivatives.
 
-    The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy, A_yy]. ``centres``
-    (n, 2) px are relative to the middle of the window's first pixel. ``shapes`` (n, 2, 2) px are
-    symmetric and positive definite. ``psf_px`` is the standard deviation of the point spread; 0
-    gives the fraction that the ellipse covers. Raises the CmmError of `require_psf`.
+    The light is 0 far outside of an ellipse, and 1 deep inside. ``psf_px`` is the standard
+    deviation of the point spread; if it is 0, the light is the fraction of the pixel that the
+    ellipse covers. The derivatives (n, size, size, 5) are with respect to [c_x, c_y, A_xx, A_xy,
+    A_yy]. ``centres`` (n, 2) px are relative to the middle of the window's first pixel. ``shapes``
+    (n, 2, 2) px are symmetric and positive definite. Raises the CmmError of `require_psf`.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.disc_kernels import blur_windows
@@ -178,7 +181,7 @@ def _contiguous(*arrays: Array) -> Iterator[Array]:
 
 
 def require_psf(psf_px: float) -> None:
-    """Raise CmmError for a point spread that is neither 0 nor wide enough to be modelled."""
+    """Raise CmmError unless a point spread is 0, or finite and at least NARROWEST_PX."""
     if not (psf_px == 0.0 or NARROWEST_PX <= psf_px < np.inf):
         raise CmmError(
             f"a point spread of {psf_px:g} px cannot be fitted: it must be 0 or at least "

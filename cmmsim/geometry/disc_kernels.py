@@ -1,6 +1,6 @@
-"""Compiled kernels for the image ellipses of discs, and for the share of light in each pixel.
+"""Compiled kernels for the image ellipses of discs, and for their blurred light in each pixel.
 
-``disc_image`` states the formulas. ``rim_kernels`` has the share without blur.
+``disc_image`` states the formulas. ``rim_kernels`` computes the light without blur.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
     """Return the ellipse x, y, xx, xy, yy of a disc in camera axes through a perfect lens.
 
     The middle x, y is in normalised coordinates. xx, xy, yy are the entries of A A', px², where A
-    maps the unit disc onto the ellipse.
+    maps the unit disc onto the ellipse. The disc must lie wholly in front of the camera.
     """
     squared = radius * radius
     # the dual conic D of ``disc_image``, divided by its last entry D33
@@ -39,7 +39,7 @@ def disc_ellipse(centre: Array, normal: Array, radius: float, focal: Array) -> t
 
 @compiled
 def symmetric_root(xx: float, xy: float, yy: float) -> tuple:
-    """Return the entries xx, xy, yy of the square root of a positive definite matrix M.
+    """Return the entries xx, xy, yy of the square root of a positive definite matrix M (2, 2).
 
     The square root is (M + d I) / sqrt(trace M + 2 d) with d² = det M.
     """
@@ -65,7 +65,7 @@ def project_all(
     centres: Array, normals: Array, radii: Array, focal: Array, principal: Array,
     middles: Array, shapes: Array,
 ) -> None:  # fmt: skip
-    """Fill the ellipses of n discs through a perfect lens: middles (n, 2) and shapes, px.
+    """Fill the ellipses of n discs through a perfect lens: ``middles`` (n, 2) and ``shapes``, px.
 
     The shapes are (n, 2, 2). The discs have centres and normals (n, 3) in camera axes, and radii
     (n,). ``focal`` (2,) are the focal lengths and ``principal`` (2,) the principal point, px.
@@ -82,7 +82,7 @@ def project_all(
 
 @compiled
 def distort_ellipses(camera: Array, middles: Array, shapes: Array) -> None:
-    """Replace ellipses of a perfect lens by those of a distorting camera with intrinsics (9,).
+    """Replace ellipses of a perfect lens, in place, by those of a camera with intrinsics (9,).
 
     The distortion is linearised within each ellipse.
     """
@@ -113,8 +113,8 @@ def place_discs(
 ) -> None:
     """Fill the centres and normals (n, 3) of discs in camera axes.
 
-    ``places`` and ``directions`` (n, 3) are in the axes of the bodies ``owners`` (n,), and
-    ``camera_from_bodies`` is (b, 4, 4).
+    ``places`` and ``directions`` (n, 3) are the centres and normals in the axes of the bodies
+    ``owners`` (n,), and ``camera_from_bodies`` is (b, 4, 4).
     """
     for n in range(len(places)):
         move = camera_from_bodies[owners[n]]
@@ -128,7 +128,7 @@ def place_discs(
 
 @compiled
 def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> None:
-    """Fill ``probes`` (n, k, 3) with the middle of each disc and k - 1 points on its rim."""
+    """Fill ``probes`` (n, k, 3) with the centre of each disc, then k - 1 points on its rim."""
     count = probes.shape[1] - 1
     u = np.empty(3)
     for n in range(len(centres)):
@@ -138,7 +138,7 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
             if abs(normal[i]) < abs(normal[least]):
                 least = i
         length = math.sqrt(1.0 - normal[least] ** 2)
-        # u = normal x e_least / length lies in the plane.
+        # The unit vector u = normal x e_least / length lies in the disc's plane.
         i = (least + 1) % 3
         j = (least + 2) % 3
         u[least] = 0.0
@@ -168,11 +168,12 @@ def inverse_shape(shape: Array) -> Array:
     return m
 
 
-# Distance from the rim at which the point spread is cut off, in standard deviations. A share of
-# 4e-8 of the light is lost.
+# Distance from the rim at which the point spread is cut off, in standard deviations. This loses a
+# fraction 4e-8 of the light.
 REACH = 5.5
 # Rim points per standard deviation of the point spread.
 POINTS_PER_SIGMA = 1.1
+# Smallest number of rim points.
 FEWEST_POINTS = 24
 SQRT_HALF = math.sqrt(0.5)
 SQRT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -184,8 +185,8 @@ def fill_blur_weights(
 ) -> None:
     """Fill g and P of ``disc_image`` at the coordinate ``start`` for pixels ``first`` to ``last``.
 
-    ``across`` is g, the fraction of a point's light that reaches a pixel along one axis. ``passed``
-    is P, the integral of g from -infinity to ``start``, px.
+    The pixel ``last`` is included. ``across`` is g, the fraction of a point's light that reaches a
+    pixel along one axis. ``passed`` is P, the integral of g from -infinity to ``start``, px.
     """
     u = (first - 0.5 - start) / psf_px
     below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
@@ -213,7 +214,7 @@ def rim_points(shape: Array, psf_px: float) -> int:
 def blur_window(
     centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of a blurred ellipse.
+    """Fill the light ``shares`` (h, w) and its ``derivatives`` (h, w, 5) for a blurred ellipse.
 
     The arguments are those of ``disc_image.coverage``, for a single ellipse.
     """
@@ -224,7 +225,7 @@ def blur_window(
     passed_x = np.empty(width)
     across_y = np.empty(height)
     passed_y = np.empty(height)
-    # contributions to all pixels left of a column
+    # contributions to all pixels to the left of each column
     to_the_left = np.zeros((height, width + 1))
     m = inverse_shape(shape)
     count = rim_points(shape, psf_px)
@@ -269,6 +270,6 @@ def blur_window(
 def blur_windows(
     centres: Array, shapes: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
-    """Fill shares (n, h, w) and derivatives (n, h, w, 5) of n ellipses, see ``blur_window``."""
+    """Fill ``shares`` (n, h, w) and ``derivatives`` (n, h, w, 5), see ``blur_window``."""
     for k in range(len(centres)):
         blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

@@ -1,4 +1,4 @@
-"""Lens distortion of Brown and Conrady.
+"""Lens distortion by the model of Brown and Conrady.
 
 The five distortion coefficients have OpenCV's order and meaning. Distortion acts on normalised
 image coordinates (x, y) = (X/Z, Y/Z). With s = x² + y²:
@@ -6,9 +6,10 @@ image coordinates (x, y) = (X/Z, Y/Z). With s = x² + y²:
     x_d = x (1 + k1 s + k2 s² + k3 s³) + 2 p1 x y + p2 (s + 2 x²)
     y_d = y (1 + k1 s + k2 s² + k3 s³) + p1 (s + 2 y²) + 2 p2 x y
 
-The model is valid up to the radius at which the radial part stops growing. Beyond this radius the
-image folds back onto itself. Source: D. C. Brown, Close-range camera calibration, Photogrammetric
-Engineering 37 (1971). ``lens_distortion_kernels`` computes the distortion and its inverse.
+The model is valid up to the fold radius, at which the radial part stops growing, and only where the
+determinant of the derivative is positive. Beyond the fold radius the image folds back onto itself.
+Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37 (1971).
+``lens_distortion_kernels`` computes the distortion and its inverse.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ FARTHEST_FOLD = 1e3
 
 @dataclass(frozen=True)
 class Distortion:
-    """Radial coefficients k1, k2, k3 and tangential p1, p2; all are zero for a perfect lens."""
+    """Radial coefficients k1, k2, k3 and tangential p1, p2; all are zero for a perfect lens.
+
+    Raises CmmError if a coefficient is not finite.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -52,7 +56,7 @@ class Distortion:
     @cached_property
     def fold_radius(self) -> float:
         """Undistorted radius at which the radial part stops growing; infinite if it never stops."""
-        # Roots of the derivative of the radial part, in 1/s.
+        # Values of 1/s at which the derivative of the radial part is zero.
         roots = np.roots([1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3])
         turning = roots[
             (np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / FARTHEST_FOLD**2)
@@ -74,9 +78,9 @@ class Distortion:
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 2)
         distorted = np.empty_like(flat)
-        slopes = np.empty((len(flat), 2, 2))
-        distort_points(np.array(astuple(self)), flat, distorted, slopes)
-        return distorted.reshape(points.shape), slopes.reshape(*points.shape, 2)
+        derivatives = np.empty((len(flat), 2, 2))
+        distort_points(np.array(astuple(self)), flat, distorted, derivatives)
+        return distorted.reshape(points.shape), derivatives.reshape(*points.shape, 2)
 
     def holds(self, points: Array) -> NDArrayBool:
         """Return a mask (...) of the undistorted points (..., 2) at which the model is valid.
@@ -89,9 +93,9 @@ class Distortion:
     def undistort(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Return the undistorted points (..., 2) of distorted points, and whether each was found.
 
-        Newton's method ends when the image of the result lies within 1e-12 of the given point. A
-        point is not found if it is not the image of an undistorted point inside the fold. Its value
-        is then finite but meaningless.
+        Newton's method searches inside the fold radius. A point was found if the method converged
+        to 1e-12 in both coordinates, and the determinant of the derivative is positive there. The
+        value of a point that was not found is finite but meaningless.
         """
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.lens_distortion_kernels import undistort_points

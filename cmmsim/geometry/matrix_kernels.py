@@ -1,4 +1,4 @@
-"""Compiled kernels for small symmetric systems of equations, by Cholesky's factor or by minors."""
+"""Compiled kernels for small symmetric systems of equations, by Cholesky factors or by minors."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
+# Smallest square of a diagonal entry of a Cholesky factor.
 SMALLEST_PIVOT = 1e-300
 
 
@@ -19,13 +20,16 @@ def factorise(matrix: Array) -> None:
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
-            # if rounding errors make the matrix indefinite, the pivot becomes a tiny number
+            # if rounding errors make the matrix indefinite, the diagonal entry is a tiny number
             matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
 
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Solve L L' x = ``right`` (n,) in place."""
+    """Solve L L' x = ``right``, and replace the right-hand side ``right`` (n,) by x.
+
+    L (n, n) is the lower triangle of ``lower``.
+    """
     n = len(right)
     for i in range(n):
         for k in range(i):
@@ -41,7 +45,7 @@ def solve_factored(lower: Array, right: Array) -> None:
 def invert_factored(lower: Array, inverse: Array) -> None:
     """Fill ``inverse`` with the leading (m, m) part of the inverse of L L'.
 
-    The inverse is K' K with K = L^-1.
+    L (n, n) is the lower triangle of ``lower``. The inverse is K' K with K = L^-1.
     """
     n = len(lower)
     m = len(inverse)

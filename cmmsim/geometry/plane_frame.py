@@ -1,8 +1,8 @@
 """The frame that three planes A, B and C define (paper section 4.2).
 
-The origin is the intersection of the planes. The z axis is the normal of A, the x axis is the
-intersection line of A and B, and y is the cross product of z and x. A plane is n . p = d with the
-unit normal n.
+The origin is the intersection of the planes. The z axis is the normal of A. The x axis, along the
+intersection line of A and B, is the cross product of the normals of A and B. The y axis is the
+cross product of z and x. A plane is n . p = d with the unit normal n.
 """
 
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from cmmsim.geometry.pose import Array, rigid
 from cmmsim.geometry.registration import SMALLEST_SPREAD
 
 PLANE_NAMES = ("A", "B", "C")
+# Smallest number of stickers to which a plane is fitted.
 FEWEST_STICKERS = 3
 
 
@@ -23,9 +24,9 @@ FEWEST_STICKERS = 3
 class FittedPlane:
     """One plane, or an array (...) of planes.
 
-    Planes have unit normals (..., 3), offsets d (...), m, and two tangents (..., 3, 2). The
-    covariance (..., 3, 3) belongs to three parameters: two tilts, rad, and d, m. The tilts change
-    the normal by tangents @ tilts.
+    Planes have unit normals (..., 3), offsets d (...), m, and two unit tangents (..., 3, 2). The
+    covariance (..., 3, 3) is that of three parameters: two tilts, rad, and d, m. The tilts (2,)
+    change the normal by tangents @ tilts.
     """
 
     normal: Array
@@ -39,8 +40,10 @@ def fit_plane(
 ) -> FittedPlane:
     """Fit a weighted least-squares plane to points (n, 3) with covariances (n, 3, 3).
 
-    For sets of points (..., n, 3) the result is one plane per set. ``rough_normals`` (..., 3) fix
-    the signs. Raises LostError for fewer than three points, or if all points lie on one line.
+    For sets of points (..., n, 3) the result is one plane per set. Each normal gets the sign with
+    which it points to the side of ``rough_normals`` (..., 3). Raises LostError, which names the
+    plane ``name``, for fewer than three points, or if the points of a set lie on one line to within
+    SMALLEST_SPREAD.
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
@@ -57,7 +60,7 @@ def fit_plane(
         )
     normal = axes[..., 2, :]
     normal = normal * np.where(_dot(normal, rough_normals) > 0.0, 1.0, -1.0)[..., None]
-    # Shift of the plane from the middle, along the normal.
+    # Distance along the normal from the middle of the points to the plane.
     shift = np.zeros(normal.shape[:-1])
     # the start is the unweighted plane, so two weighted steps converge to rounding errors
     for _ in range(2):
@@ -98,10 +101,11 @@ def frame_of_points(
 ) -> tuple[Array, Array]:
     """Return the frame (4, 4) of planes through measured stickers, and its covariance (6, 6).
 
-    The covariance is that of the small error [dt, dphi]. Stickers are points (n, 3) with
-    covariances (n, 3, 3). ``plane_index`` (n,) is 0, 1 or 2 for a sticker on plane A, B or C.
-    ``rough_normals`` (3, 3) has one row per plane. Raises LostError, which names the plane, if a
-    plane has too few stickers or all of them lie on one line.
+    The frame is that of ``frame_from_planes``, and the covariance that of its small error
+    [dt, dphi]. Stickers are points (n, 3) m with covariances (n, 3, 3). ``plane_index`` (n,) is 0,
+    1 or 2 for a sticker on plane A, B or C. ``rough_normals`` (3, 3) has one row per plane. Raises
+    LostError, which names the plane, if a plane has too few stickers or all of them lie on one
+    line.
     """
     frame, planes = frames_of_points(points, covariances, plane_index, rough_normals)
     sensitivity = _frame_sensitivity(
@@ -115,7 +119,8 @@ def frames_of_points(
 ) -> tuple[Array, list[FittedPlane]]:
     """Return the frames (..., 4, 4) of sets of points (..., n, 3), and the planes A, B and C.
 
-    The parameters are the same as in ``frame_of_points``.
+    The parameters and the LostError are those of ``frame_of_points``. All sets have the same
+    ``plane_index`` (n,).
     """
     planes = []
     for k, name in enumerate(PLANE_NAMES):
@@ -144,10 +149,11 @@ def _tangents(normal: Array) -> Array:
 
 
 def _frame_sensitivity(frame: Array, normals: Array, tangents: Array) -> Array:
-    """Return the derivatives (6, 9) of a frame with respect to two tilts and the offset per plane.
+    """Return the derivatives (6, 9) of a frame with respect to the parameters of its planes.
 
-    The frame is that of ``frame_from_planes``, and its changes are small changes [dt, dphi]. The
-    planes have normals (3, 3) and tangents (3, 3, 2).
+    The parameters are two tilts and the offset of A, then of B and of C. The frame is that of
+    ``frame_from_planes``, and its changes are small errors [dt, dphi]. The planes have normals
+    (3, 3) and tangents (3, 3, 2).
     """
     x, y, z, origin = frame[:3].T
     # derivatives of all normals and offsets with respect to each of the nine parameters

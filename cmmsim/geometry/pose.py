@@ -17,7 +17,8 @@ from cmmsim.errors import ShapeError
 
 Array = NDArray[np.float64]
 
-# Largest accepted deviation of a transform from a rigid one. Single precision is sufficient.
+# Largest accepted deviation of a transform from a rigid one. Transforms that were stored in single
+# precision are accepted.
 RIGID_TOLERANCE = 1e-6
 
 
@@ -42,7 +43,7 @@ def pose_to_transform(pose: ArrayLike) -> Array:
     Parameters
     ----------
     pose : array_like, shape (6,)
-        Place in m and angles in rad, with R = Rx(alpha) Ry(beta) Rz(gamma).
+        Position in m and angles in rad, with R = Rx(alpha) Ry(beta) Rz(gamma).
 
     Returns
     -------
@@ -113,7 +114,7 @@ def transform_to_pose(transform: ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (6,)
-        Place in m and angles in rad; beta lies in [-pi/2, pi/2].
+        Position in m and angles in rad; beta lies in [-pi/2, pi/2], alpha and gamma in [-pi, pi].
 
     Raises
     ------
@@ -151,8 +152,8 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 def invert(transform: Array) -> Array:
     """Return the inverses (..., 4, 4) of rigid transforms (..., 4, 4)."""
-    back = transform[..., :3, :3].swapaxes(-1, -2)
-    return rigid(back, -(back @ transform[..., :3, 3:])[..., 0])
+    transposed = transform[..., :3, :3].swapaxes(-1, -2)
+    return rigid(transposed, -(transposed @ transform[..., :3, 3:])[..., 0])
 
 
 def apply(transform: Array, points: Array) -> Array:
@@ -196,7 +197,7 @@ def rotation_exp(vector: Array) -> Array:
 
 
 def rotation_log(rotation: Array) -> Array:
-    """Return the rotation vector (3,) of a rotation (3, 3) with an angle well below pi."""
+    """Return the rotation vector (3,) of a rotation (3, 3), whose angle must be well below pi."""
     axis = 0.5 * np.array(
         [
             rotation[2, 1] - rotation[1, 2],
@@ -211,7 +212,7 @@ def rotation_log(rotation: Array) -> Array:
 
 
 def euler_rates_matrix(pose: Array) -> Array:
-    """Return the matrices (..., 3, 3) that map rates of pose angles to angular velocities.
+    """Return the matrices (..., 3, 3) that map rates of pose angles to angular velocities (eq. 2).
 
     Poses are (..., 6), and angular velocities are in the axes of the output frame.
     """
@@ -232,7 +233,8 @@ def euler_rates_matrix(pose: Array) -> Array:
 def pose_jacobian(poses: Array) -> Array:
     """Return the derivatives (..., 6, 6) of poses (..., 6) with respect to small errors [dt, dphi].
 
-    The small errors are those of the poses' transforms.
+    The small errors are those of the poses' transforms. The derivatives are singular at beta = pi/2
+    and -pi/2.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import all_angle_rates
@@ -249,17 +251,17 @@ def pose_jacobian(poses: Array) -> Array:
 def pose_covariance(transforms: Array, covariances: Array) -> Array:
     """Return the covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
 
-    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi]. For a pose
-    that is fitted to points, ``rigid_kernels`` computes them.
+    ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi], which
+    ``rigid_kernels`` computes for a transform that is fitted to points.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_covariances
 
-    spreads = np.empty(covariances.shape)
+    converted = np.empty(covariances.shape)
     poses = poses_of(transforms).reshape(-1, 6)
     flat = np.ascontiguousarray(covariances, dtype=float).reshape(-1, 6, 6)
-    pose_covariances(poses, flat, spreads.reshape(-1, 6, 6))
-    return spreads
+    pose_covariances(poses, flat, converted.reshape(-1, 6, 6))
+    return converted
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:

@@ -7,9 +7,10 @@ import numpy as np
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array
 
-# Gauss-Newton steps after the unweighted start.
+# Number of Gauss-Newton steps after the unweighted start.
 STEPS = 2
-# Points do not determine a rotation if their spread perpendicular to one line is below this, m.
+# Points count as lying on one line if the second singular value of their centred coordinates is
+# below this, m. They do not determine a rotation about this line.
 SMALLEST_SPREAD = 0.005
 
 
@@ -17,8 +18,9 @@ SMALLEST_SPREAD = 0.005
 class Registration:
     """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
-    ``misfit`` (n,) is the squared residual of each point in units of its noise. Its expected value
-    is 3 minus the point's share of the six fitted parameters.
+    ``misfit`` (n,) is the squared residual of each point in units of its noise. The expected sum
+    over the points is 3 n - 6, because six parameters are fitted. For the registrations of several
+    sets, see ``register_sets``.
     """
 
     transform: Array
@@ -29,8 +31,9 @@ class Registration:
 def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3).
 
-    The method is a singular value decomposition. The source is (n, 3), or (c, n, 3) with one source
-    per target. Weights are (c, n).
+    They minimise the weighted sum of squared distances, and follow from a singular value
+    decomposition. The source is (n, 3), or (c, n, 3) with one source per target. Weights are
+    (c, n).
     """
     fractions = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means = (fractions * source).sum(axis=1)
@@ -39,12 +42,12 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
         source - source_means[:, None]
     )
     u, _, vt = np.linalg.svd(products)
-    turns = np.ones((len(targets), 3))
+    signs = np.ones((len(targets), 3))
     # if the nearest orthogonal matrix is a reflection, the direction of the smallest singular value
     # is reversed
-    turns[:, 2] = np.sign(np.linalg.det(u @ vt))
+    signs[:, 2] = np.sign(np.linalg.det(u @ vt))
     transforms = np.tile(np.eye(4), (len(targets), 1, 1))
-    transforms[:, :3, :3] = (u * turns[:, None]) @ vt
+    transforms[:, :3, :3] = (u * signs[:, None]) @ vt
     transforms[:, :3, 3] = target_means - np.einsum(
         "cij,cj->ci", transforms[:, :3, :3], source_means
     )
@@ -52,7 +55,10 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
 
 
 def require_spread(points: Array) -> None:
-    """Raise LostError for fewer than three points (n, 3), or if all points lie on one line."""
+    """Raise LostError for fewer than three points (n, 3), or if all points lie on one line.
+
+    SMALLEST_SPREAD states how near to a line they must not lie.
+    """
     if len(points) < 3:
         raise LostError(
             f"{len(points)} visible stickers, at least 3 that are not on one line are needed"
@@ -69,8 +75,7 @@ def register(source: Array, target: Array, covariances: Array) -> Registration:
     """Return the maximum-likelihood transform for target = transform(source) + noise.
 
     ``source`` (n, 3) are known points, and ``target`` (n, 3) are measured points, m, with
-    ``covariances`` (n, 3, 3). Raises LostError for fewer than three points, or if all points lie on
-    one line.
+    ``covariances`` (n, 3, 3). Raises the LostError of ``require_spread`` for the known points.
     """
     require_spread(source)
     fit = register_sets(source, target[None], covariances[None])
@@ -88,14 +93,14 @@ def register_sets(source: Array, targets: Array, covariances: Array) -> Registra
 
     sets, count = targets.shape[:2]
     transforms = rigid_starts(source, targets, np.ones((sets, count)))
-    # a copy, because the kernel is compiled once more for arrays that are read-only
+    # a copy, because the kernel would be compiled once more for a read-only array
     places = np.array(np.broadcast_to(source, targets.shape), dtype=float, order="C")
     points = np.ascontiguousarray(targets, dtype=float).reshape(-1, 3)
     informations = np.linalg.inv(covariances.reshape(-1, 3, 3))
     starts = count * np.arange(sets + 1)
-    spreads = np.zeros((sets, 6, 6))
+    errors = np.zeros((sets, 6, 6))
     misfits = np.empty(sets * count)
     rigid_fits(
-        places.reshape(-1, 3), points, informations, starts, STEPS, transforms, spreads, misfits
+        places.reshape(-1, 3), points, informations, starts, STEPS, transforms, errors, misfits
     )
-    return Registration(transforms, spreads, misfits)
+    return Registration(transforms, errors, misfits)

@@ -25,10 +25,11 @@ from cmmsim.geometry.transform_kernels import move_by, transform_point
 
 @compiled
 def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
-    """Tell whether the used places (n,3) lie within ``width`` m of one line.
+    """Tell whether the places (n, 3) in the mask ``used`` (n,) lie within ``width`` m of one line.
 
-    The middle eigenvalue of their scatter matrix is compared with ``width`` squared. A lower bound
-    of the eigenvalue is compared first, because the bound is faster to compute.
+    The middle eigenvalue of their scatter matrix, a sum of squares, is compared with ``width``
+    squared. A lower bound of the eigenvalue is compared first, because it is faster to compute. At
+    least one place must be used.
     """
     first = np.argmax(used)
     count = 0
@@ -48,14 +49,14 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
             yy += b * b
             yz += b * c
             zz += c * c
-    # Change from sums of squares about the first place to sums about the middle.
+    # Change from sums of squares about the first used place to sums about the middle.
     xx -= x * x / count
     xy -= x * y / count
     xz -= x * z / count
     yy -= y * y / count
     yz -= y * z / count
     zz -= z * z / count
-    # With eigenvalues a >= b >= c, the sum of the principal minors is at most 2 b (a + b + c).
+    # With eigenvalues a >= b >= c, the sum of the principal 2x2 minors is at most 2 b (a + b + c).
     minors = xx * yy + xx * zz + yy * zz - xy * xy - xz * xz - yz * yz
     if minors >= 2.0 * (xx + yy + zz) * width * width:
         return False
@@ -66,19 +67,19 @@ def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
 
 @compiled
 def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array) -> float:
-    """Add a point to the normal equations of a pose; return its squared gap in units of its noise.
+    """Add a point to the normal equations of a pose; return gap' W gap.
 
-    ``info`` (3, 3) is the inverse covariance W of the point. J' W J is added to the lower triangle
-    of ``normal`` (6, 6), and J' W gap to ``change`` (6,).
+    ``info`` (3, 3) is W, the inverse covariance of the point's noise. J' W J is added to the lower
+    triangle of ``normal`` (6, 6), and J' W gap to the right-hand side ``change`` (6,).
     """
     x = arm[0]
     y = arm[1]
     z = arm[2]
     squared = 0.0
     for i in range(3):
-        push = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
-        squared += gap[i] * push
-        change[i] += push
+        weighted = info[i, 0] * gap[0] + info[i, 1] * gap[1] + info[i, 2] * gap[2]
+        squared += gap[i] * weighted
+        change[i] += weighted
         # row i of W J, where J = [I, -skew(arm)]
         by_x = info[i, 2] * y - info[i, 1] * z
         by_y = info[i, 0] * z - info[i, 2] * x
@@ -95,21 +96,21 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
             normal[4, 4] += z * by_y
             normal[5, 4] -= y * by_y
             normal[5, 5] -= y * by_z
-            change[4] += z * push
-            change[5] -= y * push
+            change[4] += z * weighted
+            change[5] -= y * weighted
         elif i == 1:
             normal[3, 3] -= z * by_x
             normal[5, 3] += x * by_x
             normal[5, 4] += x * by_y
             normal[5, 5] += x * by_z
-            change[3] -= z * push
-            change[5] += x * push
+            change[3] -= z * weighted
+            change[5] += x * weighted
         else:
             normal[3, 3] += y * by_x
             normal[4, 3] -= x * by_x
             normal[4, 4] -= x * by_y
-            change[3] += y * push
-            change[4] -= x * push
+            change[3] += y * weighted
+            change[4] -= x * weighted
     return squared
 
 
@@ -117,22 +118,25 @@ def add_point(arm: Array, info: Array, gap: Array, normal: Array, change: Array)
 def solve_step(normal: Array, change: Array, covariance: Array) -> float:
     """Solve the normal equations of a pose in place; return the decrease of the sum of squares.
 
-    ``change`` (6,) is replaced by the step [dt, dphi], and ``covariance`` (6, 6) is filled.
-    ``normal`` is overwritten.
+    The decrease is that of the linearised residuals. The right-hand side ``change`` (6,) is
+    replaced by the step [dt, dphi], and ``covariance`` (6, 6) is filled. ``normal`` is overwritten.
     """
-    before = (change[0], change[1], change[2], change[3], change[4], change[5])
+    right_hand_side = (change[0], change[1], change[2], change[3], change[4], change[5])
     factorise(normal)
     invert_factored(normal, covariance)
     solve_factored(normal, change)
     decrease = 0.0
     for a in range(6):
-        decrease += before[a] * change[a]
+        decrease += right_hand_side[a] * change[a]
     return decrease
 
 
 @compiled
 def turn_arm(transform: Array, place: Array, point: Array, arm: Array, gap: Array) -> None:
-    """Fill the arm (3,) and the gap (3,) of a measured point (3,) with known ``place`` (3,)."""
+    """Fill the arm (3,) and the gap (3,) of a measured ``point`` (3,) that is known at ``place``.
+
+    ``place`` (3,) is in the axes of the body.
+    """
     transform_point(transform, place, 0.0, arm)
     for i in range(3):
         gap[i] = point[i] - transform[i, 3] - arm[i]
@@ -145,9 +149,10 @@ def rigid_fits(
 ) -> None:  # fmt: skip
     """Fit transforms (f, 4, 4) that move known ``places`` (k, 3) to measured ``points`` (k, 3).
 
-    ``transforms`` contain start values and are replaced. Points ``starts[j]`` to ``starts[j + 1]``
-    belong to fit j. The points have inverse covariances ``informations`` (k, 3, 3). Fills
-    covariances (f, 6, 6), and misfits (k,), which are squared residuals in units of the noise.
+    ``transforms`` contain start values and are replaced after ``steps`` Gauss-Newton steps. Fit j
+    has the points ``starts[j]:starts[j + 1]``. The points have inverse covariances ``informations``
+    (k, 3, 3). Fills covariances (f, 6, 6), and misfits (k,), which are squared residuals in units
+    of the noise. For a fit without points, neither transform nor covariance changes.
     """
     arm = np.empty(3)
     gap = np.empty(3)
@@ -176,10 +181,10 @@ def rigid_fits(
 def residual_covariance(
     arm: Array, noise: Array, covariance: Array, half: Array, entries: Array
 ) -> None:
-    """Fill the entries (6,) of the covariance of a fitted point's residual.
+    """Fill the entries (6,) of S - J C J', the covariance of a fitted point's residual.
 
-    ``noise`` (3, 3) is the covariance of the point, and ``covariance`` (6, 6) that of the pose.
-    ``half`` (3, 6) is overwritten.
+    ``noise`` (3, 3) is S, and ``covariance`` (6, 6) is C. The entries are 00, 01, 02, 11, 12 and
+    22. ``half`` (3, 6) is overwritten.
     """
     x = arm[0]
     y = arm[1]
@@ -200,7 +205,7 @@ def residual_covariance(
 def residual_misfit(
     gap: Array, noise: Array, residual_entries: Array, smallest: float, inverse: Array
 ) -> float:
-    """Return the squared residual ``gap`` (3,) in units of its own covariance.
+    """Return the squared Mahalanobis norm of the residual ``gap`` (3,) for its own covariance.
 
     ``residual_entries`` (6,) has the entries of that covariance, see ``residual_covariance``. A
     direction does not count if the variance of the residual is below ``smallest`` times the
@@ -226,7 +231,7 @@ def checkable_misfit(gap: Array, noise: Array, residual_entries: Array, smallest
     """Return ``residual_misfit`` from only the directions with enough variance."""
     lower = noise.copy()
     factorise(lower)
-    root = np.zeros((3, 3))  # the inverse of the factor whitens the noise
+    root = np.zeros((3, 3))  # inverse of the Cholesky factor, which whitens the noise
     for k in range(3):
         for i in range(k, 3):
             rest = 1.0 if i == k else 0.0

@@ -1,4 +1,4 @@
-"""Compiled kernels for the share of each pixel that an ellipse covers, arc by arc of its rim.
+"""Compiled kernels for the fraction of each pixel that an ellipse covers, arc by arc of its rim.
 
 ``disc_image`` states the formulas. The rim is followed once around, from one line between pixels to
 the next. An ellipse is given by its centre and the matrix A (2, 2) that maps the unit circle onto
@@ -14,7 +14,8 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Up to this tangent of half an arc's angle, eleven terms of the series give full precision.
+# Up to this tangent of half an arc's angle, eleven terms of the arctangent's series give full
+# precision.
 SHORT_ARC = 0.2
 
 
@@ -23,7 +24,7 @@ class Cover(NamedTuple):
 
     shares       (h, w), areas between the left side of a pixel and the arcs inside it
     past         (h, w + 1), total rise dy of the arcs in a pixel, which contributes to all pixels
-                 to the left
+                 to the left; column w is for the arcs to the right of the window
     touched      (h, w), True for pixels with arcs
     derivatives  (h, w, 5), of the shares with respect to [c_x, c_y, A_xx, A_xy, A_yy]; not computed
                  if the shape is (0, 0, 5)
@@ -36,7 +37,7 @@ class Cover(NamedTuple):
 
 
 class Arcs(NamedTuple):
-    """Arcs in the order of the rim.
+    """Arcs in the order in which they follow each other on the rim.
 
     ``rows`` and ``columns`` (n,) are those of their pixels. ``ends`` (n, 4) are the start and the
     end of each arc as points u, v, u, v of the unit circle.
@@ -49,7 +50,7 @@ class Arcs(NamedTuple):
 
 @compiled
 def angle_between(cross: float, dot: float) -> float:
-    """Return the angle between two unit vectors from their cross and dot products."""
+    """Return the signed angle between two unit vectors, rad, from their cross and dot products."""
     half = cross / (1.0 + dot)  # tangent of half the angle
     if not abs(half) < SHORT_ARC:
         return math.atan2(cross, dot)
@@ -102,8 +103,9 @@ def add_arcs(count: int, arcs: Arcs, centre_x: float, shape: Array, cover: Cover
 def crossings(centre: float, reach: float, crossed: Array) -> None:
     """Fill ``crossed`` (n, 2) for the n lines that bound n - 1 pixels along one axis.
 
-    The first column is the distance of a line from the centre, in units of the half extent
-    ``reach`` of the ellipse. The second is half the length of the chord inside the unit circle.
+    The first column is the signed distance of a line from the centre, in units of the half extent
+    ``reach`` of the ellipse. The second is half the length of the chord that a line at this
+    distance has inside the unit circle, or 0 for a line outside.
     """
     per_reach = 1.0 / reach
     for k in range(len(crossed)):
@@ -127,14 +129,14 @@ def follow_quarter(
 
     Quarter 0 leads from the largest x to the largest y, quarter 1 from there to the smallest x, and
     so on. ``ends`` are (u, v) of these four points. ``columns`` (w + 1, 2) and ``rows`` (h + 1, 2)
-    are the ``crossings`` of the lines between pixels. ``count`` is the number of arcs found before,
-    which is included in the result. Arcs above, below and to the left of the window are omitted.
-    Arcs to its right are assigned to column w.
+    are the ``crossings`` of the lines between pixels. ``arcs`` is filled from index ``count`` on,
+    and the result is the number of all arcs, with those before. Arcs above, below and to the left
+    of the window are omitted. Arcs to its right are assigned to column w.
     """
     x_u, x_v = ends[0]
     y_u, y_v = ends[1]
     u, v = ends[quarter]
-    last_u, last_v = ends[(quarter + 1) % 4]
+    end_u, end_v = ends[(quarter + 1) % 4]
     centre_x, centre_y = centre
     a = shape[0, 0]
     b = shape[0, 1]
@@ -144,8 +146,8 @@ def follow_quarter(
     way_y = 1 if quarter == 0 or quarter == 3 else -1
     width = len(columns) - 1
     height = len(rows) - 1
-    end_x = centre_x + a * last_u + b * last_v
-    end_y = centre_y + c * last_u + d * last_v
+    end_x = centre_x + a * end_u + b * end_v
+    end_y = centre_y + c * end_u + d * end_v
     column = within(centre_x + a * u + b * v, width)
     row = within(centre_y + c * u + d * v, height)
     side = 1 if way_x > 0 else 0, 1 if way_y > 0 else 0
@@ -169,8 +171,8 @@ def follow_quarter(
             down_v = t * y_v + s * y_u
             down_x = centre_x + a * down_u + b * down_v
             new_row = False
-        to_u = last_u
-        to_v = last_v
+        to_u = end_u
+        to_v = end_v
         to_column = column
         to_row = row
         # The arc ends at whichever of the two lines the rim crosses first.
@@ -207,15 +209,18 @@ def follow_quarter(
 
 @compiled
 def within(place: float, size: int) -> int:
-    """Return the row or column of a coordinate; -1 before the window, and ``size`` beyond it."""
+    """Return the row or column of a coordinate; -1 before the window, and ``size`` beyond it.
+
+    ``size`` is the number of rows or columns.
+    """
     return math.floor(min(max(place + 0.5, -1.0), float(size)))
 
 
 @compiled
 def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> None:
-    """Fill ``cover`` with the arcs of the rim.
+    """Fill ``cover`` from all arcs of the rim.
 
-    The shares do not yet include the arcs to the right of each pixel.
+    The shares do not yet include the arcs to the right of each pixel, see ``cover_window``.
     """
     cover.shares[:] = 0.0
     cover.past[:] = 0.0
@@ -234,7 +239,7 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
     count = 0
     crossings(centre_x, reach_x, columns)
     crossings(centre_y, reach_y, rows)
-    # Each line is crossed twice, and each quarter ends once.
+    # Each line is crossed at most twice, and each of the four quarters ends with one arc more.
     most = 2 * (width + height) + 12
     arcs = Arcs(np.empty(most, np.int64), np.empty(most, np.int64), np.empty((most, 4)))
     for quarter in range(4):
@@ -248,9 +253,10 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
 def cover_window(
     centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array
 ) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse.
+    """Fill ``shares`` (h, w), the fractions of pixels that an ellipse covers, and ``derivatives``.
 
-    The share of a pixel that the rim does not cross is exactly 0 or 1.
+    The derivatives are those of ``Cover``. The share of a pixel that the rim does not cross is
+    exactly 0 or 1.
     """
     height, width = shares.shape
     cover = Cover(
@@ -261,7 +267,7 @@ def cover_window(
     first = max(within(centre_y - reach, height), 0)
     last = min(within(centre_y + reach, height), height - 1)
     for row in range(first, last + 1):
-        # add the rise of all arcs farther right; for pixels without arcs, the sum is 0 or 1
+        # add the rise of all arcs farther right; for pixels without arcs, it is exactly 0 or 1
         risen = cover.past[row, width]
         filled = np.rint(risen)
         for column in range(width - 1, -1, -1):
@@ -275,6 +281,6 @@ def cover_window(
 
 @compiled
 def cover_windows(centres: Array, shapes: Array, shares: Array, derivatives: Array) -> None:
-    """Fill shares (n, h, w) and derivatives (n, h, w, 5) of n ellipses, see ``cover_window``."""
+    """Fill ``shares`` (n, h, w) and ``derivatives`` (n, h, w, 5), see ``cover_window``."""
     for k in range(len(centres)):
         cover_window(centres[k, 0], centres[k, 1], shapes[k], shares[k], derivatives[k])

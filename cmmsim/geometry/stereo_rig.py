@@ -39,7 +39,8 @@ class StereoRig:
     left, right : PinholeCamera
         The cameras.
     right_from_left : ndarray, shape (4, 4)
-        Transform from the axes of the left camera into those of the right camera.
+        Transform from the axes of the left camera into those of the right camera. The array
+        becomes read-only.
 
     Raises
     ------
@@ -84,7 +85,7 @@ class StereoRig:
 
     @cached_property
     def kernel_cameras(self) -> Cameras:
-        """Both cameras as compiled functions take them, for points in the camera frame C."""
+        """Both cameras in the form for compiled functions, for points in the camera frame C."""
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import Cameras
 
@@ -125,8 +126,9 @@ class StereoRig:
     def derivatives(self, points: Array) -> tuple[Array, Array]:
         """Return the derivatives of the pixels of points (n, 3) in both images.
 
-        The derivatives are with respect to the points (2, n, 2, 3), and to the rig's parameters (2,
-        n, 2, 24) in the order of PARAMETER_NAMES. The points are in the camera frame C.
+        The first result (2, n, 2, 3) is with respect to the points, and the second (2, n, 2, 24)
+        with respect to the rig's parameters in the order of PARAMETER_NAMES. The points are in the
+        camera frame C.
         """
         by_points = np.empty((2, len(points), 2, 3))
         by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
@@ -152,9 +154,14 @@ class StereoRig:
     @property
     def parameters(self) -> Array:
         """Parameters (24,) in the order of PARAMETER_NAMES."""
-        place = self.right_from_left
+        transform = self.right_from_left
         return np.concatenate(
-            [self.left.intrinsics, self.right.intrinsics, place[:3, 3], rotation_log(place[:3, :3])]
+            [
+                self.left.intrinsics,
+                self.right.intrinsics,
+                transform[:3, 3],
+                rotation_log(transform[:3, :3]),
+            ]
         )
 
     def moved(self, changes: Array) -> StereoRig:
@@ -175,11 +182,11 @@ class StereoRig:
 def toed_in_rig(
     camera: PinholeCamera, baseline: float, position: Array, target: Array
 ) -> tuple[StereoRig, Array]:
-    """Return a rig with both cameras aimed at one point, and the true ``camera_from_base`` (4, 4).
+    """Return a rig of two equal cameras aimed at one point, and ``camera_from_base`` (4, 4).
 
     ``position`` (3,) is the middle of the baseline, and both optical axes pass through ``target``
-    (3,), m in the base frame. The baseline is horizontal and perpendicular to the viewing
-    direction.
+    (3,), m in the base frame. The baseline is horizontal, which means normal to the base frame's z
+    axis, and perpendicular to the viewing direction, which must not be vertical.
     """
     forward = target - position
     right_axis = np.cross(forward, [0.0, 0.0, 1.0])
@@ -191,13 +198,13 @@ def toed_in_rig(
 def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     """Return camera_from_base (4, 4) of a rig with the middle of its baseline at ``position`` (3,).
 
-    The rig looks at ``target`` (3,). The viewing direction is the mean of both optical axes,
-    projected perpendicular to the baseline. For a rig that ``toed_in_rig`` made for the same
-    position and target, both functions return the same transform.
+    The rig looks at ``target`` (3,), m in the base frame. The viewing direction is the mean of both
+    optical axes, projected perpendicular to the baseline. For a rig that ``toed_in_rig`` made for
+    the same position and target, both functions return the same transform.
     """
     right_centre = invert(rig.right_from_left)[:3, 3]
     x = right_centre / np.linalg.norm(right_centre)
-    # the sum of both optical axes, in the axes of the left camera, is the viewing direction
+    # the sum of both optical axes, in the axes of the left camera, has the viewing direction
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
     return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(
@@ -219,7 +226,7 @@ def _look_at(eye: Array, target: Array) -> Array:
 def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
     """Return the image radius in px of a sticker of ``radius`` m at ``target`` (3,) m in base axes.
 
-    The sticker faces the camera that shows it larger.
+    It is the larger one of the radii in both images, each for a sticker that faces the camera.
     """
     distances = [
         float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera

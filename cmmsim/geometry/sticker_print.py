@@ -1,9 +1,9 @@
 """Imperfect print of stickers, and the shifts of their centres that it causes.
 
-Places on a sticker are (u, v), in radii of the sticker and along the axes of its plane. Brightness
-varies over a sticker by the modes 2 u, 2 v, √24 u v, √6 (u² - v²) and √12 (u² + v² - ½). They are
-orthogonal, and have a mean square of 1 on the disc. The outline varies by the harmonics 2 to 5 of
-the angle.
+Points on a sticker have coordinates (u, v) along two axes in its plane, in radii of the sticker.
+Brightness varies over a sticker by the modes 2 u, 2 v, √24 u v, √6 (u² - v²) and √12 (u² + v² - ½).
+They are orthogonal, and have a mean square of 1 on the disc. The radius of the outline varies by
+the harmonics 2 to 5 of the angle.
 
 **Shift of a fitted centre.** Errors of a sticker move its apparent rim by rho, px, along the
 normal n of the rim in the image. A fit to grey values minimises the squared distance between
@@ -12,10 +12,10 @@ opposite sides. The shift of the centre is therefore
 
     (integral of n n' ds)^-1  integral of n rho ds.
 
-The rim is the image c + M q of the unit circle q, so that n is M^-T q, scaled to length one.
-An inclined thick sticker also shows the side of its rim, which enlarges its outline. A brightness
-that rises across a sticker would move its centre as well, but this rise is estimated together with
-the centre, see ``light_kernels``.
+The rim is the image c + M q of the unit circle q, so that n is M^-T q, scaled to length one. An
+inclined thick sticker also shows the side of its rim, which enlarges its outline. A brightness that
+rises across a sticker would move its centre as well, but this rise is estimated together with the
+centre, see ``detection.light_kernels``.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ import numpy as np
 
 from cmmsim.geometry.pose import Array
 
-# Number of modes of brightness, and of coefficients (cosine, sine) of the outline.
+# Number of modes of brightness.
 PRINT_MODES = 5
+# Harmonics of the outline, each with a coefficient of the cosine and one of the sine.
 HARMONICS = (2, 3, 4, 5)
 OUTLINE_MODES = 2 * len(HARMONICS)
 # Angle of view at which the shift of a retro-reflective sticker is stated, rad.
 RETRO_ANGLE = np.radians(40.0)
+# Number of points on a rim at which integrals along the rim are evaluated.
 RIM_POINTS = 32
 
 
@@ -39,9 +41,10 @@ RIM_POINTS = 32
 class PrintSizes:
     """Sizes of the errors of stickers.
 
-    ``thickness``, ``outline`` and ``retro_shift`` are in radii of a sticker, ``unevenness`` is
-    relative, and ``rim`` is the brightness of the rim, 0 for that of the ring and 1 for that of the
-    sticker.
+    ``thickness``, ``outline`` and ``retro_shift`` are in radii of a sticker. ``outline`` is the rms
+    error of the outline's radius, and ``retro_shift`` the shift at RETRO_ANGLE. ``unevenness`` is
+    the rms variation of the brightness relative to its mean. ``rim`` is the brightness of the rim's
+    side, 0 for that of the ring and 1 for that of the sticker.
     """
 
     thickness: float = 0.0
@@ -63,7 +66,7 @@ class SeenStickers:
     """Views of k stickers by a camera.
 
     to_image  (k, 2, 2), derivative d(pixels) / d(u, v) at the centre
-    slopes    (k, 2), apparent shift in (u, v) of a point one radius below the sticker's face
+    slopes    (k, 2), apparent shift, in radii, of a point one radius below the sticker's face
     """
 
     to_image: Array
@@ -73,9 +76,10 @@ class SeenStickers:
     def of(
         cls, centres: Array, normals: Array, axes: Array, radius: float, jacobians: Array
     ) -> SeenStickers:
-        """Return the views of stickers with centres, normals (k, 3) and axes (k, 3, 2).
+        """Return the views of stickers with centres and normals (k, 3), and axes u, v (k, 3, 2).
 
-        All are in camera axes. ``jacobians`` (k, 2, 3) are the derivatives d(pixels) / d(point).
+        All are in camera axes. ``radius`` is that of the stickers, m, and ``jacobians`` (k, 2, 3)
+        are the derivatives d(pixels) / d(point).
         """
         across = np.einsum("kij,ki->kj", axes, centres)
         facing = np.einsum("ki,ki->k", normals, centres)
@@ -96,7 +100,7 @@ class SeenStickers:
     def retro_shifts(self) -> Array:
         """Directions (k, 2) away from the camera in (u, v), scaled by angle of view / RETRO_ANGLE.
 
-        The shift of a retro-reflective sticker is proportional to them.
+        The shift of a retro-reflective sticker is ``PrintSizes.retro_shift`` times its direction.
         """
         size = np.linalg.norm(self.slopes, axis=1)
         factor = np.arctan(size) / RETRO_ANGLE / np.where(size > 0.0, size, 1.0)
@@ -109,14 +113,14 @@ class SeenStickers:
         """
         normals, lengths = self._rim
         weights = lengths[:, None] * normals
-        known = np.einsum("kip,kjp->kij", weights, normals)
-        pushed = np.einsum("kip,kp...->ki...", weights, rims)
-        flat = pushed.reshape(*pushed.shape[:2], -1)
-        return np.asarray(np.linalg.solve(known, flat).reshape(pushed.shape))
+        matrix = np.einsum("kip,kjp->kij", weights, normals)
+        right_hand_side = np.einsum("kip,kp...->ki...", weights, rims)
+        flat = right_hand_side.reshape(*right_hand_side.shape[:2], -1)
+        return np.asarray(np.linalg.solve(matrix, flat).reshape(right_hand_side.shape))
 
     @property
     def _rim(self) -> tuple[Array, Array]:
-        """Normals (k, 2, RIM_POINTS) of the rims in the image, and the lengths of their parts."""
+        """Normals (k, 2, RIM_POINTS) of the rims in the image, and lengths per unit of angle."""
         along = np.stack([-CIRCLE[1], CIRCLE[0]])
         normals = np.linalg.inv(self.to_image).swapaxes(1, 2) @ CIRCLE
         normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -133,7 +137,8 @@ class SeenStickers:
     def shifts_of_kind(self, sizes: PrintSizes) -> Array:
         """Return the shifts (k, 2, 2) px of the centres due to thickness and retro-reflection.
 
-        The last axis is the cause. All stickers of a kind have the same shift in the same view.
+        The last axis has the cause, thickness first. All stickers of a kind have the same shift in
+        the same view.
         """
         rims = self.rims_of_growth(sizes.thickness * sizes.rim * self.rim_growth)
         retro = sizes.retro_shift * np.einsum("kij,kj->ki", self.to_image, self.retro_shifts)
@@ -141,7 +146,10 @@ class SeenStickers:
 
     @property
     def rim_growth(self) -> Array:
-        """Growth (k, RIM_POINTS) of outlines by the side of the rim, per radius of thickness."""
+        """Growth (k, RIM_POINTS) of outlines by the side of the rim, per radius of thickness.
+
+        It is in radii, along the direction from the centre.
+        """
         return np.maximum(self.slopes @ CIRCLE, 0.0)
 
 

@@ -87,7 +87,7 @@ def transform_point(move: Array, point: Array, shift: float, transformed: Array)
 
 @compiled
 def move_by(transform: Array, change: Array) -> None:
-    """Change a transform (4, 4) by ``change`` (6,) [dt, dphi], in the axes of its output frame."""
+    """Change a transform (4, 4) in place by ``change`` (6,), a small error [dt, dphi]."""
     turn = change[3:]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     # Rodrigues' formula, with its limits for small angles.
@@ -108,8 +108,9 @@ def move_by(transform: Array, change: Array) -> None:
 def make_rigid(transform: Array) -> None:
     """Replace the rotation of a transform (4,4) by the nearest orthogonal matrix.
 
-    Newton's steps R (3 I - R'R) / 2 converge quadratically. The replacement is needed in a chain of
-    transforms, each a product with the one before, because rounding errors double each time.
+    Four steps R (3 I - R'R) / 2 of Newton's method converge quadratically. The replacement is
+    needed in a chain of transforms, each computed from those before by products, because the error
+    of the rotation doubles with each.
     """
     square = np.empty((3, 3))
     row = np.empty(3)
@@ -133,7 +134,7 @@ def farthest_from_rigid(transforms: Array) -> float:
     """Return the largest deviation of transforms (k, 4, 4) from rigid transforms.
 
     The entries of R'R are compared with the unit matrix, and the last rows with [0 0 0 1]. The
-    result is infinite if an entry is not finite or a transform is mirrored.
+    result is infinite if an entry is not finite, or the determinant of a rotation is not positive.
     """
     farthest = 0.0
     for k in range(len(transforms)):
@@ -158,13 +159,16 @@ def farthest_from_rigid(transforms: Array) -> float:
 
 @compiled
 def angle_rates(pose: Array, rates: Array) -> None:
-    """Fill the derivatives (3, 3) of a pose's angles for a small rotation vector in output axes."""
+    """Fill the derivatives (3, 3) of a pose's angles with respect to a small rotation vector.
+
+    The rotation vector is in the axes of the output frame.
+    """
     ca = math.cos(pose[3])
     sa = math.sin(pose[3])
     cb = math.cos(pose[4])
     sb = math.sin(pose[4])
     rates[0, 0] = 1.0
-    # the inverse of the matrix of eq. 2, which is singular at beta = pi/2 and -pi/2
+    # inverse of the matrix of eq. 2, which does not exist at beta = pi/2 and -pi/2
     rates[0, 1] = sa * sb / cb
     rates[0, 2] = -ca * sb / cb
     rates[1, 0] = 0.0
@@ -186,34 +190,34 @@ def all_angle_rates(poses: Array, rates: Array) -> None:
 def pose_covariance(pose: Array, turn: Array, covariance: Array, spread: Array) -> None:
     """Fill ``spread`` (6, 6), the covariance of a pose (6,), from that of a small error [dt, dphi].
 
-    ``covariance`` (6, 6) belongs to the small error of the transform, in other axes than the pose.
+    ``covariance`` (6, 6) is that of the small error, which may be in other axes than the pose.
     ``turn`` (3, 3) rotates these axes to those of the pose.
     """
     rates = np.empty((3, 3))
-    slopes = np.empty((6, 3))  # derivatives d(place)/d(dt), then d(angles)/d(dphi)
+    derivatives = np.empty((6, 3))  # derivatives d(position)/d(dt), then d(angles)/d(dphi)
     half = np.empty((6, 6))
     angle_rates(pose, rates)
     for i in range(3):
         for j in range(3):
-            slopes[i, j] = turn[i, j]
-            slopes[3 + i, j] = (
+            derivatives[i, j] = turn[i, j]
+            derivatives[3 + i, j] = (
                 rates[i, 0] * turn[0, j] + rates[i, 1] * turn[1, j] + rates[i, 2] * turn[2, j]
             )
     for i in range(6):
         first = 0 if i < 3 else 3
         for j in range(6):
             half[i, j] = (
-                slopes[i, 0] * covariance[first, j]
-                + slopes[i, 1] * covariance[first + 1, j]
-                + slopes[i, 2] * covariance[first + 2, j]
+                derivatives[i, 0] * covariance[first, j]
+                + derivatives[i, 1] * covariance[first + 1, j]
+                + derivatives[i, 2] * covariance[first + 2, j]
             )
     for i in range(6):
         for j in range(6):
             first = 0 if j < 3 else 3
             spread[i, j] = (
-                half[i, first] * slopes[j, 0]
-                + half[i, first + 1] * slopes[j, 1]
-                + half[i, first + 2] * slopes[j, 2]
+                half[i, first] * derivatives[j, 0]
+                + half[i, first + 1] * derivatives[j, 1]
+                + half[i, first + 2] * derivatives[j, 2]
             )
 
 

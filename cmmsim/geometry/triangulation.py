@@ -1,7 +1,6 @@
 """Triangulation: points in space, with covariances, from their pixels in both images of a rig.
 
-The start values come from OpenCV's linear method. Weighted Gauss-Newton steps follow, which are in
-``triangulation_kernels``.
+Weighted Gauss-Newton steps, which are in ``triangulation_kernels``, follow OpenCV's linear method.
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ from cmmsim.errors import ShapeError
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# A triangulation ends with a step shorter than this, m.
+# A triangulation ends with a step shorter than this, m, or with the last one of
+# TRIANGULATION_STEPS.
 STEP_TOLERANCE = 1e-8
 
 
@@ -23,9 +23,9 @@ STEP_TOLERANCE = 1e-8
 class StereoPoints:
     """Points (n, 3) with covariances (n, 3, 3) in the camera frame, m.
 
-    ``ray_gap`` (n,) is the squared distance of the two rays in units of the pixel noise, a
-    chi-square with one degree of freedom. ``rays`` (n,) are its square roots. Their sign tells on
-    which side of the left ray the right ray passes.
+    ``ray_gap`` (n,) is the squared distance of the two rays in units of its variance, a chi-square
+    with one degree of freedom. ``rays`` (n,) are its square roots, with the sign that
+    ``triangulation_kernels.signed_distance`` defines.
     """
 
     points: Array
@@ -45,9 +45,10 @@ def triangulate(
 ) -> StereoPoints:
     """Return the points at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2) px².
 
-    The start values are ``near`` (n, 3), or the results of the linear method. ``line_variance`` px²
-    is added to the covariances for the weights and the ray gap, but not for the covariances of the
-    points.
+    The start values are ``near`` (n, 3), or the results of the linear method if it is None.
+    ``line_variance`` px², for errors of the rig, is added to the covariances for the weights and
+    the ray gap. The stated covariances of the points are those of the pixel noise alone, see
+    ``triangulate_point``. Raises ShapeError unless both arrays of pixels are (n, 2).
     """
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
         raise ShapeError(
@@ -58,17 +59,19 @@ def triangulate(
 
     if near is None:
         near = linear_triangulation(rig, rig.left.undistort(left)[0], rig.right.undistort(right)[0])
-    # by rows, because the kernel is compiled once more for arrays in another order
+    # in C order, because the kernel would be compiled once more for another memory layout
     points = np.array(near, dtype=float, order="C")
     covariances = np.empty((len(points), 3, 3))
     gaps = np.empty(len(points))
     rays = np.empty(len(points))
     pixels = np.ascontiguousarray(np.stack([left, right], axis=1))
-    spreads = np.ascontiguousarray(np.stack([left_covariances, right_covariances], axis=1))
+    pixel_covariances = np.ascontiguousarray(
+        np.stack([left_covariances, right_covariances], axis=1)
+    )
     triangulate_all(
         rig.kernel_cameras,
         pixels,
-        spreads,
+        pixel_covariances,
         line_variance,
         STEP_TOLERANCE,
         points,
@@ -80,7 +83,7 @@ def triangulate(
 
 
 def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Return points (n, 3) in the camera frame from ideal pixels, by OpenCV's linear method."""
+    """Return points (n, 3), in the camera frame, of ideal pixels (n, 2), by OpenCV's method."""
     if len(left) == 0:
         return np.zeros((0, 3))
     first, second = rig.projection_matrices

@@ -25,8 +25,9 @@ def add_image(
     """Add one image's contribution to the normal equations of a point (3,); return r' W r.
 
     r is the measured ``pixel`` (2,) minus the predicted pixel. J is the derivative of the predicted
-    pixel with respect to the point, and W the inverse of ``spread`` (2, 2) + ``line_variance`` I.
-    J' W J is added to the six entries ``normal`` (6,), and J' W r to ``right`` (3,).
+    pixel with respect to the point, and W the inverse of the covariance ``spread`` (2, 2) +
+    ``line_variance`` I, px². J' W J is added to the six entries ``normal`` (6,), and J' W r to the
+    right-hand side ``right`` (3,). ``move`` (4, 4) transforms the point into camera axes.
     """
     x, y, z = transformed(move, point)
     u, v, a, b, c, d = project(camera, x, y, z)
@@ -36,34 +37,34 @@ def add_image(
     xy = spread[0, 1]
     yy = spread[1, 1] + line_variance
     inverse_determinant = 1.0 / (xx * yy - xy * xy)
-    near = 1.0 / z
+    inverse_depth = 1.0 / z
     w_xx = inverse_determinant * yy
     w_xy = -inverse_determinant * xy
     w_yy = inverse_determinant * xx
-    f_x = near * camera[0]
-    f_y = near * camera[1]
-    t_x = near * x
-    t_y = near * y
-    along = w_xx * r + w_xy * s
-    down = w_xy * r + w_yy * s
+    f_x = inverse_depth * camera[0]
+    f_y = inverse_depth * camera[1]
+    t_x = inverse_depth * x
+    t_y = inverse_depth * y
+    weighted_r = w_xx * r + w_xy * s
+    weighted_s = w_xy * r + w_yy * s
     first_0, first_1, first_2 = point_derivatives(move, a, b, f_x, f_y, t_x, t_y)
     second_0, second_1, second_2 = point_derivatives(move, c, d, f_x, f_y, t_x, t_y)
-    right[0] += first_0 * along + second_0 * down
-    right[1] += first_1 * along + second_1 * down
-    right[2] += first_2 * along + second_2 * down
-    pushed_0 = w_xx * first_0 + w_xy * second_0
-    pulled_0 = w_xy * first_0 + w_yy * second_0
-    pushed_1 = w_xx * first_1 + w_xy * second_1
-    pulled_1 = w_xy * first_1 + w_yy * second_1
-    pushed_2 = w_xx * first_2 + w_xy * second_2
-    pulled_2 = w_xy * first_2 + w_yy * second_2
-    normal[0] += pushed_0 * first_0 + pulled_0 * second_0
-    normal[1] += pushed_0 * first_1 + pulled_0 * second_1
-    normal[2] += pushed_0 * first_2 + pulled_0 * second_2
-    normal[3] += pushed_1 * first_1 + pulled_1 * second_1
-    normal[4] += pushed_1 * first_2 + pulled_1 * second_2
-    normal[5] += pushed_2 * first_2 + pulled_2 * second_2
-    return r * along + s * down
+    right[0] += first_0 * weighted_r + second_0 * weighted_s
+    right[1] += first_1 * weighted_r + second_1 * weighted_s
+    right[2] += first_2 * weighted_r + second_2 * weighted_s
+    w_first_0 = w_xx * first_0 + w_xy * second_0
+    w_second_0 = w_xy * first_0 + w_yy * second_0
+    w_first_1 = w_xx * first_1 + w_xy * second_1
+    w_second_1 = w_xy * first_1 + w_yy * second_1
+    w_first_2 = w_xx * first_2 + w_xy * second_2
+    w_second_2 = w_xy * first_2 + w_yy * second_2
+    normal[0] += w_first_0 * first_0 + w_second_0 * second_0
+    normal[1] += w_first_0 * first_1 + w_second_0 * second_1
+    normal[2] += w_first_0 * first_2 + w_second_0 * second_2
+    normal[3] += w_first_1 * first_1 + w_second_1 * second_1
+    normal[4] += w_first_1 * first_2 + w_second_1 * second_2
+    normal[5] += w_first_2 * first_2 + w_second_2 * second_2
+    return r * weighted_r + s * weighted_s
 
 
 @compiled
@@ -71,34 +72,35 @@ def triangulate_point(
     cameras: Cameras, pixels: Array, spreads: Array, line_variance: float, step_tolerance: float,
     point: Array, scratch: Array,
 ) -> float:  # fmt: skip
-    """Triangulate a point (3,) from two pixels (2, 2); return the gap of their rays.
+    """Triangulate a point (3,) from two pixels (2, 2); return the squared distance of their rays.
 
-    ``point`` contains a start value and is replaced by the result. The gap is the squared distance
-    of the rays in units of the noise. ``spreads`` (2, 2, 2) are the covariances of the pixels.
-    ``line_variance`` px² is added to them for the weights and the gap, but not for the covariance
-    of the point. Gauss-Newton ends with a step below ``step_tolerance`` m. The first two rows of
-    ``scratch`` (3, 6) are filled with the entries of the point's information matrix and of its
-    covariance.
+    ``point`` contains a start value and is replaced by the result. ``spreads`` (2, 2, 2) are the
+    covariances of the pixels. Their sum with ``line_variance`` px² on the diagonals gives the
+    weights and the unit of the distance. The point's covariance is multiplied by the fraction of
+    the pixels' noise in the mean of these sums. This is exact only if both covariances are the same
+    multiple of the unit matrix. Gauss-Newton ends with a step below ``step_tolerance`` m, or after
+    TRIANGULATION_STEPS steps. The first two rows of ``scratch`` (3, 6) are filled with the entries
+    of the point's information matrix and of its covariance.
     """
     normal = scratch[0]
     inverse = scratch[1]
-    right = scratch[2]
+    rhs = scratch[2]
     gap = 0.0
     for _ in range(TRIANGULATION_STEPS):
         for k in range(6):
             normal[k] = 0.0
-            right[k] = 0.0
+            rhs[k] = 0.0
         gap = 0.0
         for side in range(2):
             gap += add_image(
                 cameras.intrinsics[side], cameras.extrinsics[side], point, pixels[side],
-                spreads[side], line_variance, normal, right,
+                spreads[side], line_variance, normal, rhs,
             )  # fmt: skip
         inverse_entries(normal, inverse)
-        x = inverse[0] * right[0] + inverse[1] * right[1] + inverse[2] * right[2]
-        y = inverse[1] * right[0] + inverse[3] * right[1] + inverse[4] * right[2]
-        z = inverse[2] * right[0] + inverse[4] * right[1] + inverse[5] * right[2]
-        gap -= x * right[0] + y * right[1] + z * right[2]
+        x = inverse[0] * rhs[0] + inverse[1] * rhs[1] + inverse[2] * rhs[2]
+        y = inverse[1] * rhs[0] + inverse[3] * rhs[1] + inverse[4] * rhs[2]
+        z = inverse[2] * rhs[0] + inverse[4] * rhs[1] + inverse[5] * rhs[2]
+        gap -= x * rhs[0] + y * rhs[1] + z * rhs[2]
         point[0] += x
         point[1] += y
         point[2] += z
@@ -117,9 +119,10 @@ def triangulate_point(
 def signed_distance(cameras: Cameras, pixels: Array, point: Array, gap: float) -> float:
     """Return the signed distance of two rays in standard deviations, from its square ``gap``.
 
-    The distance is positive if the left pixel of ``pixels`` (2, 2) lies on a fixed side of a line
-    in the left image. This line passes through the image of the triangulated ``point`` (3,), in the
-    direction from the left to the right camera.
+    A line in the left image passes through the image of the triangulated ``point`` (3,), in the
+    direction from the left to the right camera. The distance is positive if the left pixel of
+    ``pixels`` (2, 2) lies to the right of this line for an observer who looks along it, which is
+    below a line that leads to the right.
     """
     move = cameras.extrinsics[0]
     camera = cameras.intrinsics[0]
@@ -146,8 +149,9 @@ def triangulate_all(
 ) -> None:  # fmt: skip
     """Triangulate n points from pixels (n, 2, 2) with covariances ``spreads`` (n, 2, 2, 2).
 
-    ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3), gaps (n,)
-    and their signed roots ``rays`` (n,). See ``triangulate_point`` for the other parameters.
+    ``points`` (n, 3) contain start values and are replaced. Fills covariances (n, 3, 3), squared
+    distances ``gaps`` (n,) of the rays and their signed roots ``rays`` (n,). See
+    ``triangulate_point`` for the other parameters.
     """
     scratch = np.empty((3, 6))
     for n in range(len(points)):

@@ -1,13 +1,12 @@
-"""Drawing without OpenGL. The share of each pixel that a disc covers is computed exactly.
+"""Renderer ``analytic``, without OpenGL. The fraction of a pixel that a disc covers is exact.
 
 Layers are drawn over each other: first the background, then solids from far to near, then discs. A
-disc that faces away from the camera is not drawn. The centre and some points on the rim of each
-disc are tested. If a solid hides one of them, the disc is drawn only outside of the solid's
-outline.
+disc that faces away from the camera is not drawn. If a solid of another body hides the centre of a
+disc, or one of some points on its rim, the disc is drawn only outside of this solid's outline.
 
-Three things are simpler than in `pyrender`. Solids are convex hulls, ordered by the depth of their
-middles. Their edges are sampled by scan lines. If a pixel contains edges of two layers, the shares
-that the layers cover are assumed to be independent.
+Three things are simpler than in the renderer `pyrender`. Solids are convex hulls, ordered by the
+depth of their middles. Their edges are sampled by scan lines. If a pixel contains edges of two
+layers, the fractions that the layers cover are assumed to be independent.
 """
 
 from collections.abc import Sequence
@@ -45,11 +44,11 @@ def draw_windows(
     for shown in views.exposures:
         camera = shown.camera
         camera_from_bodies = np.ascontiguousarray(shown.camera_from_bodies)
-        figures = camera.focal_lengths, camera.centre, NEAR, TOUCHING
+        lens = camera.focal_lengths, camera.centre, NEAR, TOUCHING
         draw_view(
             scene,
             camera_from_bodies,
-            *figures,
+            *lens,
             images,
             shown.windows,
             corners[shown.windows],
@@ -89,13 +88,16 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Join arrays (k, 3), and return the joined array and the index at which each part begins."""
+    """Join arrays (k, 3), and return the joined array and the indices (parts + 1,) of the parts.
+
+    Each part begins at its index and ends before the next one.
+    """
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 
 
 def _faces(faces: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, NDArray[np.int_]]:
-    """Return normals and offsets of the faces of all solids, and the first index of each solid."""
+    """Return normals and offsets of the faces of all solids, and indices as ``_joined`` does."""
     normals, starts = _joined([normal for normal, _ in faces])
     return normals, np.concatenate([np.zeros(0), *(offset for _, offset in faces)]), starts
 

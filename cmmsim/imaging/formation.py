@@ -1,17 +1,17 @@
 """Image formation from posed bodies to the light on each pixel, before noise.
 
-Windows are drawn through perfect lenses on a grid finer than the pixels. A margin around each
-window supplies the light that the point spread brings in from outside. Distortion is applied by
-resampling: each fine pixel takes its light from its ideal place, which is its place in the image
-of a perfect lens. Then the point spread, the mean over each pixel, a ghost (a faint shifted copy)
-and the relative illumination are applied. All steps are linear in light. For a perfect lens without
-point spread, the pixels are drawn directly.
+Windows are drawn through perfect lenses on a grid of fine pixels, of which several form a pixel. A
+margin around each window supplies the light that the point spread brings in from outside.
+Distortion is applied by resampling: each fine pixel takes its light from its ideal pixel, which is
+its position in the image of a perfect lens. Then the point spread, the mean over each pixel, a
+ghost (a faint shifted copy) and the relative illumination are applied. All steps are linear in
+light. For a perfect lens without point spread, the pixels are drawn directly.
 
-The ideal places of pixels are exact at three by three nodes of a window, and interpolated by
-quadratics in between. In windows of some tens of pixels, the interpolation error is below 1e-4 px.
-Values between drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so it
-neither moves nor widens edges. Source: R. G. Keys, Cubic convolution interpolation for digital
-image processing, IEEE Trans. ASSP 29 (1981).
+Ideal pixels are exact at three by three nodes of a window, and interpolated by quadratics in
+between. In windows of some tens of pixels, the interpolation error is below 1e-4 px. Values between
+drawn pixels come from Keys' cubic convolution. It reproduces quadratics, so it neither moves nor
+widens edges. Source: R. G. Keys, Cubic convolution interpolation for digital image processing, IEEE
+Trans. ASSP 29 (1981).
 """
 
 from collections.abc import Sequence
@@ -29,15 +29,16 @@ from cmmsim.imaging.scene_bodies import DiscStack
 
 # Matrix that maps the values of a quadratic at -1, 0 and 1 to its coefficients.
 _QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
-# Fine pixels along each side of a pixel. The point spread smooths the errors of resampling; without
-# a point spread, sharp edges need more fine pixels.
+# Number of fine pixels along each side of a pixel. The point spread smooths the errors of
+# resampling; without a point spread, sharp edges need more fine pixels.
 SUB_PIXELS = 6
 SHARP_SUB_PIXELS = 12
 # px: sides of drawn windows are multiples of this, so that few sizes of frame buffers are needed.
 SIDE_STEP = 4
 # Number of drawn pixels that the cubic convolution needs on either side.
 REACH = 2
-# Smallest and largest depth for which defocus is computed, in shares of the usual distance.
+# Smallest and largest depth for which defocus is computed, as fractions of the usual distance. A
+# depth outside of this range has the defocus of the nearer limit.
 DEPTHS = (0.7, 1.5)
 # px: point spreads of windows are rounded to multiples of this.
 SPREAD_STEP = 0.01
@@ -46,8 +47,8 @@ SPREAD_STEP = 0.01
 def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.float32]:
     """Return windows (n, size, size) that are resampled from drawn windows (n, h, w).
 
-    ``nodes`` (n, 3, 3, 2) belong to the pixels in the first, middle and last row and column of the
-    result. They are the places (x, y) of these pixels in the drawn window.
+    ``nodes`` (n, 3, 3, 2) are the positions (x, y) in the drawn window of the result's pixels in
+    the first, middle and last row and column.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.imaging.window_kernels import resample_windows
@@ -60,7 +61,10 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Side:
-    """Camera with camera_from_body (b, 4, 4) as ``bodies``, and first pixels (k, 2) of windows."""
+    """One camera, its windows and what it sees.
+
+    ``bodies`` are camera_from_body (b, 4, 4), and ``corners`` (k, 2) the first pixels of windows.
+    """
 
     camera: PinholeCamera
     bodies: Array
@@ -77,7 +81,7 @@ class Painter(Protocol):
 
     @property
     def paints_background(self) -> bool:
-        """True if windows without any body are not empty."""
+        """True if the painter also paints into windows that show no body."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,10 @@ class ImageFormation:
         return SHARP_SUB_PIXELS if self.optics.psf_px == 0.0 else SUB_PIXELS
 
     def draws_pixels(self, cameras: Sequence[PinholeCamera]) -> bool:
-        """Tell whether images are drawn directly on their pixels, without a finer grid."""
+        """Tell whether images are drawn directly on their pixels, without fine pixels.
+
+        This needs perfect lenses without point spread and defocus, and no painter.
+        """
         if self.painter is not None or self.optics.aperture > 0.0:
             return False
         return self.optics.psf_px == 0.0 and all(camera.distortion.is_zero for camera in cameras)
@@ -120,16 +127,16 @@ class ImageFormation:
         """Return the radiance (k, size, size) of each side's windows.
 
         ``supersampling`` is the smallest number of drawn samples per pixel and axis. ``sub_pixels``
-        replaces the default number of fine pixels. If ``shade`` is True, the windows are multiplied
-        by the relative illumination.
+        replaces the default number of fine pixels. The ghost is included. If ``shade`` is True, the
+        windows are multiplied by the relative illumination.
         """
         windows = self._light(sides, size, supersampling, sub_pixels or self.sub_pixels)
         if self.optics.ghost > 0.0:
             offset = np.array(self.optics.ghost_offset)
             beside = [replace(s, corners=s.corners - offset) for s in sides]
             again = self._light(beside, size, supersampling, sub_pixels or self.sub_pixels)
-            share = np.float32(self.optics.ghost)
-            windows = [w + share * other for w, other in zip(windows, again, strict=True)]
+            fraction = np.float32(self.optics.ghost)
+            windows = [w + fraction * other for w, other in zip(windows, again, strict=True)]
         if shade and self.optics.vignetting > 0.0:
             windows = [
                 w * self.optics.window_illumination(s.camera, s.corners, size).astype(np.float32)
@@ -201,7 +208,10 @@ class ImageFormation:
     def _formed(
         self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
     ) -> list[NDArray[np.float32]]:
-        """Return windows that are drawn finely, distorted, blurred and averaged over pixels."""
+        """Return windows that are drawn finely, distorted, blurred, and averaged over pixels.
+
+        The parameters are those of ``windows``.
+        """
         margin = max(self._margin_px(side.camera) for side in sides)
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
@@ -227,7 +237,7 @@ class ImageFormation:
     ) -> NDArray[np.float32]:
         """Return windows (k, size, size), blurred and averaged over pixels.
 
-        Each window has the point spread of the sticker that is nearest to its middle.
+        With defocus, each window has the point spread of the sticker nearest to its middle.
         """
         if self.optics.aperture == 0.0:
             response = pixel_response(self.optics.psf_px, size, margin, sub_pixels)
@@ -242,13 +252,16 @@ class ImageFormation:
         return windows
 
     def _spreads_px(self, side: Side, pixels: Array) -> Array:
-        """Return the point spread (k,) px at the stickers that are nearest to pixels (k, 2)."""
+        """Return the standard deviations (k,) px of the point spread of windows with defocus.
+
+        They belong to the depths of the stickers that are nearest to ``pixels`` (k, 2).
+        """
         moves = side.bodies[self._sticker_bodies]
         points = np.einsum("nij,nj->ni", moves[:, :3, :3], self._sticker_places) + moves[:, :3, 3]
         shown = side.camera.project(points)[0]
-        gaps = np.linalg.norm(pixels[:, None] - shown, axis=2)
-        low, high = (share * self.drawable.distance for share in DEPTHS)
-        depths = np.clip(points[gaps.argmin(axis=1), 2], low, high)
+        distances = np.linalg.norm(pixels[:, None] - shown, axis=2)
+        low, high = (fraction * self.drawable.distance for fraction in DEPTHS)
+        depths = np.clip(points[distances.argmin(axis=1), 2], low, high)
         return self.optics.spreads_px(side.camera.focal_px, depths)
 
     def _margin_px(self, camera: PinholeCamera) -> int:
@@ -264,7 +277,7 @@ class ImageFormation:
 
     @cached_property
     def _sticker_places(self) -> Array:
-        """Places (n, 3) of the stickers in the axes of their bodies, m."""
+        """Positions (n, 3) of the stickers in the axes of their bodies, m."""
         stacks = [patch for patch in self.drawable.patches if isinstance(patch, DiscStack)]
         return np.array([stack.discs[-1].centre for stack in stacks])
 
@@ -272,7 +285,7 @@ class ImageFormation:
 def _shown_places(
     camera: PinholeCamera, corners: NDArray[np.int_], size: int, margin: int, fine_size: int
 ) -> Array:
-    """Return the ideal places (k, 3, 3, 2) of nodes in k windows with their margins.
+    """Return the ideal pixels (k, 3, 3, 2) of nodes in k windows with their margins.
 
     The nodes are the fine pixels in the first, middle and last row and column of a window.
     """
@@ -285,8 +298,9 @@ def _shown_places(
 def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
     """Return the parts of ideal images that have to be drawn.
 
-    The results are their first pixels (k, 2) for each camera, and their common size in px. The
-    parts contain the places ``nodes`` (k, 3, 3, 2) of each camera.
+    The results are their first pixels (k, 2) for each camera, and their common size in px. Each
+    part contains the ideal pixels ``nodes`` (3, 3, 2) of a window of the camera, and what
+    resampling needs around them.
     """
     first = [np.floor(places.min(axis=(1, 2))).astype(int) - REACH for places in nodes]
     reach = max(
@@ -299,9 +313,10 @@ def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
 def _distorted(
     side: Side, drawn: NDArray[np.float32], nodes: Array, fine_size: int
 ) -> NDArray[np.float32]:
-    """Return distorted fine windows (k, fine_size, fine_size).
+    """Return distorted fine windows (k, fine_size, fine_size) from drawn windows.
 
-    For a lens without distortion, the windows are only cut out.
+    ``nodes`` (k, 3, 3, 2) are those of ``resample``. For a lens without distortion, the windows are
+    only cut out.
     """
     if not side.camera.distortion.is_zero:
         return resample(drawn, nodes, fine_size)
@@ -330,22 +345,22 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
 
 @lru_cache(maxsize=32)
 def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
-    """Return the weights of drawn sub-pixels in each pixel of a row.
+    """Return the weights of drawn fine pixels in each pixel of a row.
 
-    The weights (size, (size + 2 margin) sub_pixels) average a Gaussian of standard deviation
-    ``psf_px`` over each pixel. Each drawn sub-pixel is a mean over its own width, so the sum over
-    sub-pixels is the exact mean over a pixel.
+    The weights (size, (size + 2 margin) sub_pixels) average the light over each pixel after a
+    Gaussian point spread of standard deviation ``psf_px``, which is cut off at ``margin`` px. Each
+    drawn fine pixel is a mean over its own width, so the average over a pixel is exact.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(
         np.eye(size, size + 2 * margin, margin), np.full(sub_pixels, 1.0 / sub_pixels)
     )
     if psf_px > 0.0:
-        gap = np.subtract.outer(np.arange(total), np.arange(total))
-        spread = np.exp(-0.5 * (gap / (psf_px * sub_pixels)) ** 2) * (
-            np.abs(gap) <= margin * sub_pixels
+        distance = np.subtract.outer(np.arange(total), np.arange(total))
+        gaussian = np.exp(-0.5 * (distance / (psf_px * sub_pixels)) ** 2) * (
+            np.abs(distance) <= margin * sub_pixels
         )
-        into_pixels = into_pixels @ (spread / spread[total // 2].sum())
+        into_pixels = into_pixels @ (gaussian / gaussian[total // 2].sum())
     weights = into_pixels.astype(np.float32)
     weights.setflags(write=False)
     return weights

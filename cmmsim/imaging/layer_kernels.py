@@ -14,9 +14,10 @@ from cmmsim.geometry.rim_kernels import cover_window
 class Solids(NamedTuple):
     """Outlines of solids in an image, from far to near.
 
-    ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. Rows starts[k] to starts[k + 1]
-    belong to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y of the s solids. The shares
-    of pixels that solid k covers are stored in ``covers[slots[k]]``, or not if ``slots[k]`` is -1.
+    ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. The slice starts[k]:starts[k + 1]
+    belongs to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y, px, and ``levels`` (s,)
+    the radiances of the s solids. The fractions of pixels that solid k covers are stored in
+    ``covers[slots[k]]``, or nowhere if ``slots[k]`` is -1.
     """
 
     half_planes: Array
@@ -29,8 +30,9 @@ class Solids(NamedTuple):
 class Discs(NamedTuple):
     """Discs in the order in which they are drawn.
 
-    Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``behind`` (m,
-    slots) states whether a disc lies behind the solid with each slot.
+    Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``levels``
+    (m,) are their radiances. ``behind`` (m, slots) is True if a disc lies behind the solid with a
+    slot.
     """
 
     centres: Array
@@ -42,7 +44,7 @@ class Discs(NamedTuple):
 
 @compiled
 def polygon_contains(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
-    """Tell whether a box with its first corner at (x, y) lies wholly inside a convex polygon."""
+    """Tell whether a box with its top-left corner at (x, y) lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):
         a, b, c = half_planes[k]
         if max(a * x, a * (x + width)) + max(b * y, b * (y + height)) > c:
@@ -52,22 +54,22 @@ def polygon_contains(half_planes: Array, x: float, y: float, width: int, height:
 
 @compiled
 def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: Array) -> None:
-    """Fill ``share`` (h, w) with the share of each pixel that a convex polygon covers.
+    """Fill ``share`` (h, w) with the fraction of each pixel that a convex polygon covers.
 
-    The first pixel begins at (x, y). The share is exact along x, and along y it is the mean over
-    ``lines`` scan lines.
+    The top-left corner of the first pixel is (x, y). The fraction is exact along x, and along y it
+    is the mean over ``lines`` scan lines.
     """
     height, width = share.shape
     share[:] = 0.0
     for row in range(height):
         for line in range(lines):
-            at = y + row + (line + 0.5) / lines
+            line_y = y + row + (line + 0.5) / lines
             left = 0.0
             right = float(width)
             for k in range(len(half_planes)):
                 a, b, c = half_planes[k]
                 # Each half plane limits the covered part of the scan line at one end.
-                room = c - b * at - a * x
+                room = c - b * line_y - a * x
                 if a > 0.0:
                     right = min(right, room / a)
                 elif a < 0.0:
@@ -85,10 +87,10 @@ def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: 
 def draw_solids(
     image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array
 ) -> None:
-    """Draw solids over a window (h, w) and store the shares of pixels that they cover.
+    """Draw solids over a window (h, w) and store the fractions of pixels that they cover.
 
-    The first pixel of the window begins at (x, y). The shares are stored in ``covers`` (slots, h,
-    w).
+    The top-left corner of the window is (x, y). ``covers`` (slots, h, w) gets the fractions of
+    solids that have a slot.
     """
     height, width = image.shape
     share = np.empty((height, width))
@@ -110,7 +112,7 @@ def draw_solids(
 
 @compiled
 def visible_share(behind: Array, covers: Array, row: int, column: int) -> float:
-    """Return the share of a pixel that is not covered by any solid in front of a disc."""
+    """Return the fraction of a pixel that no solid in front of a disc covers."""
     shown = 1.0
     for slot in range(len(behind)):
         if behind[slot]:
@@ -122,7 +124,7 @@ def visible_share(behind: Array, covers: Array, row: int, column: int) -> float:
 def draw_disc(
     image: Array, centre_x: float, centre_y: float, k: int, discs: Discs, covers: Array
 ) -> None:
-    """Draw disc ``k`` over a window (h, w). Its centre is in px of the window."""
+    """Draw disc ``k`` over a window (h, w), with its centre relative to the first pixel, px."""
     height, width = image.shape
     extent_x, extent_y = discs.extents[k]
     first = max(0, math.ceil(centre_x - extent_x - 0.5))
@@ -162,15 +164,15 @@ def draw_layers(
         covers[:] = 0.0
         draw_solids(image, x - 0.5, y - 0.5, solids, lines, covers)
         for k in range(len(discs.levels)):
-            gap_x = discs.centres[k, 0] - x
-            gap_y = discs.centres[k, 1] - y
+            centre_x = discs.centres[k, 0] - x
+            centre_y = discs.centres[k, 1] - y
             if (
-                gap_x + discs.extents[k, 0] > -0.5
-                and gap_x - discs.extents[k, 0] < width - 0.5
-                and gap_y + discs.extents[k, 1] > -0.5
-                and gap_y - discs.extents[k, 1] < height - 0.5
+                centre_x + discs.extents[k, 0] > -0.5
+                and centre_x - discs.extents[k, 0] < width - 0.5
+                and centre_y + discs.extents[k, 1] > -0.5
+                and centre_y - discs.extents[k, 1] < height - 0.5
             ):
-                draw_disc(image, gap_x, gap_y, k, discs, covers)
+                draw_disc(image, centre_x, centre_y, k, discs, covers)
 
 
 @compiled
@@ -179,10 +181,10 @@ def occludes(
 ) -> bool:
     """Tell whether a solid stands between ``eye`` (3,) and ``point`` (3,).
 
-    The solid, enlarged by ``wider`` m on all sides, consists of the points x with
-    normal . x + offset <= ``wider`` for all faces. All coordinates are in its axes. A point lies on
-    the solid, and not behind it, if the line of sight enters the solid within the last share
-    ``touching`` of the line's length.
+    The solid, enlarged by ``wider`` m on all sides, consists of the points x with normal . x +
+    offset <= ``wider`` for all faces. All coordinates are in the solid's axes. A point counts as
+    lying on the solid, and not behind it, if the line of sight enters the solid within the final
+    fraction ``touching`` of the line's length.
     """
     enter = -np.inf
     leave = np.inf
@@ -216,7 +218,8 @@ def occluded_points(
 ) -> None:
     """Fill ``hidden`` (n,) with whether a convex solid stands between the camera and each point.
 
-    The points (n, 3) are in camera axes. The solid is normal . x + offset <= 0 in its own axes.
+    The points (n, 3) are in camera axes. The solid is normal . x + offset <= 0 in its own axes. See
+    ``occludes`` for ``touching``.
     """
     eye = np.empty(3)
     point = np.empty(3)

@@ -1,9 +1,9 @@
 """Renderer ``mitsuba``: windows by physically based path tracing with Mitsuba 3.
 
 It shares neither the meshes of discs nor rasterisation nor light with the other renderers, so it is
-their reference. Without lamps, each surface emits its level as radiance. With lamps, surfaces are
-diffuse, and light falls on them from the lamps and from all sides, with shadows. Discs are exact
-circles. Only this module imports Mitsuba, an optional dependency.
+their reference. Without lamps and ambient light, each surface emits its level as radiance. With
+them, surfaces are diffuse and reflect light from the lamps and from all sides, with shadows. Discs
+are exact circles. Only this module imports Mitsuba, an optional dependency.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class PointLamp:
-    """Lamp at a ``place`` (3,) in the axes of the camera that is drawn, m.
+    """Lamp at the position ``place`` (3,) in the axes of the camera that is drawn, m.
 
     ``strength`` is the radiance of a white face that faces the lamp from a distance of 1 m.
     """
@@ -46,8 +46,8 @@ def draw_frames(
 
     Each pixel is the mean of ``supersampling``² stratified rays. If there are ``lamps`` or
     ``ambient`` light, surfaces are lit by them instead of emitting their levels. ``ambient`` is the
-    radiance of a white face in the light from all sides. Raises CmmError if Mitsuba is missing, or
-    if the pixels of a camera are not square.
+    radiance of a white face in the light from all sides; it then replaces ``background``. Raises
+    CmmError if Mitsuba is missing, or if the pixels of a camera are not square.
     """
     mi = _mitsuba()
     views = Views.of(views)
@@ -95,7 +95,10 @@ def _mitsuba() -> Any:
 def _sensor(
     mi: Any, camera: PinholeCamera, corner: Array, size: tuple[int, int], supersampling: int
 ) -> Any:
-    """Return Mitsuba's camera for a window with first pixel ``corner`` (2,)."""
+    """Return Mitsuba's camera for a window with first pixel ``corner`` (2,).
+
+    Raises CmmError if pixels are not square.
+    """
     focal = camera.focal_lengths
     if abs(focal[0] / focal[1] - 1.0) > 1e-9:
         raise CmmError(

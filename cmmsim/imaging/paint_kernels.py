@@ -13,13 +13,14 @@ from cmmsim.compilation import Array, compiled
 class Painted(NamedTuple):
     """Stickers that a camera sees, with their print and light.
 
-    to_stickers   (n, 3, 3), matrices that map pixels to places (u, v, 1) on stickers, in radii
-    to_places     (n, 2, 2), derivatives d(u, v) / d(pixels)
+    to_stickers   (n, 3, 3), matrices that map homogeneous pixels to (u, v, 1) on the stickers, with
+                  u and v in radii
+    to_places     (n, 2, 2), derivatives d(u, v) / d(pixels) at the centres
     boxes         (n, 4), lowest x, y and highest x, y of the rings, px
     slopes        (n, 2), apparent shifts in (u, v) of the lower edges of the rims
     shifts        (n, 2), apparent shifts in (u, v) of the stickers by retro-reflection
     lights        (n, 3), light at the centres, and its changes over a radius along u and v
-    faces         (n,), levels of the stickers
+    faces         (n,), levels of the stickers in full light
     ring, rim     levels of the rings and of the rims
     prints        (n, 5), coefficients of the modes of brightness
     outlines      (n, 8), coefficients of the harmonics 2 to 5 of the outline
@@ -40,7 +41,7 @@ class Painted(NamedTuple):
 
 @compiled
 def print_at(prints: Array, u: float, v: float) -> float:
-    """Return the relative brightness at (u, v). Outside of the unit disc, it is that at the rim."""
+    """Return the relative brightness at (u, v), beyond the rim that at the nearest rim point."""
     size = math.sqrt(u * u + v * v)
     if size > 1.0:
         u /= size
@@ -73,9 +74,10 @@ def outline_at(outlines: Array, u: float, v: float) -> float:
 
 @compiled
 def covered(u: float, v: float, radius: float, to_places: Array) -> float:
-    """Return the share of a pixel at (u, v) that a disc of the given radius covers.
+    """Return the fraction of a pixel at (u, v) that a disc of the given radius covers.
 
-    ``to_places`` (2, 2) is the derivative d(u, v) / d(pixels).
+    Within the pixel, the rim is taken as straight. ``to_places`` (2, 2) is the derivative d(u, v) /
+    d(pixels).
     """
     size = math.sqrt(u * u + v * v)
     if size < 1e-6:
@@ -87,7 +89,11 @@ def covered(u: float, v: float, radius: float, to_places: Array) -> float:
 
 @compiled
 def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Painted) -> None:
-    """Paint sticker ``n`` into a window (h, w), weighted by the visible share ``shown`` (h, w)."""
+    """Paint sticker ``n`` into a window (h, w), weighted by the visible fraction ``shown`` (h, w).
+
+    The window already contains the empty ring, whose level is replaced. ``corner`` (2,) is the
+    first pixel of the window.
+    """
     height, width = image.shape
     box = painted.boxes[n]
     slope = painted.slopes[n]
@@ -118,7 +124,8 @@ def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Pai
                 face = painted.faces[n] * max(print_at(painted.prints[n], u, v), 0.0)
                 level += own * (face - painted.ring)
                 if squared > 0.0 and own < 1.0:
-                    # Depth of the part of the rim that this pixel shows best, in thicknesses.
+                    # Depth of the part of the rim's side that this pixel shows best, in
+                    # thicknesses.
                     depth = (u * slope[0] + v * slope[1]) / squared
                     depth = min(max(depth, 0.0), 1.0)
                     low_u = u - depth * slope[0]
@@ -133,7 +140,7 @@ def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Pai
 def paint_view(images: Array, shown: Array, group: Array, corners: Array, painted: Painted) -> None:
     """Paint all stickers into the windows ``images[group]`` (n, h, w) of one exposure.
 
-    ``shown``, of the shape of ``images``, has the share of each pixel in which a ring with its
+    ``shown``, of the shape of ``images``, has the fraction of each pixel in which a ring with its
     sticker is visible. ``corners`` (n, 2) are the first pixels of the windows.
     """
     height, width = images.shape[1:]
@@ -157,9 +164,10 @@ def scatter_objects(
 ) -> None:  # fmt: skip
     """Paint far objects into the windows ``images[group]`` (n, h, w) where no body hides them.
 
-    ``behind``, of the shape of ``images``, has the share of each pixel that shows the background.
-    Each of the ``objects`` (o, 5) has a direction in the base frame, an angular radius, rad, and a
-    level above the background. ``turn`` (3, 3) is the rotation from base axes to camera axes.
+    ``behind``, of the shape of ``images``, has the fraction of each pixel that shows the
+    background. Each of the ``objects`` (o, 5) has a direction in the base frame, an angular radius,
+    rad, and a level above the background. ``turn`` (3, 3) is the rotation from base axes to camera
+    axes. ``focal`` and ``principal`` (2,) are focal lengths and principal point, px.
     """
     height, width = images.shape[1:]
     ray = np.empty(3)

@@ -1,9 +1,10 @@
 """Stickers with uneven light and imperfect print, painted into the images of any renderer.
 
-A renderer draws the scene with empty rings. It also draws a second image, which states the share of
-each pixel in which a ring and its sticker are visible. In these pixels, the sticker is painted: the
-place on the sticker that a pixel shows determines its level. Light and print are thus the same for
-all renderers, and bodies still hide stickers. Pixels must be much finer than the rims of stickers.
+A renderer draws the scene with empty rings. It also draws a second image, which states the fraction
+of each pixel in which a ring and its sticker are visible. In these pixels, the sticker is painted:
+the point of the sticker that a pixel shows determines the pixel's level. Light and print are thus
+the same for all renderers, and bodies still hide stickers. Drawn pixels must be much smaller than
+stickers, because the rim is taken as straight within a pixel.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch, SceneBody
 if TYPE_CHECKING:
     from cmmsim.imaging.paint_kernels import Painted
 
-# rad: largest angle between the line of sight and an object of the background, and the range of
-# the objects' radii.
+# rad: largest angle between the line of sight and an object of the background, in each of two
+# perpendicular directions.
 CLUTTERED = 0.5
+# rad: range of the angular radii of these objects.
 SMALLEST_OBJECT = 4e-4
 LARGEST_OBJECT = 8e-3
 
@@ -39,15 +41,15 @@ LARGEST_OBJECT = 8e-3
 class Paint:
     """Stickers with their print, in the axes of their bodies, and the light on them.
 
-    bodies, places    (n,) and (n, 3) m, body and place of each sticker
+    bodies, places    (n,) and (n, 3) m, body and position of each sticker
     axes              (n, 3, 2), axes u and v of each sticker's plane
     radius            radius of the stickers, m
     ring_radius       radius of the rings, m
     face, ring        levels of stickers and rings
-    sizes             sizes of the imperfections of the stickers
+    sizes             sizes of the errors of the stickers
     prints, outlines  (n, 5) and (n, 8), coefficients of the modes of brightness and outline
     light             light of the sensor file
-    target            (3,), place at which lamps have the stated strength, in base axes, m
+    target            (3,), point at which lamps have the stated strength, in base axes, m
     """
 
     bodies: NDArray[np.int_]
@@ -64,7 +66,10 @@ class Paint:
     target: Array
 
     def seen_by(self, camera: PinholeCamera, camera_from_bodies: Array) -> Painted:
-        """Return the stickers that face a camera with a perfect lens."""
+        """Return the stickers that face a camera with a perfect lens and lie beyond NEAR.
+
+        ``camera_from_bodies`` is (b, 4, 4), with the platform first and the base second.
+        """
         # Imported late, because importing numba takes time.
         from cmmsim.imaging.paint_kernels import Painted
 
@@ -101,7 +106,7 @@ class Paint:
     def _lights(
         self, camera_from_base: Array, centres: Array, normals: Array, steps: Array
     ) -> Array:
-        """Return the light at n stickers, and its changes along both axes of each, as (n, 3).
+        """Return the light at n stickers, and its changes along both axes of each, in one (n, 3).
 
         The stickers have ``centres`` and ``normals`` (n, 3). ``steps`` (n, 3, 2) are their axes,
         one radius long. All are in camera axes.
@@ -112,14 +117,14 @@ class Paint:
             for lamp in self.light.lamps:
                 if lamp.direction is not None:
                     towards = np.tile(turn @ lamp.direction, (len(points), 1))
-                    reach = np.ones(len(points))
+                    distance_factor = np.ones(len(points))
                 elif lamp.place is not None:
                     towards = turn @ lamp.place + camera_from_base[:3, 3] - points
-                    usual = np.sum((np.array(lamp.place) - self.target) ** 2)
-                    reach = usual / np.sum(towards**2, axis=1)
+                    stated_squared = np.sum((np.array(lamp.place) - self.target) ** 2)
+                    distance_factor = stated_squared / np.sum(towards**2, axis=1)
                 cosines = np.einsum("ni,ni->n", towards, normals)
                 cosines = cosines / np.linalg.norm(towards, axis=1)
-                light += lamp.strength * np.maximum(cosines, 0.0) * reach
+                light += lamp.strength * np.maximum(cosines, 0.0) * distance_factor
             return light
 
         turn = camera_from_base[:3, :3]
@@ -151,7 +156,7 @@ class StickerPainter:
     def draw(
         self, renderer: Renderer, views: Views, supersampling: int, background: float
     ) -> NDArray[np.float32]:
-        """Return the radiance (n, h, w) of n windows, with stickers."""
+        """Draw the radiance (n, h, w) of n windows, with stickers and far objects."""
         # Imported late, because importing numba takes time.
         from cmmsim.imaging.paint_kernels import paint_view, scatter_objects
 
@@ -163,12 +168,12 @@ class StickerPainter:
         for seen in views.exposures:
             camera = seen.camera
             places = seen.camera_from_bodies
-            at = seen.windows, np.asarray(views.corners[seen.windows], dtype=float)
-            paint_view(images, shown, *at, self.paint.seen_by(camera, places))
+            windows = seen.windows, np.asarray(views.corners[seen.windows], dtype=float)
+            paint_view(images, shown, *windows, self.paint.seen_by(camera, places))
             if len(self.objects):
                 turn = np.ascontiguousarray(places[1, :3, :3])
                 lens = camera.focal_lengths, camera.centre
-                scatter_objects(images, behind, *at, self.objects, turn, *lens)
+                scatter_objects(images, behind, *windows, self.objects, turn, *lens)
         return images
 
 
@@ -178,7 +183,10 @@ def painter_of(
     marked: Sequence[MarkedBody],
     drawable: Drawable,
 ) -> StickerPainter | None:
-    """Return the painter of a sensor file's light and print, or None if it has neither."""
+    """Return the painter of a sensor file's light and print, or None if it has nothing to paint.
+
+    That is so with a perfect print, even light, and no far objects.
+    """
     light = file.light
     plain = file.print.is_perfect and not light.lamps and light.fall_off == 0.0
     if plain and light.clutter == 0:
@@ -211,7 +219,7 @@ def _with_levels(drawable: Drawable, ring: float, solid: float | None) -> Drawab
 
 
 def _paint(file: SensorFile, bodies: Sequence[SceneBody], marked: Sequence[MarkedBody]) -> Paint:
-    """Return the stickers of platform and base with their print, and the lamps."""
+    """Return the stickers of platform and base with their print, and the light on them."""
     counts = [len(body.sticker_places) for body in bodies]
     drawn = [drawn_print(file, n, k) for k, n in enumerate(counts)]
     prints, outlines = (np.concatenate(values) for values in zip(*drawn, strict=True))
@@ -233,7 +241,11 @@ def _paint(file: SensorFile, bodies: Sequence[SceneBody], marked: Sequence[Marke
 
 
 def _objects(file: SensorFile) -> Array:
-    """Return the bright objects (o, 5) of the background, far away around the line of sight."""
+    """Return the bright objects (o, 5) of the background, far away around the line of sight.
+
+    Each has a direction in the base frame, an angular radius, rad, and a level above the
+    background.
+    """
     light = file.light
     rng = np.random.default_rng(light.clutter_seed)
     sight = np.subtract(file.rig.target, file.rig.position)
@@ -243,6 +255,6 @@ def _objects(file: SensorFile) -> Array:
     rays = sight + aside @ across
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     smallest, largest = np.log([SMALLEST_OBJECT, LARGEST_OBJECT])
-    sizes = np.exp(rng.uniform(smallest, largest, light.clutter))
+    radii = np.exp(rng.uniform(smallest, largest, light.clutter))
     levels = rng.uniform(0.2, 1.0, light.clutter) * light.clutter_level / 255.0
-    return np.column_stack([rays, sizes, levels])
+    return np.column_stack([rays, radii, levels])

@@ -11,9 +11,10 @@ def draw_print(
 ) -> None:
     """Draw a print over a window (h, w).
 
-    ``texels_from_pixels`` (3, 3) maps homogeneous pixels of the window to places in the print, in
-    units of its picture elements. ``levels`` (r, c) are the levels of these elements. Only pixels
-    from ``box`` (first x, first y, last x, last y) are drawn, with ``samples``² samples each.
+    ``texels_from_pixels`` (3, 3) maps homogeneous pixels of the window to points of the print, in
+    units of its picture elements. ``levels`` (r, c) are the levels of these elements. Only the
+    pixels in ``box`` (first x, first y, last x, last y) are drawn, the last ones included, with
+    ``samples``² samples each. Samples beside the print keep the level of the pixel.
     """
     height, width = levels.shape
     turn = texels_from_pixels

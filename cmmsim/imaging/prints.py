@@ -1,8 +1,9 @@
 """Flat prints, such as chessboards and tags, and whole images of flat plates.
 
-A perfect lens images a plane by a homography. Each sample of a pixel therefore has its exact place
-on the print. The renderer of prints draws nothing else, so `ImageFormation` adds distortion, point
-spread and pixels as it does for stickers. Only the tiles of an image that show a plate are drawn.
+A perfect lens images a plane by a homography. The point of the print that a sample of a pixel shows
+is therefore exact. The renderer of prints draws nothing else, so `ImageFormation` adds distortion,
+point spread and pixels as it does for stickers. Only the tiles of an image that show a plate are
+drawn.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.whole_image import TILE
 
-# Drawn samples per pixel and axis. Sampling errors average out along an edge.
+# Number of drawn samples per pixel and axis. Sampling errors average out along an edge.
 PRINT_SUPERSAMPLING = 6
-# Points along each side of a plate, from which the extent of its distorted image is found.
+# Number of points along each side of a plate, from which the extent of its image is computed.
 OUTLINE_POINTS = 15
 
 
@@ -64,7 +65,10 @@ def _draw_windows(
     supersampling: int,
     background: float = 0.0,
 ) -> NDArray[np.float32]:
-    """Draw the radiance (n, h, w) of n windows. Each pixel has ``supersampling``² samples."""
+    """Draw the radiance (n, h, w) of n windows. Each pixel has ``supersampling``² samples.
+
+    A print is left out if a camera stands behind it, or if a part of it is nearer than NEAR.
+    """
     # Imported late, because importing numba takes time.
     from cmmsim.imaging.print_kernels import draw_print
 
@@ -107,10 +111,10 @@ def plates_image(
     plates: Sequence[Array],
     supersampling: int,
 ) -> NDArray[np.float32]:
-    """Return the radiance (height, width) of the only body of a drawable.
+    """Return the radiance (height, width) of a whole image of the only body of a drawable.
 
     ``plates`` are the corners (4, 3) of its plates in body axes, m. All plates must stand in front
-    of the camera.
+    of the camera. The image beside them shows the background.
     """
     image = np.full(
         (-(-camera.height // TILE) * TILE, -(-camera.width // TILE) * TILE),
@@ -130,7 +134,10 @@ def plates_image(
 def _reached_tiles(
     camera: PinholeCamera, camera_from_body: Array, plate: Array, margin: int
 ) -> NDArray[np.int_]:
-    """Return the first pixels (k, 2) of the tiles within the bounding box of a plate (4, 3)."""
+    """Return the first pixels (k, 2) of the tiles that the bounding box of a plate (4, 3) reaches.
+
+    The box is that of its distorted image, with ``margin`` px on all sides.
+    """
     fraction = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
     outline = ((1.0 - fraction) * plate + fraction * np.roll(plate, -1, axis=0)).reshape(-1, 3)
     pixels = camera.project(apply(camera_from_body, outline))[0]

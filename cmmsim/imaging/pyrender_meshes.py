@@ -1,16 +1,17 @@
 """Meshes for pyrender: stickers with soft rims, and windows that are drawn without depth tests.
 
 **Soft discs.** A sharp rim would show aliasing, because a pixel has few drawn samples. Therefore
-the level of the uppermost disc falls gradually to the level around it. The transition is
-RIM_SAMPLES sample distances wide. It changes neither the disc's centre nor its total light, and it
-needs fewer samples than a sharp rim for the same accuracy.
+the level of the uppermost disc changes gradually to the level around it, over a band that is
+RIM_SAMPLES sample distances wide. This band changes neither the disc's centre nor its total light.
+Such a soft rim needs fewer samples than a sharp rim for the same accuracy.
 
 **Painter's order.** A window needs no depth test if it shows one solid and at most one stack of
 discs that lies on the solid. The solid is drawn first, then the discs. If the camera stands in
-front of the plane of a disc, it sees the disc, because the whole solid lies behind that plane. If
-the solid fills the window, the background is not visible. The dark ring of a sticker then fills
-most of the window. The window is therefore cleared to the ring's level, and only a band of the
-solid around the ring is drawn. The image is the same, but far fewer pixels are drawn.
+front of the plane of a disc, it sees the disc, because the whole solid lies behind that plane.
+
+If the solid fills the window, the background is not visible, and the dark ring of a sticker often
+fills most of the window. Such a window is cleared to the ring's level, and only a band of the solid
+around the ring is drawn. The image is the same, but far fewer pixels are drawn.
 """
 
 from collections.abc import Sequence
@@ -24,22 +25,26 @@ from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Exposure, Views
 from cmmsim.imaging.scene_bodies import ConvexSolid, Disc, DiscStack, Mesh
 
+# Width of a soft rim, in samples.
 RIM_SAMPLES = 1.8
 # Largest distance between a side of the polygon and the rim, in samples.
 LARGEST_SAG = 0.08
+# Smallest number of sides of the uppermost disc, and number of sides of the discs below it.
 FEWEST_SIDES = 16
 GROUND_SIDES = 16
 # Ratio of the outer radius of a band to the radius of the ring inside it.
 BAND_REACH = 5.0
 # px around a window that the solid must fill as well, to be safe against rounding.
 RIM_PX = 0.5
-# Smallest distance in m between a disc and the solid below it.
+# m: smallest height of a disc above what lies below it, and of the camera above a disc's plane, for
+# drawing without a depth test.
 CLEARANCE = 1e-6
 # Smallest ratio of a solid's volume to that of a cube with the solid's longest side. Flatter solids
-# are drawn with depth tests.
+# are drawn with a depth test.
 FLATTEST = 1e-6
 # Smallest slope between a ray and a disc's plane. Flatter rays count as parallel to the plane.
 SMALLEST_SLOPE = 1e-3
+# Signs that enlarge a window (lowest x, y, highest x, y).
 OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
 CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # indices into (lowest x, y, highest x, y)
 
@@ -47,8 +52,9 @@ CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # indices into (lowest x, y, highest
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
     """Return the triangles of a stack of discs for drawing with samples ``sample`` m apart.
 
-    The uppermost disc has a soft rim if another disc lies below it. The lower discs are polygons
-    with few sides and sharp rims.
+    The triangles are in the order of drawing with a depth test, from front to back. The uppermost
+    disc has a soft rim if another disc lies below it. The lower discs are polygons with few sides
+    and sharp rims.
     """
     *grounds, top = stack.discs
     uppermost = (
@@ -62,8 +68,8 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
 def ringed_mesh(stack: DiscStack, sample: float, level: float) -> Mesh:
     """Return the triangles of a stack for a window that is cleared to the lowest disc's level.
 
-    The triangles are as in ``disc_mesh``, but a band of ``level`` around the lowest disc replaces
-    this disc.
+    The triangles are as in ``disc_mesh``, but a band around the lowest disc replaces this disc. The
+    band has the ``level`` of the solid. The stack must have at least two discs.
     """
     lowest, *grounds = stack.discs[:-1]
     corners = [_corners(lowest, reach * lowest.radius, GROUND_SIDES) for reach in (1.0, BAND_REACH)]
@@ -87,7 +93,7 @@ def _joined(pieces: Sequence[Mesh]) -> Mesh:
 
 
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
-    """Return a disc whose level falls to the level ``around`` within a band at its rim."""
+    """Return a disc whose level changes to the level ``around`` within a band at its rim."""
     width = min(RIM_SAMPLES * sample, disc.radius)
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # same total light as the sharp disc
     sides = _sides(disc.radius, sample)
@@ -112,16 +118,22 @@ def _sides(radius: float, sample: float) -> int:
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Return corners (sides, 3) of a polygon with the area of a circle in a disc's plane."""
+    """Return corners (sides, 3) of a polygon in a disc's plane, around the disc's centre.
+
+    It has the area of a circle of the given radius.
+    """
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
-    # Polygon and circle have the same area and therefore the same total light.
+    # Polygon and circle then have the same total light.
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
     return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
 
 
 def _band_triangles(sides: int) -> NDArray[np.int_]:
-    """Return triangles (2 sides, 3) between an inner and an outer polygon of ``sides`` corners."""
+    """Return triangles (2 sides, 3) between an inner and an outer polygon of ``sides`` corners.
+
+    The indices of the inner corners come first.
+    """
     here = np.arange(sides)
     there = np.roll(np.arange(sides), -1)
     return np.concatenate(
@@ -153,9 +165,9 @@ class PaintedWindows:
     """Windows that can be drawn in painter's order, without a depth test.
 
     ``solid`` (n,) is the index of the only solid in a window, or -1 if a depth test is needed.
-    ``filled`` (n,) states whether this solid fills the window. ``ringed`` (n,) is the index of a
-    stack of discs if the window can be cleared to the level of the lowest disc, and otherwise -1.
-    The indices are those of the drawable's patches.
+    ``filled`` (n,) is True if this solid fills the window. ``ringed`` (n,) is the index of a stack
+    of discs if the window can be cleared to the level of the lowest disc, and otherwise -1. The
+    indices are those of the drawable's patches.
     """
 
     solid: NDArray[np.int_]
@@ -252,14 +264,17 @@ class PaintedSolids:
         return laid
 
     def carrier(self, stack: int) -> int | None:
-        """Return the solid on which a stack of several discs lies, or None."""
+        """Return the index of the solid on which a stack of several discs lies, or None.
+
+        The result is also None for a stack of one disc.
+        """
         return next(
             (k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]),
             None,
         )
 
     def _seen_over(self, solid: int, view: Exposure) -> NDArray[np.bool_]:
-        """Return a mask of the patches that can be drawn over each other without a depth test.
+        """Return a mask of the patches that can be drawn over a solid without a depth test.
 
         They are the solid itself and the stacks on it that face the camera.
         """
@@ -272,7 +287,8 @@ class PaintedSolids:
     def _fills(self, solid: int, view: Exposure, rays: Array) -> NDArray[np.bool_]:
         """Tell whether a solid fills windows, given the ``rays`` (n, 4, 3) to their corners.
 
-        The solid is convex, so it fills a window if the rays to all corners meet it.
+        The solid is convex, so it fills a window if the rays to all corners meet it. A solid that
+        is partly nearer than NEAR or farther than FAR fills no window.
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
@@ -289,12 +305,14 @@ class PaintedSolids:
         """
         move = view.camera_from_bodies[self._body_index[solid]]
         # Vectors from the camera to the rings' centres, in the axes of the body.
-        gaps = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]
+        to_centres = self._ring_centres[stacks] + move[:3, 3] @ move[:3, :3]
         along = rays @ move[:3, :3]
         normals = self._normals[stacks]
         slopes = np.einsum("nci,ni->nc", along, normals)
-        share = np.einsum("ni,ni->n", normals, gaps)[:, None] / np.minimum(slopes, -SMALLEST_SLOPE)
-        beside = share[..., None] * along - gaps[:, None]
+        scales = np.einsum("ni,ni->n", normals, to_centres)[:, None] / np.minimum(
+            slopes, -SMALLEST_SLOPE
+        )
+        beside = scales[..., None] * along - to_centres[:, None]
         within = np.einsum("nci,nci->nc", beside, beside) < self._ring_reach[stacks, None] ** 2
         return np.asarray((within & (slopes < -SMALLEST_SLOPE)).all(axis=1))
 
@@ -312,7 +330,10 @@ def _is_plain_convex(mesh: Mesh) -> bool:
 
 
 def _lies_over(stack: DiscStack, vertices: Array) -> bool:
-    """Tell whether the discs are parallel, in rising order, and all above the vertices (n, 3)."""
+    """Tell whether the discs are parallel, in rising order, and all above the vertices (n, 3).
+
+    Each must be more than CLEARANCE above what lies below it.
+    """
     normal = stack.discs[0].normal
     heights = np.array([disc.centre @ normal for disc in stack.discs])
     parallel = all(np.allclose(disc.normal, normal, rtol=0.0, atol=1e-9) for disc in stack.discs)

@@ -30,7 +30,9 @@ from cmmsim.imaging.pyrender_meshes import PaintedSolids, disc_mesh, ringed_mesh
 from cmmsim.imaging.renderer import Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh, Patch
 
+# Largest side of an atlas, drawn pixels, unless a single cell is larger.
 ATLAS_SIDE_PX = 2048
+# Number of frame buffers that are kept; a further one replaces the oldest.
 KEPT_FRAME_BUFFERS = 12
 # Number of pieces in which an atlas is sent to OpenGL.
 PIECES = 3
@@ -84,7 +86,10 @@ def opengl_context() -> Any:
 
 @lru_cache(maxsize=1)
 def _shared_atlas() -> "_Atlas":
-    """Return the only atlas of this process. A second one would leak memory."""
+    """Return the only atlas of this process; a second one would leak memory.
+
+    Without a display, PyOpenGL is told to use EGL. Raises OpenGLMissingError.
+    """
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
@@ -100,8 +105,8 @@ class _Patch:
     """Patch in OpenGL's memory.
 
     The vertex indices of its triangles are stored twice: from front to back, and in reverse order.
-    ``indices`` is the number of indices of one order, and ``backwards`` the byte at which the
-    reverse order begins. ``solid`` is False for a stack of discs.
+    ``indices`` is the number of indices of one order, and ``backwards`` the byte offset at which
+    the reverse order begins. ``solid`` is False for a stack of discs.
     """
 
     vertex_array: int
@@ -169,7 +174,8 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """Draw the atlas (rows * cell_h, columns * cell_w) uint8, with cells in reading order.
 
-        The result is valid until the next call.
+        The result is valid until the next call. Discs are triangulated for the focal length of the
+        first camera.
         """
         self.platform.make_current()
         # Drawn pixels per radian.
@@ -225,7 +231,8 @@ class _Atlas:
     def _draw_in_order(self, matrices: Mapping[int, int], patches: Sequence[_Patch]) -> None:
         """Draw the patches of a cell over each other: the solid, then the stack that lies on it.
 
-        ``matrices`` maps each patch to the address of its matrix. All patches belong to one body.
+        The triangles are drawn from back to front. ``matrices`` maps each patch to the address of
+        its matrix. All patches belong to one body.
         """
         triangles, unsigned = self._constants
         for p in sorted(matrices, key=lambda p: not patches[p].solid):
@@ -236,7 +243,10 @@ class _Atlas:
     def _clear(
         self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
-        """Clear each cell to its level in ``grounds``, and the depth buffer if ``with_depth``."""
+        """Clear each cell to its level in ``grounds``, and the depth buffer if ``with_depth``.
+
+        ``places`` are the viewports (x, y, w, h) of the cells.
+        """
         gl = self._gl
         level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)
@@ -251,7 +261,7 @@ class _Atlas:
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
     def _uploaded(self, drawable: Drawable, samples: float) -> _Uploaded:
-        """Return the drawable with its patches in OpenGL's memory.
+        """Return the parts of a drawable in OpenGL's memory, where the first call stores them.
 
         Discs are triangulated for ``samples`` drawn pixels per radian.
         """

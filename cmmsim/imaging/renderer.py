@@ -32,8 +32,8 @@ FAR = 10.0
 class View:
     """One window of a camera with a perfect lens.
 
-    ``camera_from_bodies`` (b, 4, 4) are the places of the bodies. ``corner`` is the window's first
-    pixel (x, y), and ``size`` its size (w, h), px.
+    ``camera_from_bodies`` are the transforms camera_from_body (b, 4, 4). ``corner`` is the window's
+    first pixel (x, y), and ``size`` its size (w, h), px.
     """
 
     camera: PinholeCamera
@@ -46,7 +46,7 @@ class View:
 class Exposure:
     """Camera with a perfect lens that sees bodies at camera_from_body (b, 4, 4).
 
-    ``windows`` (k,) are the indices of the windows that belong to this camera and these places.
+    ``windows`` (k,) are the indices of the windows that belong to this camera and these transforms.
     """
 
     camera: PinholeCamera
@@ -66,7 +66,10 @@ class Views(Sequence[View]):
 
     @classmethod
     def of(cls, views: Sequence[View]) -> Views:
-        """Group single windows by camera and places of bodies."""
+        """Group single windows by camera and transforms of bodies.
+
+        Windows form a group if they have the very same objects, not merely equal ones.
+        """
         if isinstance(views, Views):
             return views
         groups: dict[tuple[int, int], list[int]] = {}
@@ -135,7 +138,7 @@ class Views(Sequence[View]):
         """Clip-from-camera matrices (n, 4, 4) for OpenCV camera axes.
 
         Row 0 of a drawn image is the top row of a window. OpenCV's pixel coordinates refer to pixel
-        centres, OpenGL's to pixel corners. Half a pixel is added for this reason.
+        centres, OpenGL's to pixel corners, so half a pixel is added.
         """
         matrices = np.zeros((len(self), 4, 4))
         for shown in self.exposures:
@@ -164,9 +167,9 @@ _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}
 class Drawable:
     """Patches of several bodies.
 
-    ``body_index`` (n,) is the body of each patch. ``boxes`` (n, 4, 8) are the corners of each
-    patch's bounding box as columns (x, y, z in m, 1). ``distance`` in m is the usual distance from
-    the cameras, for which discs are triangulated.
+    ``body_index`` (n,) is the index of each patch's body. ``boxes`` (n, 4, 8) are the corners of
+    each patch's bounding box as columns (x, y, z in m, 1). ``distance`` in m is the usual distance
+    from the cameras, for which discs are triangulated.
     """
 
     def __init__(
@@ -180,7 +183,7 @@ class Drawable:
         self.distance = distance
 
     def reaching(self, views: Views) -> NDArray[np.bool_]:
-        """Return a mask (views, patches): whether a patch's bounding box reaches into a window."""
+        """Return a mask (views, patches) of the windows into which a bounding box reaches."""
         windows = views.bounds
         result = np.zeros((len(views), len(self.patches)), dtype=bool)
         for shown in views.exposures:
@@ -194,8 +197,9 @@ class Drawable:
     ) -> NDArray[np.bool_]:
         """Return a mask (windows, patches), as in ``reaching``.
 
-        All windows belong to one camera with a perfect lens. Bodies stand at ``camera_from_bodies``
-        (b, 4, 4). ``bounds`` (n, 4) are lowest x, y and highest x, y of the windows, px.
+        All windows belong to one camera with a perfect lens. ``camera_from_bodies`` are the
+        transforms camera_from_body (b, 4, 4). ``bounds`` (n, 4) are lowest x, y and highest x, y of
+        the windows, px.
         """
         # Imported late, because importing numba takes time.
         from cmmsim.imaging.window_kernels import boxes_reaching
@@ -228,8 +232,8 @@ class DrawWindows(Protocol):
 class Renderer:
     """Renderer with its name and its drawing function.
 
-    ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9, see
-    ``centre_error_px``.
+    ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9, from which
+    ``centre_error_px`` extrapolates.
     """
 
     name: str

@@ -14,7 +14,7 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, transforms_of
 from cmmsim.imaging.formation import ImageFormation, Side
 
-# Number of rows between the two poses from whose difference the change per row is computed.
+# Number of rows between two poses whose difference gives the change per row.
 SWEPT_ROWS = 100.0
 
 
@@ -24,8 +24,8 @@ def row_sweeps(
     """Return, for each of N poses, the changes (2, 4, 4) of camera_from_platform per row.
 
     The platform has poses (N, 6) that change at rates (N, 6), and a row is exposed ``row_time`` s
-    after the row above it. ``from_base`` are camera_from_base (4, 4) of both cameras. The change is
-    None for a platform at rest.
+    after the row above it. ``from_base`` are camera_from_base (4, 4) of both cameras. The changes
+    are None for a platform at rest.
     """
     ahead, behind = (
         transforms_of(poses + sign * 0.5 * SWEPT_ROWS * row_time * rates) for sign in (1.0, -1.0)
@@ -41,8 +41,8 @@ def swept(
     """Return camera_from_body (b, 4, 4) when the middle row of a window is exposed.
 
     ``bodies`` (b, 4, 4) belong to the middle row of the image. ``sweep`` (4, 4) is the change of
-    the first body's transform from one row to the next, or None. The window begins at
-    ``first_row`` and has ``size`` rows.
+    the first body's transform from one row to the next, or None for a body at rest. The window
+    begins at ``first_row`` and has ``size`` rows. The motion is linearised.
     """
     if sweep is None:
         return bodies
@@ -68,8 +68,8 @@ def drawn_row_by_row(
         sweep = sweeps[k // 2]
         own = None if sweep is None else sweep[k % 2]
         parts = [
-            Side(side.camera, swept(side.camera, side.bodies, own, at[1], size), at[None])
-            for at in side.corners
+            Side(side.camera, swept(side.camera, side.bodies, own, corner[1], size), corner[None])
+            for corner in side.corners
         ]
         windows.append(np.concatenate(formation.windows(parts, size, supersampling)))
     return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]

@@ -1,6 +1,6 @@
-"""Solid bodies in front of the cameras, with the true places of stickers.
+"""Solid bodies in front of the cameras, with the true positions of stickers.
 
-Only renderers use these true places, never the estimator.
+Only renderers use these true positions, never the estimator.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, invert
 
-# Depth in m of the solid surface below the sticker planes, and of a dark ring below its sticker.
+# m: depth of the solid's surface below the stickers, and of a dark ring below its sticker.
 SUNK = 0.0003
 RING_SUNK = 0.0001
-# m: the direction of a shorter rod would be dominated by rounding errors.
+# m: shorter rods are refused, because rounding errors would dominate their direction.
 SHORTEST_ROD = 1e-9
 # A point counts as lying on a solid, and not behind it, if the line of sight enters the solid
-# within this last share of the line's length.
+# within this final fraction of the line's length.
 TOUCHING = 1e-6
 
 
@@ -110,7 +110,7 @@ Patch = DiscStack | Mesh  # piece of a body that is drawn by one call
 class SceneBody:
     """Rigid body for drawing: its solid and one stack of discs per sticker.
 
-    ``sticker_places`` (n, 3) are the true places, m.
+    ``sticker_places`` (n, 3) are the true positions, m, in the axes of the body.
     """
 
     solid: Mesh
@@ -119,32 +119,38 @@ class SceneBody:
 
 
 def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
-    """Return the true sticker places (n, 3).
+    """Return the true sticker positions (n, 3), m.
 
-    They are the nominal places, moved within their planes by random distances and directions from
-    ``placement_seed`` and ``stream``.
+    They are the nominal positions, moved within their planes by random distances in random
+    directions. The random numbers follow from ``placement_seed`` and ``stream``.
     """
     rng = np.random.default_rng([stickers.placement_seed, stream])
     distance = rng.uniform(*stickers.placement, len(body.nominal))
     angle = rng.uniform(0.0, 2.0 * np.pi, len(body.nominal))
-    moves = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    return body.nominal + np.einsum("nij,nj->ni", body.in_plane, moves)
+    shifts = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return body.nominal + np.einsum("nij,nj->ni", body.in_plane, shifts)
 
 
 def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
-    """Return the body for drawing that a section of a sensor file describes."""
+    """Return the body for drawing that a section of a sensor file describes.
+
+    Raises SensorFileError if the section describes no solid, or its mesh cannot be used.
+    """
     places = placed_stickers(body, stickers, stream)
     drawn = tuple(
         _sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True)
     )
-    found = _solid(body, section) if section.mesh is None else _sunk(read_mesh(section, body.name))
-    return SceneBody(solid_mesh(found, stickers.body_level / 255.0), drawn, places)
+    surface = (
+        _solid(body, section) if section.mesh is None else _sunk(read_mesh(section, body.name))
+    )
+    return SceneBody(solid_mesh(surface, stickers.body_level / 255.0), drawn, places)
 
 
 def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: str) -> None:
     """Raise SensorFileError if a sticker lies in a hollow of a body.
 
-    The renderer, named in the message, draws the body's convex hull, which would hide the sticker.
+    The message names the ``renderer``, which draws the body's convex hull, so that the hull would
+    hide the sticker.
     """
     normals, offsets = ConvexSolid(body.solid.vertices).faces
     heights = (body.sticker_places @ normals.T + offsets).max(axis=1)
@@ -232,7 +238,7 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
 def rod_transforms(starts: Array, ends: Array) -> Array:
     """Return ``rod_transform`` (k, 4, 4) of k rods at once, from starts and ends (k, 3).
 
-    Raises CmmError for a rod that is too short.
+    Raises CmmError for a rod whose length is below SHORTEST_ROD or NaN.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.imaging.view_kernels import place_rods
@@ -252,7 +258,7 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
 class PlacedBodies(Mapping[str, Array]):
     """Mapping of names of bodies to base_from_body, stored in one array ``together`` (k, 4, 4).
 
-    With the array, a sensor need not join the matrices again in every frame.
+    Thanks to the array, a sensor need not join the matrices again in every frame.
     """
 
     def __init__(self, names: tuple[str, ...], together: Array) -> None:
@@ -284,7 +290,8 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         *(np.array(c.point) for c in section.cuts),
     ]
     half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
-    # The point one centimetre below the middle of the stickers must lie inside all half spaces.
+    # The middle of the stickers, moved inwards by 1 cm along the normal of each plane, must lie
+    # inside all half spaces.
     inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
     outside = half_spaces @ [*inside, 1.0]
     if outside.max() >= 0.0:
@@ -312,7 +319,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 
 
 def _sunk(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh whose faces lie SUNK below those of the given mesh.
+    """Return a mesh whose faces lie about SUNK below those of the given mesh.
 
     Stickers on the surface of the given mesh then lie above the drawn one, as on convex solids.
     """

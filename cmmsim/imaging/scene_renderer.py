@@ -1,7 +1,7 @@
 """Renderer ``scene``: whole frames by pyrender's own scene, camera, lamp and materials.
 
 It shares no matrices, frame buffers or order of drawing with the renderer ``pyrender``. It is
-slower, but it shades bodies realistically, and it serves to check the other renderers.
+slower, but it shades bodies realistically, and serves to check the other renderers.
 
 Stickers are retro-reflective, so their level is the same in any light. Bodies are lit by a lamp at
 the camera and by ambient light, in equal parts. A face that faces the camera has about the level
@@ -29,19 +29,20 @@ from cmmsim.imaging.pyrender_renderer import opengl_context
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Renderer, View, Views
 from cmmsim.imaging.scene_bodies import DiscStack, Mesh
 
-# Drawn pixels along each side of the largest piece, and of the frame buffer for pieces.
+# Number of drawn pixels along each side of the largest piece, and of the frame buffer for pieces.
 LARGEST_PIECE = 512
 ATLAS = 1024
 # Ratio of the drawn samples to the requested ones, along each side. Materials and lamps make a
 # sample five times as expensive as in the renderer `pyrender`.
 SAMPLES = 5.0 / 9.0
-# Share of a body's level that ambient light contributes.
+# Fraction of a body's level that ambient light contributes.
 AMBIENT = 0.5
 # Radiance of the lamp, which contributes the rest of the level of a face that faces the camera.
 # pyrender reflects 0.96² / pi of it diffusely and 0.04 / (4 pi) as rough gloss.
 LAMP = (1.0 - AMBIENT) / (AMBIENT * 0.96**2 / np.pi + 0.04 / (4.0 * np.pi))
 # pyrender's shader writes the radiance to the power 1 / GAMMA.
 GAMMA = 2.2
+# Radiance of each 8-bit value that the shader writes.
 LINEAR = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 # Transform from the camera axes of OpenGL to those of OpenCV.
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -52,7 +53,8 @@ def draw_frames(
 ) -> NDArray[np.float32]:
     """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    Each pixel is the mean of (SAMPLES supersampling)² drawn pixels. Raises OpenGLMissingError.
+    Each pixel is the mean of s² drawn pixels, where s is SAMPLES times ``supersampling``, rounded,
+    but at least 1. Raises OpenGLMissingError.
     """
     views = Views.of(views)
     supersampling = max(1, round(SAMPLES * supersampling))
@@ -81,7 +83,7 @@ def draw_frames(
             background,
         )
         for (k, left, top), piece in zip(cells[kept].tolist(), drawn, strict=True):
-            # The mean of the drawn pixels of each pixel.
+            # Interpolation by area is the mean of the drawn pixels of each pixel.
             mean = cv2.resize(LINEAR[piece], size, interpolation=cv2.INTER_AREA)
             part = images[k, top : top + size[1], left : left + size[0]]
             part[:] = mean[: part.shape[0], : part.shape[1]]
@@ -92,7 +94,10 @@ SCENE = Renderer("scene", draw_frames, 0.0016)
 
 
 class _Scene:
-    """pyrender's scene of a drawable: for each body, a node of its discs and one of its solids."""
+    """pyrender's scene of a drawable: for each body, a node of its discs and one of its solids.
+
+    Discs are triangulated for ``samples`` drawn pixels per radian.
+    """
 
     def __init__(self, drawable: Drawable, samples: float) -> None:
         # The context selects OpenGL's platform, which must be done before pyrender is imported.
@@ -103,7 +108,7 @@ class _Scene:
         self._scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0])
         sample = drawable.distance / samples
         self._nodes = {}
-        # Nodes with their primitives, and the indices of the patches in each.
+        # For each node: the node, its primitive, and the indices of its patches.
         self.primitives = []
         for body in np.unique(drawable.body_index).tolist():
             own = np.flatnonzero(drawable.body_index == body)
@@ -164,7 +169,7 @@ class _Scene:
     def _primitive(self, facets: Array, share: float) -> Any:
         """Return triangles in pyrender's form. ``facets`` is a result of `_facets`.
 
-        ``share`` is the share of the level that ambient light contributes.
+        ``share`` is the fraction of the level that ambient light contributes.
         """
         positions, normals, levels = facets[:, :3], facets[:, 3:6], facets[:, 6:]
         return self._pyrender.Primitive(
@@ -191,10 +196,10 @@ def _facets_of(patch: DiscStack | Mesh, sample: float) -> Array:
 
 
 def _facets(mesh: Mesh, normal: Array | None) -> Array:
-    """Return place, normal and level (3 m, 7) of the corners of a mesh's m triangles.
+    """Return position, normal and level (3 m, 7) of the corners of a mesh's m triangles.
 
-    Each triangle has its own corners, so that edges are sharp. ``normal`` (3,) replaces the normals
-    of the triangles.
+    Each triangle has its own corners, so that edges are sharp. ``normal`` (3,), unless it is None,
+    replaces the normals of the triangles.
     """
     corners = mesh.vertices[mesh.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -233,11 +238,11 @@ def _drawing() -> Any:
             projections: NDArray[np.float32],
             size: NDArray[np.int_],
         ) -> NDArray[np.uint8]:
-            """Return the values (rows, ATLAS) that the shader wrote, the lowest row first.
+            """Return the values (rows, ATLAS) uint8 that the shader wrote, the lowest row first.
 
-            ``parts`` contains nodes of meshes with their primitives, and masks (n,) of the pieces
-            in which each is drawn. ``projections`` (n, 4, 4) belong to the pieces of ``size``
-            (w, h).
+            The pieces lie beside each other in rows. ``parts`` contains nodes of meshes with their
+            primitives, and masks (n,) of the pieces in which each is drawn. ``projections``
+            (n, 4, 4) belong to the pieces of ``size`` (w, h).
             """
             context.make_current()
             while _UNUSED:
@@ -279,14 +284,14 @@ def _drawing() -> Any:
 
         def _configure_forward_pass_viewport(self, flags: int) -> None:
             super()._configure_forward_pass_viewport(flags)
-            # The plain frame buffer has one sample per pixel, which is enough for soft rims.
+            # This frame buffer has one sample per pixel, which is enough for soft rims.
             GL.glBindFramebuffer(GL.GL_DRAW_FRAMEBUFFER, self._main_fb)
 
     context.make_current()
     return Drawing(ATLAS, ATLAS)
 
 
-# Primitives of scenes that no longer exist, which are in OpenGL's memory until the next drawing.
+# Primitives of scenes that no longer exist. They stay in OpenGL's memory until the next drawing.
 _UNUSED: list[Any] = []
 _SCENES: "WeakKeyDictionary[Drawable, dict[float, _Scene]]" = WeakKeyDictionary()
 

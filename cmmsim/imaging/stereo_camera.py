@@ -17,12 +17,15 @@ from cmmsim.imaging.whole_image import whole_image
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from cmmsim.radiometry.stereo_images import StereoFrame, Windows
 
-# Largest movement of a sticker between two sub-frames.
+# Largest movement of a sticker between two sub-frames, into which an exposure is divided.
 LARGEST_STEP_PX = 0.3
+# An exposure that needs more sub-frames is refused.
 MOST_SUB_FRAMES = 500
+# Usual number of drawn samples per pixel and axis.
 SUPERSAMPLING = 9
 
-# Transforms camera_from_body (b, 4, 4) of all bodies for both cameras, at each sub-frame.
+# Transforms camera_from_body (b, 4, 4) of all bodies for the left and the right camera, at the
+# moment of each sub-frame.
 Moments = Sequence[Sequence[Array]]
 
 
@@ -33,7 +36,7 @@ def sub_frame_poses(
 
     Each exposure is divided into m equal parts, and each pose belongs to the middle of a part.
     ``poses`` (N, 6) are the poses in the middle of the exposures, and ``pose_rates`` (N, 6) are
-    constant. ``sticker_pixels`` returns the places (2, N, n, 2) px of all stickers at poses (N, 6).
+    constant. ``sticker_pixels`` returns the pixels (2, N, n, 2) of all stickers at poses (N, 6).
     Raises CmmError if a sticker moves too far for MOST_SUB_FRAMES parts.
     """
     halves = 0.5 * exposure * pose_rates
@@ -48,20 +51,16 @@ def sub_frame_poses(
             f"a sticker moves {far:.0f} px during the exposure of {exposure:g} s at pose rate "
             f"{rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
         )
-    shares = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
+    fractions = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
     return [
-        pose + share[:, None] * half
-        for pose, share, half in zip(poses, shares, halves, strict=True)
+        pose + fraction[:, None] * half
+        for pose, fraction, half in zip(poses, fractions, halves, strict=True)
     ]
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Quality of windows.
-
-    It states the number of drawn samples per pixel and axis, and the number of exposures that are
-    averaged.
-    """
+    """Quality of windows: drawn samples per pixel and axis, and number of averaged exposures."""
 
     supersampling: int = SUPERSAMPLING
     exposures: int = 1
@@ -73,9 +72,9 @@ class VirtualStereoCamera:
 
     ``rig`` and ``camera_from_base`` (4, 4) have their true values. In the drawable of
     ``formation``, body 0 is the platform and body 1 the base. The further bodies are the obstacles,
-    in the order of ``obstacle_names``. ``exposure`` is in s. ``pattern_seed`` is the seed of the
-    fixed pattern. The right camera exposes ``right_later`` s after the left camera, and each row of
-    pixels ``row_time`` s after the row above it.
+    in the order of ``obstacle_names``. ``exposure`` is the exposure time, s. ``pattern_seed`` is
+    the seed of the fixed pattern. The right camera exposes ``right_later`` s after the left camera,
+    and each row of pixels is exposed ``row_time`` s after the row above it.
     """
 
     rig: StereoRig
@@ -98,8 +97,9 @@ class VirtualStereoCamera:
     ) -> "LiveImages":
         """Take one exposure of the platform, and of obstacles at base_from_body (4, 4) by name.
 
-        ``pose`` (6,) is the pose in the middle of the exposure, and ``pose_rate`` (6,) its time
-        derivative. Obstacles stand still.
+        ``pose`` (6,) is the pose in the middle of the left camera's exposure, and ``pose_rate``
+        (6,) its time derivative, None at rest. Obstacles stand still, and those that are not named
+        are absent.
         """
         rates = None if pose_rate is None else pose_rate[None]
         moments = self._moments(pose[None], rates, obstacles or {})[0]
@@ -121,7 +121,7 @@ class VirtualStereoCamera:
         return ManyLiveImages(self, moments, rngs, self._sweeps(poses, pose_rates))
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
-        """Return the cameras after changes (24,) of the rig's parameters.
+        """Return the cameras after adding ``changes`` (24,) to the parameters of their rig.
 
         The fixed pattern of their pixels does not change.
         """
@@ -149,15 +149,15 @@ class VirtualStereoCamera:
             [first for first, *_ in moments], corners, size, supersampling, swept_by
         )
         for k in range(1, max(map(len, moments))):
-            going = [n for n, own in enumerate(moments) if len(own) > k]
+            moving = [n for n, own in enumerate(moments) if len(own) > k]
             drawn = self._drawn(
-                [moments[n][k] for n in going],
-                [corners[n] for n in going],
+                [moments[n][k] for n in moving],
+                [corners[n] for n in moving],
                 size,
                 supersampling,
-                [swept_by[n] for n in going],
+                [swept_by[n] for n in moving],
             )
-            for n, more in zip(going, drawn, strict=True):
+            for n, more in zip(moving, drawn, strict=True):
                 light[n] += more
         for mean, own in zip(light, moments, strict=True):
             if len(own) > 1:
@@ -209,7 +209,9 @@ class VirtualStereoCamera:
     ) -> NDArray[np.float32]:
         """Return the mean radiance (height, width) of one whole image over all moments.
 
-        ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this exposure.
+        ``side`` is 0 for the left and 1 for the right camera. ``moments`` are camera_from_body
+        (b, 4, 4) for this camera. ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this
+        exposure.
         """
         own = None if sweep is None else sweep[side]
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling, own)
@@ -236,7 +238,10 @@ class VirtualStereoCamera:
         ]
 
     def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        """Return the fixed pattern in windows of one size at ``corners`` (2, n, 2), or None."""
+        """Return the fixed pattern in windows of one size, or None if pixels do not differ.
+
+        The windows have first pixels ``corners`` (2, n, 2).
+        """
         cut = [
             p.windows(at, size)
             for p, at in zip(self.patterns, corners, strict=True)
@@ -251,16 +256,19 @@ class VirtualStereoCamera:
     def _moments(
         self, poses: Array, rates: Array | None, obstacles: Mapping[str, Array]
     ) -> list[Moments]:
-        """Return the moments of N exposures at poses (N, 6) that change at rates (N, 6)."""
+        """Return the moments of N exposures at poses (N, 6) that change at rates (N, 6).
+
+        Without rates, or with an exposure time of 0, each exposure has one moment.
+        """
         parts = list(poses[:, None])
-        lag = np.zeros(poses.shape)
+        change = np.zeros(poses.shape)
         if rates is not None:
-            lag = self.right_later * rates
+            change = self.right_later * rates
             if self.exposure > 0.0:
                 parts = sub_frame_poses(poses, rates, self.exposure, self._sticker_pixels)
         counts = [len(part) for part in parts]
         left = np.concatenate(parts)
-        placed = self._placed(left, left + np.repeat(lag, counts, axis=0), obstacles)
+        placed = self._placed(left, left + np.repeat(change, counts, axis=0), obstacles)
         return [
             placed[end - count : end] for count, end in zip(counts, np.cumsum(counts), strict=True)
         ]
@@ -293,7 +301,7 @@ class VirtualStereoCamera:
 
     @cached_property
     def _sticker_places(self) -> Array:
-        """Places (n,3) of the platform's stickers, m, in its axes."""
+        """Positions (n, 3) of the platform's stickers, m, in its axes."""
         drawable = self.formation.drawable
         return np.array(
             [
@@ -322,7 +330,7 @@ class LiveImages:
         self._sweep = sweep
 
     def full(self) -> StereoFrame:
-        """Return both whole images."""
+        """Return both whole images of a single exposure, whatever the number of averaged ones."""
         images = []
         for side, pattern in enumerate(self._camera.patterns):
             moments = [placed[side] for placed in self._moments]
@@ -335,7 +343,7 @@ class LiveImages:
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
         """Return the grey values (2, n, size, size) of windows with first pixels ``corners``.
 
-        The first pixels (2, n, 2) are (x, y).
+        The first pixels (2, n, 2) are (x, y). Each call draws new noise.
         """
         (radiance,) = self._camera.radiances(
             [self._moments], [corners], size, self._quality.supersampling, [self._sweep]

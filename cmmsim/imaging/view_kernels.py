@@ -20,15 +20,15 @@ NEAREST = 1e-3
 class Scene(NamedTuple):
     """Discs and convex solids, in the axes of their bodies. Levels are radiances 0 to 1.
 
-    places, normals             (m, 3), of the discs
-    radii, disc_levels          (m,), of the discs
+    places, normals             (m, 3), centres and normals of the discs
+    radii, disc_levels          (m,), radii and levels of the discs
     owners                      (m,), bodies to which the discs belong
     bodies, levels              (s,), bodies and levels of the solids
-    middles                     (s, 3), of the solids
-    vertices                    (v, 3), of all solids
-    vertex_starts               vertices of solid k begin at vertex_starts[k]
+    middles                     (s, 3), means of the vertices of the solids
+    vertices                    (v, 3), vertices of all solids
+    vertex_starts               (s + 1,), vertices of solid k begin at vertex_starts[k]
     face_normals, face_offsets  faces of all solids: normal . x + offset <= 0 inside
-    face_starts                 faces of solid k begin at face_starts[k]
+    face_starts                 (s + 1,), faces of solid k begin at face_starts[k]
     """
 
     places: Array
@@ -52,7 +52,7 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
 
     The rods lead from ``starts`` to ``ends`` (k, 3) along their z axes. Each x axis is
     perpendicular to the rod, and to the base axis that forms the largest angle with the rod.
-    ``transforms`` must contain zeros.
+    ``transforms`` must contain zeros. A rod without length gets NaN.
     """
     for k in range(len(starts)):
         move = transforms[k]
@@ -80,7 +80,10 @@ def place_rods(starts: Array, ends: Array, transforms: Array, lengths: Array) ->
 
 @compiled
 def convex_hull(points: Array) -> Array:
-    """Return corners (k, 2) of the convex hull of points (n, 2), by Andrew's monotone chain."""
+    """Return corners (k, 2) of the convex hull of points (n, 2), by Andrew's monotone chain.
+
+    ``points`` is sorted in place.
+    """
     n = len(points)
     # Insertion sort by x, then y; the points are few.
     for i in range(1, n):
@@ -114,8 +117,8 @@ def convex_hull(points: Array) -> Array:
 def half_planes_of(corners: Array, half_planes: Array) -> int:
     """Fill ``half_planes`` with a, b, c of a x + b y <= c for the sides of a convex polygon.
 
-    The polygon has ``corners`` (n, 2). Sides without length are omitted. The result is the number
-    of half planes.
+    The polygon has ``corners`` (n, 2), px. Sides shorter than about 1e-6 px are omitted. The result
+    is the number of half planes.
     """
     n = len(corners)
     count = 0
@@ -145,7 +148,8 @@ def visible_discs(
 
     The results are the indices (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and half
     extents (m, 2) of their ellipses in px, and the ``probes`` (m, k, 3), points on the discs that
-    are tested for occlusion, in camera axes, m. Discs nearer than ``near`` m are left out.
+    are tested for occlusion, in camera axes, m. Discs that may be partly nearer than ``near`` m are
+    left out.
     """
     total = len(scene.radii)
     places = np.empty((total, 3))
@@ -164,15 +168,17 @@ def visible_discs(
             continue
         # Depths are rounded to millimetres, so that the discs of a sticker are ordered by radius.
         depth = np.rint(1e3 * places[n, 2])
-        at = count
-        while at > 0:
-            other = kept[at - 1]
-            ahead = np.rint(1e3 * places[other, 2])
-            if ahead > depth or (ahead == depth and scene.radii[other] >= scene.radii[n]):
+        rank = count
+        while rank > 0:
+            other = kept[rank - 1]
+            other_depth = np.rint(1e3 * places[other, 2])
+            if other_depth > depth or (
+                other_depth == depth and scene.radii[other] >= scene.radii[n]
+            ):
                 break
-            kept[at] = other
-            at -= 1
-        kept[at] = n
+            kept[rank] = other
+            rank -= 1
+        kept[rank] = n
         count += 1
     kept = kept[:count]
     pixels = np.empty((count, 2))
@@ -202,9 +208,11 @@ def occlusion_mask(
 ) -> Array:
     """Return a mask (m, h) that states which discs lie behind which solids.
 
-    Only the h solids that hide a probe of at least one disc have a column. ``slots`` (s,) is filled
-    with the column of each solid, or -1. The discs belong to bodies ``owners`` (m,) and have
-    ``probes`` (m, k, 3) from ``visible_discs``. ``touching`` is that of ``occludes``.
+    A disc lies behind a solid of another body that hides one of its probes. Only the h solids that
+    hide at least one disc have a column. ``slots`` (s,) is filled with the column of each solid, or
+    -1. The discs belong to bodies ``owners`` (m,) and have ``probes`` (m, k, 3) from
+    ``visible_discs``. A solid whose body's origin lies more than ``near`` m behind the camera hides
+    nothing. ``touching`` is that of ``occludes``.
     """
     behind = np.zeros((len(owners), len(slots)), np.bool_)
     hiding = 0
@@ -213,7 +221,7 @@ def occlusion_mask(
     for k in range(len(slots)):
         slots[k] = -1
         move = camera_from_bodies[scene.bodies[k]]
-        # Bodies behind the cameras, such as absent obstacles, hide nothing.
+        # Bodies behind the camera, such as absent obstacles, hide nothing.
         if move[2, 3] < -near:
             continue
         own = slice(scene.face_starts[k], scene.face_starts[k + 1])
@@ -269,9 +277,9 @@ def solid_outlines(
             depth = move[2, 0] * x + move[2, 1] * y + move[2, 2] * z + move[2, 3]
             nearest = min(nearest, depth)
             for i in range(2):
-                at = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
+                coordinate = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
                 # Single precision is sufficient for edges in an image.
-                pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])
+                pixels[v, i] = np.float32(coordinate / depth * focal[i] + principal[i])
         if nearest <= NEAREST:
             continue
         hull = convex_hull(pixels)
@@ -303,10 +311,11 @@ def draw_view(
 ) -> None:
     """Draw the windows ``images[group]`` (n, h, w) of one exposure of a camera with a perfect lens.
 
-    The windows have first pixels ``corners`` (n, 2). The camera has the focal lengths ``focal``
-    (2,) and the principal point ``principal`` (2,), px. Bodies stand at ``camera_from_bodies``
-    (b, 4, 4). ``lines`` is the number of scan lines per pixel that sample edges of solids. See
-    ``visible_discs`` for ``near`` and ``occludes`` for ``touching``.
+    The windows have first pixels ``corners`` (n, 2) and already contain the background. The camera
+    has the focal lengths ``focal`` (2,) and the principal point ``principal`` (2,), px.
+    ``camera_from_bodies`` are the transforms camera_from_body (b, 4, 4). ``lines`` is the number of
+    scan lines per pixel that sample edges of solids. See ``visible_discs`` for ``near`` and
+    ``occludes`` for ``touching``.
     """
     kept, pixels, shapes, extents, probes = visible_discs(
         scene, camera_from_bodies, focal, principal, near

@@ -2,7 +2,7 @@
 
 A whole image is drawn finely only around bright spots. Most of the scene stands still during an
 exposure, so a window without a moving body is drawn only once. A window without any body is filled
-with the background.
+with the background, unless the background is painted too.
 """
 
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import View
 from cmmsim.imaging.row_sweep import swept
 
-# px: side of the finely drawn window around a bright spot.
+# px: smallest side of the finely drawn window around a bright spot.
 PASTED_SIZE = 24
 # px: largest side of a finely drawn window; larger spots are drawn coarsely.
 LARGEST_PASTED_SIZE = 96
-# px: margin that is drawn finely around a large spot.
+# px: width of the finely drawn margin around a spot that is too large for PASTED_SIZE.
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4
-# The same limit if light and print can make stickers darker than their level.
+# The same threshold where light and print can make stickers darker than their level.
 DIM = 0.25
 # px: side of the pieces in which a whole image is distorted and blurred.
 TILE = 64
@@ -45,7 +45,7 @@ def exposed_windows(
     """Return the mean and the largest radiance (k, size, size) of windows over several moments.
 
     Each moment states camera_from_body (b, 4, 4). Windows have first pixels ``corners`` (k, 2). The
-    result has no vignetting. See ``ImageFormation.windows`` for ``supersampling`` and
+    results have no vignetting. See ``ImageFormation.windows`` for ``supersampling`` and
     ``sub_pixels``.
     """
     reached = formation.reached(camera, moments, corners, size, sub_pixels)
@@ -98,8 +98,8 @@ def whole_image(
     if sweep is not None:
         groups = [slice(k, k + 1) for k in range(len(corners))]
     for own in groups if len(corners) else []:
-        at = [swept(camera, moment, sweep, corners[own][0, 1], size) for moment in moments]
-        fine = exposed_windows(formation, camera, at, corners[own], size, supersampling)[0]
+        moved = [swept(camera, moment, sweep, corners[own][0, 1], size) for moment in moments]
+        fine = exposed_windows(formation, camera, moved, corners[own], size, supersampling)[0]
         for (x, y), window in zip(corners[own], fine, strict=True):
             image[y : y + size, x : x + size] = window
     if formation.optics.vignetting == 0.0:
@@ -113,9 +113,10 @@ def whole_image(
 def _coarse(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the mean radiance (height, width), drawn with COARSE² samples per pixel.
+    """Return the mean radiance (height, width), drawn with COARSE samples per pixel and axis.
 
-    The second result is a mask of the pixels that are bright at one moment at least.
+    It has no vignetting. The second result is a mask of the pixels that are bright at one moment at
+    least.
     """
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
@@ -139,7 +140,8 @@ def _coarse(
 def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
     """Return the first pixels (k, 2) of the windows around bright spots, and their side in px.
 
-    The side suits the largest spot unless ``fixed_size`` is True.
+    If ``fixed_size`` is True, the side is PASTED_SIZE for spots of all sizes. Otherwise the side
+    suits the largest spot, and spots too large for LARGEST_PASTED_SIZE have no window.
     """
     _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
     keep = np.isfinite(centres[1:]).all(axis=1)

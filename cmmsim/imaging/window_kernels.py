@@ -20,8 +20,8 @@ def boxes_reaching(
 
     ``pixels_from_bodies`` (b, 3, 4) are the projection matrices of the bodies. ``windows`` (n, 4)
     are lowest x, y and highest x, y, px. ``boxes`` (patches, 4, 8) are the corners of each box as
-    columns (x, y, z in m, 1). A box that is partly nearer than ``near`` counts as reaching into all
-    windows, and a box behind the camera into none.
+    columns (x, y, z in m, 1). A box with a depth of less than ``near`` m counts as reaching into
+    all windows, unless it lies wholly behind the camera; then it reaches into none.
     """
     box = np.empty(4)
     point = np.empty(3)
@@ -61,8 +61,8 @@ def boxes_reaching(
 def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array) -> None:
     """Fill windows (n, h, w) float32, 0 to 1, with means of ``supersampling``² drawn pixels.
 
-    ``drawn`` contains the cell of each window, pixels 0 to 255, in reading order with ``columns``
-    cells per row.
+    ``drawn`` contains a cell for each window, with pixels from 0 to 255. The cells are in reading
+    order, with ``columns`` cells per row.
     """
     count, height, width = windows.shape
     share = np.float32(1.0 / (supersampling * supersampling))
@@ -87,9 +87,9 @@ def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array
 
 @compiled
 def keys_weights(share: float) -> tuple:
-    """Return Keys' weights of four pixels in a row, for a place between the second and the third.
+    """Return Keys' weights of four pixels in a row, for a position between the middle two.
 
-    The place lies ``share`` px, 0 to 1, after the second pixel.
+    The position lies ``share`` px after the second pixel. A ``share`` outside of 0 to 1 is clamped.
     """
     s = min(max(share, 0.0), 1.0)
     return (
@@ -104,8 +104,8 @@ def keys_weights(share: float) -> tuple:
 def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
     """Mark in ``plain`` (h, w) the pixels of a drawn window (h, w) that equal all their neighbours.
 
-    The neighbours are the pixels from one before to two after in both directions. ``along`` (h, w)
-    is working memory.
+    The neighbours are the pixels from one before to two after in both directions. At the edges,
+    where some of them are missing, ``plain`` is not filled. ``along`` (h, w) is working memory.
     """
     height, width = drawn.shape
     for y in range(height):
@@ -116,40 +116,44 @@ def mark_plain(drawn: Array, along: Array, plain: Array) -> None:
         above = drawn[y - 1]
         row = drawn[y]
         below = drawn[y + 1]
-        last = drawn[y + 2]
+        second_below = drawn[y + 2]
         for x in range(1, width - 2):
             even = along[y - 1, x] & along[y, x] & along[y + 1, x] & along[y + 2, x]
-            plain[y, x] = even & (above[x] == row[x]) & (row[x] == below[x]) & (row[x] == last[x])
+            plain[y, x] = (
+                even & (above[x] == row[x]) & (row[x] == below[x]) & (row[x] == second_below[x])
+            )
 
 
 @compiled
 def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
     """Fill ``result`` (n, size, size) with windows resampled from drawn windows (n, h, w).
 
-    Each pixel's place in the drawn window is a biquadratic function of its row and column, with
-    ``coefficients`` (n, 3, 3, 2).
+    Each pixel's position (x, y) in the drawn window is a biquadratic function of t and s, with the
+    ``coefficients`` (n, 3, 3, 2) of t^a s^b. The row is expressed by t, which is -1 in the first
+    row and 1 in the last, and the column by s alike. ``size`` must be at least 2. A position too
+    near to the edge of the drawn window, or beyond, is clamped as ``interpolated`` says.
     """
     n, height, width = drawn.shape
     size = result.shape[1]
-    at = np.empty((3, 2))
+    along_row = np.empty((3, 2))
     along = np.empty((height, width), np.bool_)
     plain = np.empty((height, width), np.bool_)
     for k in range(n):
         mark_plain(drawn[k], along, plain)
         for row in range(size):
-            # From -1 to 1 over the window: the nodes of the quadratic are at -1, 0 and 1.
+            # The nodes of the quadratic are at -1, 0 and 1.
             t = 2.0 * row / (size - 1) - 1.0
             for b in range(3):
                 for axis in range(2):
-                    at[b, axis] = (
+                    along_row[b, axis] = (
                         coefficients[k, 0, b, axis]
                         + t * coefficients[k, 1, b, axis]
                         + t * t * coefficients[k, 2, b, axis]
                     )
             for column in range(size):
                 s = 2.0 * column / (size - 1) - 1.0
-                x = at[0, 0] + s * (at[1, 0] + s * at[2, 0])
-                y = at[0, 1] + s * (at[1, 1] + s * at[2, 1])
+                x = along_row[0, 0] + s * (along_row[1, 0] + s * along_row[2, 0])
+                y = along_row[0, 1] + s * (along_row[1, 1] + s * along_row[2, 1])
                 first_x = min(max(int(np.floor(x)), 1), width - 3)
                 first_y = min(max(int(np.floor(y)), 1), height - 3)
                 # The weights add up to one, so equal pixels need no interpolation.
@@ -161,9 +165,10 @@ def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
 
 @compiled
 def interpolated(drawn: Array, x: float, y: float, first_x: int, first_y: int) -> float:
-    """Return the value of a drawn window (h, w) at a place (x, y) between pixels.
+    """Return the value of a drawn window (h, w) at a position (x, y) between pixels.
 
-    In each direction, the pixels from one before (first_x, first_y) to two after it are used.
+    In each direction, four pixels are used, from one before ``first_x`` or ``first_y`` to two after
+    it. A position that is not between the second and the third of them is clamped.
     """
     weights_x = keys_weights(x - first_x)
     weights_y = keys_weights(y - first_y)

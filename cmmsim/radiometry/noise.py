@@ -1,8 +1,9 @@
 """Camera noise after the linear model of EMVA 1288.
 
 Radiance (0 to 1) is converted to electrons. Shot noise, dark noise and the fixed pattern of the
-pixels are added. The gain K converts electrons to grey values, which are clipped and rounded. Shot
-noise is drawn from a normal distribution with the variance of the Poisson distribution.
+pixels are added. The gain K converts electrons to grey values above the black level, which are
+clipped and rounded. Shot noise is drawn from a normal distribution with the variance of the Poisson
+distribution.
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +19,10 @@ BIT_DEPTHS = (8, 10, 12, 14, 16)
 # Number of terms of the series in rounding_excess. Without noise, the series is 1/6, and the terms
 # that are left out add up to 0.002.
 ROUNDING_TERMS = 50
-# Variance, grey values squared, above which rounding_excess differs from 1 by less than 1e-11.
+# Variance, grey values squared, above which rounding_excess is taken as 1; the error is below
+# 1e-11.
 NO_SWING = 1.5
-# Smallest number of exposures whose mean is drawn directly.
+# Smallest number of exposures whose mean is drawn directly. Fewer exposures are drawn one by one.
 MANY_EXPOSURES = 30
 T = TypeVar("T", bound=np.generic)
 Singles = NDArray[np.float32]
@@ -76,6 +78,9 @@ def draw_pattern(
 class CameraNoise:
     """Noise parameters of one camera after EMVA 1288.
 
+    Raises CmmError if electrons, gain or full well are not positive, a noise is negative, the bit
+    depth is unknown, or ``frames`` is below 1.
+
     electrons_at_white  electrons at radiance 1 after one exposure, e-
     gain                system gain K, grey values per e-
     dark_noise          temporal noise in the dark, e- rms
@@ -87,8 +92,8 @@ class CameraNoise:
     dsnu                standard deviation of the pixels' offsets, e-
     frames              number of exposures averaged in each grey value; averaging reduces the
                         temporal noise, but not the fixed pattern
-    inverted            True if stickers are dark; grey values are then subtracted from the largest
-                        one, so that stickers become bright
+    inverted            True if stickers are dark; ``bright`` then subtracts grey values from the
+                        largest one, so that stickers become bright
     """
 
     electrons_at_white: float
@@ -123,14 +128,15 @@ class CameraNoise:
         return np.dtype(np.uint8 if self.bit_depth == 8 else np.uint16)
 
     def mean_grey(self, radiance: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the expected grey values of radiance 0 to 1."""
+        """Return the expected grey values of radiance 0 to 1, before they are clipped to white."""
         electrons = np.minimum(radiance * self.electrons_at_white, self.full_well)
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Return the variance of a grey value with a given mean.
+        """Return the variance of a grey value with a given mean, in images with bright stickers.
 
-        Shot noise, dark noise, fixed pattern and rounding contribute to it.
+        Shot noise, dark noise, fixed pattern and rounding contribute to it, but clipping does not.
+        See ``bright`` for such images.
         """
         if self.inverted:
             mean_grey = self.white_level - mean_grey
@@ -150,21 +156,24 @@ class CameraNoise:
     def rounding_excess(self, mean_grey: Array) -> Array:
         """Return the ratio of the largest to the average variance of grey values near a mean.
 
-        The ratio is 1 if the noise is at least one grey value, and up to 3 with less noise. With
-        little noise, the variance of rounded values depends on the mean. It is largest half-way
-        between two integers, because the noise then decides between rounding up and down.
+        The values are those of a single exposure. The ratio is nearly 1 if the noise is at least
+        one grey value, and up to 3 with less noise. With little noise, the variance of rounded
+        values depends on the mean. It is largest half-way between two integers, because the noise
+        then decides between rounding up and down.
 
         At such a mean, the Fourier series of the rounding error gives the variance of a rounded
-        normal variable: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). The
-        average variance over all means is s² + 1/12. The pixels of a uniform ground all have the
-        same mean, so their variance can differ from this average.
+        normal variable with the variance s²: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1
+        / (pi k)²). The average variance over all means is s² + 1/12. The pixels of a uniform ground
+        all have the same mean, so their variance can differ from this average.
         """
         average = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
         if np.all(average > NO_SWING):
             return np.ones(average.shape)
-        spread = average[..., None] - 1.0 / 12.0
+        unrounded = average[..., None] - 1.0 / 12.0
         k = np.arange(1, ROUNDING_TERMS + 1)
-        swing = np.exp(-2.0 * np.pi**2 * k**2 * spread) * (4.0 * spread + 1.0 / (np.pi * k) ** 2)
+        swing = np.exp(-2.0 * np.pi**2 * k**2 * unrounded) * (
+            4.0 * unrounded + 1.0 / (np.pi * k) ** 2
+        )
         return np.asarray(1.0 + swing.sum(axis=-1) / average)
 
     @property
@@ -190,7 +199,8 @@ class CameraNoise:
     ) -> GreyImage:
         """Return the grey values of one exposure of a radiance image (float32, 0 to 1).
 
-        ``pattern`` is the fixed pattern of the same pixels, or None if they do not differ.
+        ``pattern`` is the fixed pattern of the same pixels, or None if they do not differ. Grey
+        values are not inverted.
         """
         if not self.enabled:
             grey = np.rint(np.clip(self.mean_grey(radiance), 0.0, float(self.white_level)))
@@ -209,7 +219,7 @@ class CameraNoise:
         frames: int,
         pattern: FixedPattern | None = None,
     ) -> Array:
-        """Return the mean grey values (float64) of independent exposures of a scene at rest.
+        """Return the mean grey values (float64) of ``frames`` independent exposures at rest.
 
         The mean is not rounded, even if the noise is turned off: noise dithers the rounding, so the
         mean of many noisy exposures approaches the unrounded mean. The mean of 30 or more exposures

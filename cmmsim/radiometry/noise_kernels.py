@@ -8,10 +8,10 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Normal noise is cut off beyond this number of standard deviations, with a probability of 2e-9.
+# Normal noise is neglected beyond this number of standard deviations. It has a probability of 2e-9.
 REACH = 6.0
-# Above this standard deviation, in grey values, rounding adds 1/12 to the variance and at most 1e-9
-# to the mean.
+# From this standard deviation on, in grey values, rounding is taken to add 1/12 to the variance and
+# nothing to the mean; the mean's error is below 1e-9.
 SMOOTH_DEVIATION = 1.0
 SQRT_HALF = math.sqrt(0.5)
 
@@ -27,10 +27,11 @@ def expose_pixels(
 ) -> None:
     """Fill the grey values (n,) of pixels in one exposure.
 
-    ``radiance`` (n,) is the light on each pixel, and ``normal`` (n,) a standard normal random
-    number per pixel. ``parameters`` (6,) are electrons at white, full well, variance in the dark
-    (e-²), black level, gain, and the largest grey value. ``sensitivity`` and ``offset`` (n,) are
-    empty unless pixels differ. All arrays are float32, except that ``grey`` has the camera's type.
+    ``radiance`` (n,) is the light on each pixel, 0 to 1, and ``normal`` (n,) a standard normal
+    random number per pixel. ``parameters`` (6,) are electrons at white, full well, variance in the
+    dark (e-²), black level, gain, and the largest grey value. ``sensitivity`` and ``offset`` (n,)
+    are those of ``FixedPattern``, or empty if pixels do not differ. All arrays are float32, except
+    that ``grey`` has the camera's type.
     """
     dark, black, gain, white = parameters[2:]
     for k in range(len(radiance)):
@@ -53,7 +54,7 @@ def average_pixels(
     frames: int,
     grey: Array,
 ) -> None:
-    """Fill the mean grey values (n,), float64, of pixels in ``frames`` exposures.
+    """Fill the mean grey values (n,), float64, of pixels in ``frames`` independent exposures.
 
     The means are assumed to be normal. Arguments are those of ``expose_pixels``, with one random
     number per pixel for all exposures together.
@@ -96,9 +97,10 @@ def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[flo
 def moments_above(height: float, deviation: float, most: float) -> tuple[float, float]:
     """Return mean and mean square of the excess of a rounded normal variable over an integer.
 
-    The integer lies ``height`` above the mean of the normal variable. The excess is 0 below the
-    integer, and it is limited to ``most``. Its mean is a sum over the steps from one integer to the
-    next. Each step counts with the probability that the variable lies beyond the step's middle.
+    The integer lies ``height`` above the mean of the normal variable, or below it if ``height`` is
+    negative. The excess is 0 for values below the integer, and it is limited to ``most``. Its mean
+    is a sum over the steps from one integer to the next. Each step counts with the probability that
+    the variable lies beyond the step's middle.
     """
     steps = squares = 0.0
     for step in range(math.ceil(min(most, REACH * deviation - height))):

@@ -1,4 +1,7 @@
-"""Images for the estimator: stereo frames, and interfaces through which windows are read."""
+"""Images for the estimator: stereo frames, and interfaces through which windows are read.
+
+A window is a square part of an image. Its first pixel (x, y) is the one at the top left.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +21,13 @@ if TYPE_CHECKING:
 
 # Largest width of both images together in a notebook.
 SHOWN_WIDTH_PX = 1600
+# Grey values of windows: integers of one exposure, or means of several exposures.
 Windows = GreyImage | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class StereoFrame:
-    """Two grey images of the same size, taken at the same time.
+    """Two grey images, taken at the same time.
 
     Parameters
     ----------
@@ -33,7 +37,7 @@ class StereoFrame:
     Raises
     ------
     ShapeError
-        If an image has another shape or type.
+        If an image is not an array (height, width) of such grey values.
 
     Examples
     --------
@@ -68,7 +72,7 @@ class StereoFrame:
         Returns
         -------
         matplotlib.figure.Figure or None
-            Figure, which can be saved, if there is no display; otherwise None.
+            Figure, which can be saved, if Matplotlib has no window to show it in; otherwise None.
 
         Examples
         --------
@@ -95,7 +99,10 @@ class StereoFrame:
         return None
 
     def _repr_png_(self) -> bytes:
-        """Return both images side by side as a PNG, scaled down to at most SHOWN_WIDTH_PX."""
+        """Return both images side by side as a PNG of at most SHOWN_WIDTH_PX.
+
+        If a grey value exceeds 255, both images are darkened by the same factor.
+        """
         # Imported late, because importing OpenCV takes time.
         import cv2
 
@@ -164,9 +171,9 @@ class FrameImages:
 
 
 def readable(images: StereoImages | StereoFrame) -> StereoImages:
-    """Return images that can be read in parts, made from a StereoFrame if necessary.
+    """Return images whose windows can be read; a StereoFrame is wrapped in FrameImages.
 
-    Raises CmmError if ``images`` is neither a StereoFrame nor images of ``sensor.look``.
+    Raises CmmError if ``images`` is neither a StereoFrame nor a result of ``sensor.look``.
     """
     if isinstance(images, StereoFrame):
         return FrameImages(images)

@@ -1,7 +1,7 @@
 """Compiled kernels that simulate the results of the ellipse fit without rendering images.
 
-They compute the covariance of an ellipse's centre, and random fit results in windows of both
-images.
+They compute the covariance of an ellipse's centre, and draw random results of fits in windows of
+both images.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from cmmsim.geometry.matrix_kernels import factorise, invert_factored
 class CentreNoise(NamedTuple):
     """Table of the inverse covariance of an ellipse's centre.
 
-    table     (a, b, c, 3), entries xx, xy, yy of the inverse covariance, divided by the ellipse's
-              mean half axis m; the axes of the table are m and the ovalness p and q, which
-              ``statistical_tracker`` explains
+    table     (a, b, c, 3), entries xx, xy, yy of the inverse covariance, px^-2, divided by the
+              ellipse's mean half axis m, px; the axes of the table are m and the ovalness p and q,
+              which ``statistical_tracker`` explains
     first     (3,), values of m, p and q at which the axes begin
     steps     (3,), steps of the axes
-    by_light  (3,); at the share ``light`` of full light, the covariance is larger by the factor
+    by_light  (3,); at the fraction ``light`` of full light, the covariance is larger by the factor
               by_light[0] / light² + by_light[1] / light + by_light[2]
     contrast  contrast at full light, grey values
     ring      grey value of the ring at full light, relative to ``black``
@@ -65,16 +65,17 @@ def fit_covariances(
 ) -> None:
     """Fill the covariances (n, m, m) that ``fit_window`` states for the first m parameters.
 
+    The parameters are c_x, c_y, A_xx, A_xy, A_yy, contrast and ground, the grey value of the ring.
     The grey values are those of the model without noise. The n ellipses have centres (n, 2) px
-    relative to windows of ``size`` px, shapes (n, 2, 2) px, movements ``smears`` (n, 2) px during
-    the exposure, and contrasts and grounds (n,), grey values.
+    relative to the first pixels of windows of ``size`` px, shapes (n, 2, 2) px, movements
+    ``smears`` (n, 2) px during the exposure, and contrasts and grounds (n,).
     """
     mask = np.empty((size, size), np.bool_)
     window = np.empty((size, size))
     shares = np.empty((size, size))
     derivatives = np.empty((size, size, 5))
     normal = np.empty((UNKNOWNS, UNKNOWNS))
-    right = np.empty(UNKNOWNS)
+    rhs = np.empty(UNKNOWNS)
     parameters = np.empty(UNKNOWNS)
     for n in range(len(centres)):
         parameters[0] = centres[n, 0]
@@ -85,7 +86,7 @@ def fit_covariances(
             for j in range(size):
                 window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
         accumulate(
-            window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, right
+            window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, rhs
         )
         for k in range(UNKNOWNS):
             normal[k, k] += 1e-9  # as in fit_window
@@ -106,14 +107,14 @@ def lit_covariances(
 ) -> None:
     """Fill the covariances of fits that also estimate the gradient of the light on a sticker.
 
-    The arguments are those of ``fit_covariances``.
+    The arguments are those of ``fit_covariances``. The true gradient is zero.
     """
     mask = np.empty((size, size), np.bool_)
     window = np.empty((size, size))
     shares = np.empty((size, size))
     derivatives = np.empty((size, size, 5))
     normal = np.empty((LIT_UNKNOWNS, LIT_UNKNOWNS))
-    right = np.empty(LIT_UNKNOWNS)
+    rhs = np.empty(LIT_UNKNOWNS)
     parameters = np.zeros(LIT_UNKNOWNS)
     for n in range(len(centres)):
         parameters[:2] = centres[n]
@@ -125,7 +126,7 @@ def lit_covariances(
             for j in range(size):
                 window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
         accumulate_lit(
-            window, mask, shares, derivatives, parameters, centres[n], settings, normal, right
+            window, mask, shares, derivatives, parameters, centres[n], settings, normal, rhs
         )
         factorise(normal)
         invert_factored(normal, covariances[n])
@@ -144,9 +145,10 @@ def tabulated(
 ) -> tuple:
     """Return the covariance xx, xy, yy px² of the centre of an ellipse, from the table.
 
-    xx, xy, yy are the entries of the ellipse's shape, px, and ``light`` is its share of light. The
-    first four parameters are those of ``CentreNoise``. Between entries of the table the
-    interpolation is linear.
+    xx, xy, yy are the entries of the ellipse's shape, px, and ``light`` is the fraction of full
+    light on it. The first four parameters are those of ``CentreNoise``. Between entries of the
+    table the interpolation is linear. Beyond the table, the covariance is that of m, p and q at its
+    edge, but scaled by the true m.
     """
     mean = 0.5 * (xx + yy)
     a = (mean - first[0]) / steps[0]
@@ -158,44 +160,45 @@ def tabulated(
     a = min(max(a - i, 0.0), 1.0)
     b = min(max(b - j, 0.0), 1.0)
     c = min(max(c - k, 0.0), 1.0)
-    found_xx = 0.0
-    found_xy = 0.0
-    found_yy = 0.0
+    inverse_xx = 0.0
+    inverse_xy = 0.0
+    inverse_yy = 0.0
     for up in range(2):
         for across in range(2):
             entries = table[i + up, j + across]
             weight = (a if up else 1.0 - a) * (b if across else 1.0 - b)
             near = weight * (1.0 - c)
             far = weight * c
-            found_xx += near * entries[k, 0] + far * entries[k + 1, 0]
-            found_xy += near * entries[k, 1] + far * entries[k + 1, 1]
-            found_yy += near * entries[k, 2] + far * entries[k + 1, 2]
+            inverse_xx += near * entries[k, 0] + far * entries[k + 1, 0]
+            inverse_xy += near * entries[k, 1] + far * entries[k + 1, 1]
+            inverse_yy += near * entries[k, 2] + far * entries[k + 1, 2]
     scale = by_light[0] / (light * light) + by_light[1] / light + by_light[2]
-    scale /= mean * (found_xx * found_yy - found_xy * found_xy)
-    return scale * found_yy, -scale * found_xy, scale * found_xx
+    scale /= mean * (inverse_xx * inverse_yy - inverse_xy * inverse_xy)
+    return scale * inverse_yy, -scale * inverse_xy, scale * inverse_xx
 
 
 @compiled
 def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
     """Return the covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px.
 
-    It is computed without the table, for the actual position of the centre within its pixel.
+    It is computed without the table, for the actual position of ``centre`` (x, y) within its pixel.
+    ``shape`` is xx, xy, yy, px, and ``light`` the fraction of full light.
     """
     local = np.empty((1, 2))
-    found = np.empty((1, 5, 5))
+    covariances = np.empty((1, 5, 5))
     size = noise.fit_size
-    one = np.empty((1, 2, 2))
-    moved = np.empty((1, 2))
+    shapes = np.empty((1, 2, 2))
+    smears = np.empty((1, 2))
     greys = np.empty((2, 1))
     for i in range(2):
         local[0, i] = centre[i] - np.rint(centre[i] - 0.5 * (size - 1))
-        moved[0, i] = smear[i]
+        smears[0, i] = smear[i]
         for j in range(2):
-            one[0, i, j] = shape[i + j]
+            shapes[0, i, j] = shape[i + j]
     greys[0, 0] = noise.contrast * light
     greys[1, 0] = noise.black + noise.ring * light
-    fit_covariances(local, one, moved, greys[0], greys[1], size, noise.settings, found)
-    return found[0, 0, 0], found[0, 0, 1], found[0, 1, 1]
+    fit_covariances(local, shapes, smears, greys[0], greys[1], size, noise.settings, covariances)
+    return covariances[0, 0, 0], covariances[0, 0, 1], covariances[0, 1, 1]
 
 
 @compiled
@@ -231,11 +234,11 @@ class Ellipses(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Fitted parts of the images, of ``size`` px.
+    """Fitted parts of the images, with sides of ``size`` px.
 
     ``sides`` (k,) is 0 for the left and 1 for the right image. ``stickers`` (k,) are the indices of
     their stickers, and ``corners`` (k, 2) their first pixels. ``found`` (k,) is False for a part
-    without a sticker.
+    without a sticker, whose index is then meaningless.
     """
 
     sides: Array
@@ -261,11 +264,12 @@ class Fits(NamedTuple):
 
 
 class DetectionLimits(NamedTuple):
-    """Limits that an ellipse must keep to be fitted.
+    """Limits of the ellipses that can be fitted.
 
-    radius       smallest half width, px
-    thin_px      half width at which half of the fits fail, because the ellipse is too thin
-    thin_std_px  standard deviation of this half width between fits
+    radius       smallest half axis, px
+    thin_px      smaller half axis, px, at which half of the fits fail, because the ellipse is too
+                 thin
+    thin_std_px  standard deviation of this limit between fits, px
     contrast     smallest contrast, grey values
     """
 
@@ -281,10 +285,11 @@ def nearest_stickers(
 ) -> None:
     """Choose the fitted part of each window, and write it to ``windows``.
 
-    The windows have ``side_px`` px and the first pixels ``corners`` (2, k, 2). A part is centred at
-    the sticker nearest to the middle of its window, but it does not extend beyond the window.
+    The windows have sides of ``side_px`` px and the first pixels ``corners`` (2, k, 2). A part is
+    centred at the sticker nearest to the middle of its window, but it is shifted so that it does
+    not extend beyond the window. The parts of the left image come first.
     """
-    at = 0
+    part = 0
     slack = side_px - windows.size
     middle = 0.5 * (side_px - 1)
     half = 0.5 * (windows.size - 1)
@@ -292,21 +297,21 @@ def nearest_stickers(
         for k in range(corners.shape[1]):
             least = np.inf
             corner = corners[side, k]
-            windows.stickers[at] = 0
+            windows.stickers[part] = 0
             for n in range(seen.shape[1]):
                 x = centres[side, n, 0] - corner[0] - middle
                 y = centres[side, n, 1] - corner[1] - middle
                 # Windows are square, so the larger of both distances counts.
-                gap = max(abs(x), abs(y))
-                if seen[side, n] and gap < least:
-                    least = gap
-                    windows.stickers[at] = n
-            windows.sides[at] = side
-            windows.found[at] = least < np.inf
+                distance = max(abs(x), abs(y))
+                if seen[side, n] and distance < least:
+                    least = distance
+                    windows.stickers[part] = n
+            windows.sides[part] = side
+            windows.found[part] = least < np.inf
             for i in range(2):
-                first = int(np.rint(centres[side, windows.stickers[at], i] - half))
-                windows.corners[at, i] = min(max(first, corner[i]), corner[i] + slack)
-            at += 1
+                first = int(np.rint(centres[side, windows.stickers[part], i] - half))
+                windows.corners[part, i] = min(max(first, corner[i]), corner[i] + slack)
+            part += 1
 
 
 @compiled
@@ -319,8 +324,8 @@ def fit_stickers(
 ) -> None:
     """Draw random results of the fits in windows, and write them to ``fits``.
 
-    ``smallest`` contains the limits for a successful fit. Results that are not good have unit
-    covariances and meaningless values.
+    A fit is successful if the ellipse keeps the limits ``smallest`` and lies wholly inside the
+    fitted part. Results that are not good have unit covariances and meaningless values.
     """
     count = len(windows.stickers)
     size = windows.size

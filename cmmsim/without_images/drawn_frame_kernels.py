@@ -1,7 +1,7 @@
 """Compiled kernels that simulate measured poses frame by frame, without images.
 
-The places of stickers that two cameras find are compared with the places expected at the true pose.
-The differences are due to noise, and to the errors of teaching and of the rig.
+The positions of stickers that two cameras triangulate are compared with the positions expected at
+the true pose. The differences are due to noise, and to the errors of teaching and of the rig.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from cmmsim.measuring.solver_kernels import (
 from cmmsim.without_images.drawn_fit_kernels import CentreNoise, contains, smeared, tabulated
 from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
 
-# A triangulation, which starts at the expected place, ends with a step shorter than this, m.
+# A triangulation, which starts at the expected position, ends with a step shorter than this, m.
 STEP_TOLERANCE = 2e-4
 
 
 class Frame(NamedTuple):
     """Stickers found by two cameras in one frame.
 
-    stickers   mask of the used stickers, and triangulated places
+    stickers   mask of the used stickers, and triangulated points
     pixels     (n, 2, 2), centres in both images
     spreads    (n, 2, 2, 2), covariances of the pixels, px²
     variances  (n,), variance of a pixel coordinate, mean over both images, px²
@@ -56,9 +56,9 @@ class Frame(NamedTuple):
 
 
 class Stickers(NamedTuple):
-    """True and taught places (n, 3) of the platform's stickers, normals (n, 3), and radius, m.
+    """True and taught positions (n, 3) of the platform's stickers, normals (n, 3), and radius, m.
 
-    Places and normals are in the axes of the platform.
+    Positions and normals are in the axes of the platform.
     """
 
     true: Array
@@ -71,9 +71,10 @@ class Limits(NamedTuple):
     """Limits for finding a sticker, and properties of the images.
 
     grazing        smallest cosine between the normal of a sticker and the direction to a camera
-    thin_px        mean of the smallest accepted half width of an ellipse
-    thin_std_px    standard deviation of the smallest accepted half width
-    largest_gap    largest squared distance of the two rays
+                   with which the estimator searches for the sticker
+    thin_px        mean of the smallest accepted half axis of an ellipse
+    thin_std_px    standard deviation of the smallest accepted half axis
+    largest_gap    largest squared distance of the two rays in units of its variance
     clear          radius around a sticker, in its plane, within which no body may hide a point, m
     vignetting     vignetting of the lens
     line_variance  variance of the rays' distance that is due to errors of the rig, px²
@@ -97,7 +98,7 @@ class StereoScene(NamedTuple):
     owners                              (n,), bodies of the stickers, here all 0 for the platform
     solids                              solids that can hide stickers
     noise                               noise of a sticker's centre
-    limits                              limits for finding a sticker
+    limits                              limits for finding a sticker, and vignetting
     solver_limits                       limits of the solver of poses
     base_from_camera, camera_from_base  (4, 4), taught transforms
     """
@@ -126,10 +127,11 @@ def image_stickers(
 ) -> None:
     """Fill the pixels and covariances of stickers in one image, and mark unseen ones as not used.
 
-    ``camera_from_bodies`` (b, 4, 4) belong to all solids, the platform first. If the platform is
-    ``moving``, ``ends`` (2, 4, 4) are its camera_from_body at the beginning and the end of the
-    exposure. ``noise`` (n, 3) are unit normal numbers: two for the centre, and one for the limit of
-    thin ellipses.
+    ``side`` is 0 for the left and 1 for the right image. ``camera_from_bodies`` (b, 4, 4) belong to
+    all solids, the platform first. If the platform is ``moving``, ``ends`` (2, 4, 4) are its
+    camera_from_body at the beginning and the end of the exposure. ``noise`` (n, 3) are standard
+    normal numbers: two for the centre, and one for the limit of thin ellipses. The longest path in
+    ``frame`` is updated.
     """
     count = len(frame.variances)
     used = frame.stickers.used
@@ -150,7 +152,7 @@ def image_stickers(
     point = np.empty(3)
     size = scene.noise.fit_size
     table = scene.noise.table
-    first_node = scene.noise.first
+    first_values = scene.noise.first
     steps = scene.noise.steps
     by_light = scene.noise.by_light
     smear_step = scene.noise.settings.smear_step
@@ -176,8 +178,8 @@ def image_stickers(
                 sign = 1.0 if end else -1.0
                 smear_u += sign * other_u
                 smear_v += sign * other_v
-        length = length_of(smear_u, smear_v)
-        frame.longest[0] = max(frame.longest[0], length)
+        path_length = length_of(smear_u, smear_v)
+        frame.longest[0] = max(frame.longest[0], path_length)
         smallest = 0.5 * (xx + yy) - length_of(0.5 * (xx - yy), xy)
         used[n] = (
             smallest > limits.thin_px + limits.thin_std_px * noise[n, 2]
@@ -187,25 +189,27 @@ def image_stickers(
         if not used[n]:
             continue
         light = light_at(camera, true_cameras.size[side], u, v, limits.vignetting)
-        if length > smear_step:
-            wide, tilt, high = smeared(
+        if path_length > smear_step:
+            var_u, cov_uv, var_v = smeared(
                 scene.noise, (xx, xy, yy), light, (middle_u, middle_v), (smear_u, smear_v)
             )
         else:
-            wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
-        first = math.sqrt(wide)
-        # Cholesky's factor of the covariance transforms the unit noise.
-        across = tilt / first
+            var_u, cov_uv, var_v = tabulated(
+                table, first_values, steps, by_light, xx, xy, yy, light
+            )
+        first = math.sqrt(var_u)
+        # The Cholesky factor of the covariance transforms the unit noise.
+        across = cov_uv / first
         # The estimator corrects for the eccentricity, so the noise is added to the image of the
         # sticker's centre.
         pixels[n, 0] = u + first * noise[n, 0]
-        pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
+        pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(var_v - across * across) * noise[n, 1]
         spread = spreads[n]
-        spread[0, 0] = wide
-        spread[0, 1] = tilt
-        spread[1, 0] = tilt
-        spread[1, 1] = high
-        frame.variances[n] = 0.25 * (wide + high) + (frame.variances[n] if side else 0.0)
+        spread[0, 0] = var_u
+        spread[0, 1] = cov_uv
+        spread[1, 0] = cov_uv
+        spread[1, 1] = var_v
+        frame.variances[n] = 0.25 * (var_u + var_v) + (frame.variances[n] if side else 0.0)
 
 
 @compiled
@@ -216,8 +220,8 @@ def observe(
 
     ``poses`` (6, 6) of the platform are those in the middle, at the beginning and at the end of the
     left camera's exposure, then of the right camera's. ``bodies`` (b, 4, 4) are base_from_body of
-    all solids except the platform. ``noise`` (2, n, 3) are unit normal numbers. ``kept`` (n,) is
-    False for stickers that are omitted at random.
+    all solids except the platform. ``noise`` (2, n, 3) is that of ``image_stickers`` for both
+    images. ``kept`` (n,) is False for stickers that are omitted at random.
     """
     # Both flags begin as results of comparisons, because `image_stickers` would be compiled once
     # more for the constant False.
@@ -247,10 +251,11 @@ def observe(
 
 @compiled
 def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> int:
-    """Triangulate the used stickers, with the platform at camera_from_platform ``place`` (4, 4).
+    """Triangulate the used stickers, and return the number that the estimator would search for.
 
-    Stickers that the estimator would not search for, or would reject, are marked as not used.
-    Return the number of stickers that the estimator would search for.
+    ``place`` is the camera_from_platform (4, 4) at which stickers are expected. Stickers are marked
+    as not used if the estimator would not search for them, if they lie outside an image, or if
+    their rays are too far apart.
     """
     seen = frame.stickers
     expected = np.empty(3)
@@ -299,9 +304,10 @@ def measure_frame(
     scene: StereoScene, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame,
     pose: Array, spread: Array, verdict: Array,
 ) -> None:  # fmt: skip
-    """Fill the measured pose (6,) and its covariance (6, 6), or NaN if the frame is lost.
+    """Fill the measured ``pose`` (6,) and its covariance ``spread`` (6, 6).
 
-    The first parameters are those of ``observe``. ``verdict`` gets the state of the frame.
+    Both are NaN if the frame is lost. The first parameters are those of ``observe``. ``verdict``
+    gets the state of the frame and the other columns of ``solver_kernels``.
     """
     observe(scene, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))

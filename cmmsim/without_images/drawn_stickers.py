@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from cmmsim.without_images.drawn_fit_kernels import Ellipses, Fits, Windows
 
 THIN_PX = 0.885
-"""Half width of an ellipse at which half of the fits end at the smallest allowed ellipse.
+"""Smaller half axis of an ellipse at which half of the fits end at the smallest allowed ellipse.
 
 It was determined from images. The errors of such fits are not of first order.
 """
 THIN_STD_PX = 0.055
 """Standard deviation of this limit between fits, also determined from images."""
-# base_from_body (4, 4) of a body without a place, which lies far below the scene.
+# base_from_body (4, 4) of an absent obstacle, which lies far below the scene.
 ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
 
 
@@ -81,7 +81,7 @@ class StatisticalStereoCamera:
     They correspond to `VirtualStereoCamera`, but draw no images. ``rig`` and ``camera_from_base``
     (4, 4) are the true values. ``exposure`` is the exposure time and ``right_later`` the delay of
     the right camera, s. ``obstacle_names`` are the names of the scene's solids after platform and
-    base. ``print_errors`` has the errors of centres by uneven print and outlines, or None.
+    base. ``print_errors`` has the errors of centres due to uneven print and outlines, or is None.
     """
 
     rig: StereoRig
@@ -103,7 +103,7 @@ class StatisticalStereoCamera:
     ) -> "DrawnStickers":
         """Take one exposure; the parameters are those of ``VirtualStereoCamera.look``.
 
-        The number of averaged exposures is a property of the observer's noise.
+        ``quality`` is ignored, because the observer's noise states how many exposures are averaged.
         """
         rates = None if pose_rate is None else pose_rate[None]
         return DrawnStickers(
@@ -131,7 +131,7 @@ class StatisticalStereoCamera:
     def placed(self, obstacles: Mapping[str, Array]) -> Array:
         """Return base_from_body (b, 4, 4) of the base and of all obstacles.
 
-        Obstacles without a place lie far below.
+        Obstacles that are not named in ``obstacles`` lie far below the scene.
         """
         if isinstance(obstacles, PlacedBodies) and obstacles.names == tuple(self.obstacle_names):
             return np.concatenate((IDENTITY[None], obstacles.together))
@@ -144,7 +144,7 @@ class StatisticalStereoCamera:
     def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
         """Return contrasts (k,) and grounds (k,), in grey values, of stickers in one image.
 
-        The stickers have centres (k, 2), px.
+        A ground is the grey value of the ring. The stickers have centres (k, 2), px.
         """
         lit = self.light.optics.illumination(self.rig.cameras[side], centres)
         grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
@@ -160,7 +160,9 @@ class StatisticalStereoCamera:
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
-        The third result is the mask (m,) of wholly visible stickers.
+        The third result is the mask (m,) of stickers that face the camera and are not hidden. It
+        does not exclude stickers outside the image. The ellipse of a sticker that does not face the
+        camera is meaningless.
         """
         places, normals = self.scene.placed(camera_from_bodies)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
@@ -253,7 +255,10 @@ class DrawnStickers:
         return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
-        """Find in each window the sticker nearest to its middle, see ``StickerExposure``."""
+        """Simulate the fit of the sticker nearest to the middle of each window.
+
+        The parameters are those of ``StickerExposure``.
+        """
         from cmmsim.without_images.drawn_fit_kernels import nearest_stickers
 
         windows = _empty_windows(2 * corners.shape[1], observer)
@@ -264,7 +269,7 @@ class DrawnStickers:
         return self._fitted(windows, observer)
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
-        """Find the ellipses in both whole images, see ``StickerExposure``."""
+        """Simulate the fits of all ellipses in both whole images, see ``StickerExposure``."""
         found = []
         for side, camera in enumerate(self.camera.rig.cameras):
             centres = self._found.centres[side]
@@ -326,7 +331,7 @@ class DrawnStickers:
     def _lit(self, even: "Fits", windows: "Windows", how: "FitSettings") -> "Fits":
         """Return the simulated fits in windows, if light that rises is fitted in each of them.
 
-        ``even`` are the fits without such light.
+        ``even`` are the simulated fits of even light, and ``how`` are the settings of the fit.
         """
         from cmmsim.without_images.drawn_fit_kernels import lit_covariances
 
@@ -354,7 +359,7 @@ class DrawnStickers:
 
 
 def _empty_windows(count: int, observer: Observer) -> "Windows":
-    """Return uninitialised windows."""
+    """Return ``count`` fitted parts of the observer's size, with uninitialised values."""
     # Imported late, because importing numba takes time.
     from cmmsim.without_images.drawn_fit_kernels import Windows
 

@@ -13,17 +13,17 @@ from cmmsim.imaging.layer_kernels import occludes
 
 # Number of points around a sticker that are tested in addition to its middle.
 PROBES = 12
-# A solid that a line of sight meets within the last share TOUCHING of the line's length does not
-# hide the point, because the point lies on the solid's surface.
+# A solid that a line of sight enters within the final fraction TOUCHING of the line's length does
+# not hide the point, because the point lies on the solid's surface.
 TOUCHING = 1e-6
 
 
 class Solids(NamedTuple):
     """Convex solids in their own axes.
 
-    The faces of solid b are the entries ``starts[b]`` to ``starts[b + 1]`` of the outward normals
-    (f, 3) and offsets (f,). The ball with ``radii[b]`` around ``middles[b]`` (3,) contains the
-    solid.
+    The faces of solid b are the slice ``starts[b]:starts[b + 1]`` of the outward normals (f, 3) and
+    offsets (f,): normal . x + offset <= 0 inside. The ball with ``radii[b]`` around ``middles[b]``
+    (3,) contains the solid.
     """
 
     starts: Array
@@ -41,15 +41,15 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
     """
     along = 0.0
     total = 0.0
-    gap = 0.0
+    squared_distance = 0.0
     for i in range(3):
         along += (point[i] - eye[i]) * (middle[i] - eye[i])
         total += (point[i] - eye[i]) ** 2
-    # Position along the segment of the point that is nearest to the middle.
-    share = min(max(along / total, 0.0), 1.0)
+    # Fraction of the segment at the point that is nearest to the middle.
+    fraction = min(max(along / total, 0.0), 1.0)
     for i in range(3):
-        gap += (eye[i] + share * (point[i] - eye[i]) - middle[i]) ** 2
-    return gap < radius * radius
+        squared_distance += (eye[i] + fraction * (point[i] - eye[i]) - middle[i]) ** 2
+    return squared_distance < radius * radius
 
 
 @compiled
@@ -79,16 +79,16 @@ def hidden_stickers(
 
     The surroundings are a disc of radius ``clear`` m around the sticker, in its plane. Its middle
     and PROBES points on its rim are tested. ``camera_from_bodies`` (b, 4, 4) belong to the solids,
-    and places and normals (n, 3) of stickers are in camera axes. A sticker is not hidden by the
-    solid ``owners`` (n,) to which it belongs. Stickers outside of the mask ``asked`` (n,) are not
-    tested and count as not hidden.
+    and positions ``places`` (n, 3) and normals (n, 3) of stickers are in camera axes. The solid
+    ``owners`` (n,) to which a sticker belongs does not hide it. Stickers outside of the mask
+    ``asked`` (n,) are not tested and count as not hidden.
     """
     camera = np.zeros(3)
     eyes = np.empty((len(camera_from_bodies), 3))
     point = np.empty(3)
     probes = np.empty((1, PROBES + 1, 3))
     middles = np.empty((len(camera_from_bodies), 3))
-    reach = np.full(1, clear)
+    radii = np.full(1, clear)
     for b in range(len(camera_from_bodies)):
         to_body(camera_from_bodies[b], camera, eyes[b])
         transform_point(camera_from_bodies[b], solids.middles[b], 1.0, middles[b])
@@ -112,7 +112,7 @@ def hidden_stickers(
             if not occludes(eye, point, faces, offsets, clear, 0.0):
                 continue
             if not probed:
-                probe_discs(places[n : n + 1], normals[n : n + 1], reach, probes)
+                probe_discs(places[n : n + 1], normals[n : n + 1], radii, probes)
                 probed = True
             for k in range(PROBES + 1):
                 to_body(camera_from_bodies[b], probes[0, k], point)

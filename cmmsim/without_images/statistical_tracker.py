@@ -1,7 +1,8 @@
 """Measurement of poses without images, frame by frame or many frames at once.
 
 The results have the same distribution as those from ``DrawnStickers``, but the covariance of a
-centre comes from a table. There is no search: each sticker is found at its true position.
+centre comes from a table, except in fast motion. There is no search: the window of each sticker is
+centred at its ellipse.
 
 The table describes the noise of a sticker's centre as a function of its ellipse. The covariance
 from ``fit_covariances`` belongs to one position of the centre. It is averaged over all positions
@@ -52,13 +53,16 @@ from cmmsim.without_images.verified import require_short
 OVAL = np.linspace(-0.78, 0.78, 14)
 # Number of tabulated mean half axes. The largest is half the side of the fitted part.
 RADII = 8
+# Largest ovalness hypot(p, q) of an ellipse; entries of the table beyond it are those of this
+# limit.
 MOST_OVAL = 0.85
 # Number of positions within a pixel along each axis, without and with a point spread.
 SHARP_PHASES = 5
 BLURRED_PHASES = 2
-# Smallest distance of a tabulated ellipse from the edge of the fitted part, px.
+# Smallest distance of a tabulated ellipse in the middle of the fitted part from the part's edge,
+# px.
 EDGE_PX = 0.2
-# Shares of full light at which the growth of the covariance is computed.
+# Fractions of full light at which the growth of the covariance is computed.
 LIGHTS = np.array([0.4, 0.7, 1.0])
 # Probability that a good sticker is rejected because of its outline in either image.
 OUTLINE_CHANCE = 2 * CHANCE
@@ -72,7 +76,7 @@ BLOCK = 512
 def centre_noise(
     noise: CameraNoise, psf_px: float, fit_size: int, sticker: float, ring: float
 ) -> CentreNoise:
-    """Return the table of the centre's covariance for fits in windows of ``fit_size`` px.
+    """Return the table of the centre's inverse covariance for fits in windows of ``fit_size`` px.
 
     ``sticker`` and ``ring`` are the radiances of stickers and rings, 0 to 1.
     """
@@ -138,7 +142,8 @@ def _shapes(m: Array, p: Array, q: Array, largest: float) -> Array:
 class StatisticalTracker:
     """Tracker with the methods of `Tracker` that measures poses without images.
 
-    It makes no predictions, so a lost platform is found again in the next frame.
+    It makes no predictions, so a lost frame does not affect the next one. Raises CmmError if the
+    estimator does not measure by registration.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -158,7 +163,10 @@ class StatisticalTracker:
         """Do nothing for a missed frame, because this tracker has no memory."""
 
     def measure(self, exposure: StereoImages) -> Measurement:
-        """Measure the pose in one frame from ``sensor.look``; raises CmmError for images."""
+        """Measure the pose in one frame from ``sensor.look``.
+
+        Raises CmmError for images, and for motion blur beyond the verified length.
+        """
         if not isinstance(exposure, DrawnStickers):
             raise CmmError(
                 "a sensor without images measures only results of its own look(); use "
@@ -204,7 +212,8 @@ class StatisticalTracker:
         """Measure the poses in N frames with platform poses ``exposed`` (N, 6, 6).
 
         ``exposed`` comes from ``StatisticalStereoCamera.exposed``. ``bodies`` (b, 4, 4) are
-        base_from_body of the base and the obstacles, which stand still.
+        base_from_body of the base and the obstacles, which stand still. A lost frame has a pose and
+        a covariance of NaN, and 0 stickers. Raises CmmError as ``measure`` does for motion blur.
         """
         count = len(exposed)
         scene = self._scene_of(camera)
@@ -229,9 +238,9 @@ class StatisticalTracker:
         return MeasuredPoses(found, spreads, stickers)
 
     def _scene_of(self, camera: StatisticalStereoCamera) -> StereoScene:
-        """Return the cameras and their scene as the kernels take them.
+        """Return the cameras and their scene in the form for the kernels.
 
-        If only the cameras have changed since the last frame, the scene is reused.
+        If only the cameras have changed since the previous call, the rest is reused.
         """
         if camera is not self._camera:
             if self._camera is None or camera.scene is not self._camera.scene:
@@ -251,17 +260,17 @@ class StatisticalTracker:
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Draw unit normal noise (N, 2, n, 3), and the mask (N, n) of stickers that stay in use.
+        """Draw standard normal noise (N, 2, n, 3), and the mask (N, n) of stickers that are kept.
 
-        Of each three numbers, two are for the centre, and one is for the limit of thin ellipses.
-        Stickers are omitted at random, because the test of outlines rejects a few good ones.
+        The noise is that of ``observe``. Stickers are omitted at random, because the test of
+        outlines rejects a few good ones.
         """
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
 
 def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoScene:
-    """Return the cameras and their scene as the kernels take them."""
+    """Return the cameras and their scene in the form for the kernels."""
     settings = estimator.settings
     taught = estimator.taught
     own = camera.scene.owners == 0
@@ -278,7 +287,7 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
     )
     places = camera.scene.places[own]
     normals = camera.scene.normals[own]
-    # copies, because kernels are compiled once more for arrays that are read-only
+    # a copy, because the kernels would be compiled once more for a read-only array
     taught_places = np.array(taught.platform_places, order="C")
     return StereoScene(
         _cameras(camera.rig, camera.from_base),

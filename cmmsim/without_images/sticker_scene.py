@@ -1,4 +1,4 @@
-"""True places of stickers, errors of their centres by print, and the solids that can hide them."""
+"""True positions of stickers, print errors of their centres, and solids that can hide them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ CLEAR = 1.75
 class StickerScene:
     """Stickers with a common radius, m, and the solids of all bodies.
 
-    Stickers have places (m, 3) and normals (m, 3) in the axes of the bodies ``owners`` (m,), which
-    are 0 or 1. Solids without stickers come last.
+    Stickers have positions ``places`` (m, 3), m, and normals (m, 3) in the axes of the bodies
+    ``owners`` (m,), which are 0 or 1. Solid k belongs to body k; solids without stickers come last.
     """
 
     places: Array
@@ -55,9 +55,9 @@ class StickerScene:
         )
 
     def placed(self, camera_from_bodies: Array) -> tuple[Array, Array]:
-        """Return the places and normals (m, 3) of the stickers in the axes of a camera.
+        """Return the positions and normals (m, 3) of the stickers in the axes of a camera.
 
-        ``camera_from_bodies`` is (b, 4, 4).
+        ``camera_from_bodies`` (b, 4, 4) are the transforms of the bodies.
         """
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.disc_kernels import place_discs
@@ -70,9 +70,10 @@ class StickerScene:
     def hidden(
         self, camera_from_bodies: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return the mask (m,) of stickers that a solid hides wholly or partly.
+        """Return the mask (m,) of stickers that a solid of another body hides.
 
-        Stickers have places and normals (m, 3) in camera axes. Only stickers in the mask ``asked``
+        A sticker is hidden if a part of the disc of CLEAR radii around it is. Stickers have
+        positions ``places`` and normals (m, 3) in camera axes. Only stickers in the mask ``asked``
         (m,) are tested; the others count as not hidden.
         """
         from cmmsim.without_images.hiding_kernels import hidden_stickers
@@ -92,7 +93,7 @@ class StickerScene:
 
     @cached_property
     def occluders(self) -> Solids:
-        """Solids as ``hidden_stickers`` takes them."""
+        """Solids in the form for ``hidden_stickers``."""
         from cmmsim.without_images.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]
@@ -106,6 +107,7 @@ class StickerScene:
         return Solids(starts, normals, offsets, middles, np.array(radii))
 
 
+# Random stream of the constant errors of centres.
 PRINT_STREAM = 2
 
 
@@ -114,7 +116,8 @@ class CentreErrors:
     """Errors of sticker centres due to uneven print and outlines that are not round.
 
     ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
-    ``changing_px`` is the rms of the errors that change from exposure to exposure.
+    ``changing_px`` is the standard deviation, per coordinate, of the errors that change from
+    exposure to exposure.
     """
 
     constant: Array

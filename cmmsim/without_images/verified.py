@@ -16,14 +16,18 @@ if TYPE_CHECKING:
     from cmmsim.without_images.drawn_stickers import Light
 
 NAME = "statistical"
+# Largest verified standard deviation of the point spread, and length of motion blur.
 WIDEST_PSF_PX = 1.0
 LONGEST_STREAK_PX = 4.0
-# Grey values must be this many standard deviations of noise away from black and white.
+# Grey values must be at least this many standard deviations of noise away from black and white.
 CLIPPED = 3.0
 
 
 def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
-    """Raise CmmError, with the key and its limit, for a sensor outside the verified conditions."""
+    """Raise CmmError, with the key and its limit, for a sensor outside the verified conditions.
+
+    If several conditions are not met, only the first one is named.
+    """
     ring, bright = (
         float(noise.mean_grey(np.array(level))) for level in (light.ring, light.sticker)
     )
