@@ -195,10 +195,7 @@ class Optics:
 
     @property
     def margin_px(self) -> int:
-        """Distance, px (an integer), from which the point spread brings light into a window.
-
-        It holds for objects in focus.
-        """
+        """Distance at which the point spread in focus is cut off, px (an integer)."""
         return self.reach_px(self.psf_px)
 
     @staticmethod
@@ -207,10 +204,9 @@ class Optics:
         return ceil(PSF_REACH * psf_px)
 
     def spreads_px(self, focal_px: float, depths: Array) -> Array:
-        """Return the standard deviations (k,) px of the point spread at ``depths`` (k,), m.
+        """Return the standard deviations (k,) px of point spread and defocus at ``depths`` (k,), m.
 
-        The point spread includes defocus. A blur circle of diameter c has the variance c² / 16
-        along each axis.
+        A blur circle of diameter c has the variance c² / 16 along each axis.
         """
         circles = focal_px * self.aperture * np.abs(1.0 / self.focus - 1.0 / depths)
         return np.sqrt(self.psf_px**2 + circles**2 / 16.0)
@@ -233,7 +229,7 @@ class Optics:
     ) -> Array:
         """Return the relative illumination (k, size, size) of windows.
 
-        ``corners`` (k, 2) are the first pixels (x, y), at the top left, of the windows.
+        ``corners`` (k, 2) are the first pixels (x, y) of the windows.
         """
         ticks = np.arange(size)
         x = corners[:, 0, None, None] + ticks

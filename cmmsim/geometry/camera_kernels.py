@@ -34,15 +34,8 @@ def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
     u, v, xx, xy, yy = distort_point(
         x_m / depth, y_m / depth, camera[4], camera[5], camera[6], camera[7], camera[8]
     )
-    focal_ratio = camera[0] / camera[1]
-    return (
-        camera[0] * u + camera[2],
-        camera[1] * v + camera[3],
-        xx,
-        xy * focal_ratio,
-        xy / focal_ratio,
-        yy,
-    )
+    ratio = camera[0] / camera[1]
+    return camera[0] * u + camera[2], camera[1] * v + camera[3], xx, xy * ratio, xy / ratio, yy
 
 
 @compiled
@@ -62,19 +55,13 @@ def faces(point: Array, normal: Array, grazing: float) -> bool:
 
 @compiled
 def length_of(x: float, y: float) -> float:
-    """Return the length of a vector.
-
-    It is faster than ``math.hypot``, because it has no guard against overflow.
-    """
+    """Return the length of a vector, faster than ``math.hypot``, which guards against overflow."""
     return math.sqrt(x * x + y * y)
 
 
 @compiled
 def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) -> float:
-    """Return the relative illumination of pixel (u, v), see ``Optics.illumination``.
-
-    ``size`` is (width, height).
-    """
+    """Return the relative illumination of pixel (u, v) in an image of size (width, height)."""
     if vignetting == 0.0:
         return 1.0
     x = camera[2]

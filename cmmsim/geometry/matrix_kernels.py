@@ -14,7 +14,7 @@ SMALLEST_PIVOT = 1e-300
 
 @compiled
 def factorise(matrix: Array) -> None:
-    """Replace the lower triangle of a symmetric matrix (n,n) by its Cholesky factor."""
+    """Replace the lower triangle of a symmetric matrix (n, n) by its Cholesky factor L."""
     for j in range(len(matrix)):
         for i in range(j, len(matrix)):
             rest = matrix[i, j]
@@ -26,10 +26,7 @@ def factorise(matrix: Array) -> None:
 
 @compiled
 def solve_factored(lower: Array, right: Array) -> None:
-    """Solve L L' x = ``right``, and replace the right-hand side ``right`` (n,) by x.
-
-    L (n, n) is the lower triangle of ``lower``.
-    """
+    """Replace the right-hand side ``right`` (n,) by the solution x of L L' x = ``right``."""
     n = len(right)
     for i in range(n):
         for k in range(i):
@@ -45,7 +42,7 @@ def solve_factored(lower: Array, right: Array) -> None:
 def invert_factored(lower: Array, inverse: Array) -> None:
     """Fill ``inverse`` with the leading (m, m) part of the inverse of L L'.
 
-    L (n, n) is the lower triangle of ``lower``. The inverse is K' K with K = L^-1.
+    The inverse is K' K with K = L^-1.
     """
     n = len(lower)
     m = len(inverse)

@@ -55,10 +55,7 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
 
 
 def require_spread(points: Array) -> None:
-    """Raise LostError for fewer than three points (n, 3), or if all points lie on one line.
-
-    SMALLEST_SPREAD states how near to a line they must not lie.
-    """
+    """Raise LostError for fewer than three points (n, 3), or for points that lie on one line."""
     if len(points) < 3:
         raise LostError(
             f"{len(points)} visible stickers, at least 3 that are not on one line are needed"

@@ -209,10 +209,7 @@ def follow_quarter(
 
 @compiled
 def within(place: float, size: int) -> int:
-    """Return the row or column of a coordinate; -1 before the window, and ``size`` beyond it.
-
-    ``size`` is the number of rows or columns.
-    """
+    """Return the row or column of a coordinate; -1 before the window, and ``size`` beyond it."""
     return math.floor(min(max(place + 0.5, -1.0), float(size)))
 
 

@@ -85,7 +85,7 @@ class StereoRig:
 
     @cached_property
     def kernel_cameras(self) -> Cameras:
-        """Both cameras in the form for compiled functions, for points in the camera frame C."""
+        """Both cameras in the form that kernels take, for points in the camera frame C."""
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.camera_kernels import Cameras
 

@@ -146,10 +146,7 @@ class SeenStickers:
 
     @property
     def rim_growth(self) -> Array:
-        """Growth (k, RIM_POINTS) of outlines by the side of the rim, per radius of thickness.
-
-        It is in radii, along the direction from the centre.
-        """
+        """Growth (k, RIM_POINTS) of outlines by the side of the rim, per radius of thickness."""
         return np.maximum(self.slopes @ CIRCLE, 0.0)
 
 

@@ -88,16 +88,13 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Join arrays (k, 3), and return the joined array and the indices (parts + 1,) of the parts.
-
-    Each part begins at its index and ends before the next one.
-    """
+    """Join arrays (k, 3), and return the joined array and the index at which each part begins."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 
 
 def _faces(faces: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, NDArray[np.int_]]:
-    """Return normals and offsets of the faces of all solids, and indices as ``_joined`` does."""
+    """Return normals and offsets of the faces of all solids, and the first index of each solid."""
     normals, starts = _joined([normal for normal, _ in faces])
     return normals, np.concatenate([np.zeros(0), *(offset for _, offset in faces)]), starts
 

@@ -61,10 +61,7 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Side:
-    """One camera, its windows and what it sees.
-
-    ``bodies`` are camera_from_body (b, 4, 4), and ``corners`` (k, 2) the first pixels of windows.
-    """
+    """Camera with camera_from_body (b, 4, 4) as ``bodies``, and first pixels (k, 2) of windows."""
 
     camera: PinholeCamera
     bodies: Array
@@ -197,7 +194,7 @@ class ImageFormation:
     def _drawn(
         self, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: int, supersampling: int
     ) -> list[NDArray[np.float32]]:
-        """Return windows of one size as the renderer draws them."""
+        """Return windows of one size as the renderer or the painter draws them."""
         views = Views.of_sides(sides, (size, size))
         if self.painter is None:
             images = self.renderer.draw(self.drawable, views, supersampling, self.background)
@@ -208,10 +205,7 @@ class ImageFormation:
     def _formed(
         self, sides: Sequence[Side], size: int, supersampling: int, sub_pixels: int
     ) -> list[NDArray[np.float32]]:
-        """Return windows that are drawn finely, distorted, blurred, and averaged over pixels.
-
-        The parameters are those of ``windows``.
-        """
+        """Return windows that are drawn finely, distorted, blurred, and averaged over pixels."""
         margin = max(self._margin_px(side.camera) for side in sides)
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
@@ -252,10 +246,7 @@ class ImageFormation:
         return windows
 
     def _spreads_px(self, side: Side, pixels: Array) -> Array:
-        """Return the standard deviations (k,) px of the point spread of windows with defocus.
-
-        They belong to the depths of the stickers that are nearest to ``pixels`` (k, 2).
-        """
+        """Return standard deviations (k,) px of blur at the stickers nearest to pixels (k, 2)."""
         moves = side.bodies[self._sticker_bodies]
         points = np.einsum("nij,nj->ni", moves[:, :3, :3], self._sticker_places) + moves[:, :3, 3]
         shown = side.camera.project(points)[0]

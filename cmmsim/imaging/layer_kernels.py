@@ -31,7 +31,7 @@ class Discs(NamedTuple):
     """Discs in the order in which they are drawn.
 
     Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``levels``
-    (m,) are their radiances. ``behind`` (m, slots) is True if a disc lies behind the solid with a
+    (m,) are their radiances. ``behind`` (m, slots) is True if a disc lies behind the solid of a
     slot.
     """
 

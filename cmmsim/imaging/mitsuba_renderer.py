@@ -95,10 +95,7 @@ def _mitsuba() -> Any:
 def _sensor(
     mi: Any, camera: PinholeCamera, corner: Array, size: tuple[int, int], supersampling: int
 ) -> Any:
-    """Return Mitsuba's camera for a window with first pixel ``corner`` (2,).
-
-    Raises CmmError if pixels are not square.
-    """
+    """Return Mitsuba's camera for a window with first pixel ``corner`` (2,)."""
     focal = camera.focal_lengths
     if abs(focal[0] / focal[1] - 1.0) > 1e-9:
         raise CmmError(

@@ -41,7 +41,7 @@ class Painted(NamedTuple):
 
 @compiled
 def print_at(prints: Array, u: float, v: float) -> float:
-    """Return the relative brightness at (u, v), beyond the rim that at the nearest rim point."""
+    """Return the relative brightness at (u, v), or at the nearest point of the unit disc."""
     size = math.sqrt(u * u + v * v)
     if size > 1.0:
         u /= size

@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     from cmmsim.imaging.paint_kernels import Painted
 
 # rad: largest angle between the line of sight and an object of the background, in each of two
-# perpendicular directions.
+# perpendicular directions, and the range of the objects' angular radii.
 CLUTTERED = 0.5
-# rad: range of the angular radii of these objects.
 SMALLEST_OBJECT = 4e-4
 LARGEST_OBJECT = 8e-3
 
@@ -183,10 +182,7 @@ def painter_of(
     marked: Sequence[MarkedBody],
     drawable: Drawable,
 ) -> StickerPainter | None:
-    """Return the painter of a sensor file's light and print, or None if it has nothing to paint.
-
-    That is so with a perfect print, even light, and no far objects.
-    """
+    """Return the painter of a sensor file's light and print, or None if nothing is to be painted."""
     light = file.light
     plain = file.print.is_perfect and not light.lamps and light.fall_off == 0.0
     if plain and light.clutter == 0:
@@ -241,11 +237,7 @@ def _paint(file: SensorFile, bodies: Sequence[SceneBody], marked: Sequence[Marke
 
 
 def _objects(file: SensorFile) -> Array:
-    """Return the bright objects (o, 5) of the background, far away around the line of sight.
-
-    Each has a direction in the base frame, an angular radius, rad, and a level above the
-    background.
-    """
+    """Return the objects (o, 5) of ``scatter_objects``, at random around the line of sight."""
     light = file.light
     rng = np.random.default_rng(light.clutter_seed)
     sight = np.subtract(file.rig.target, file.rig.position)

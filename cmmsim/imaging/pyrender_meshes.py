@@ -25,7 +25,6 @@ from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, Exposure, Views
 from cmmsim.imaging.scene_bodies import ConvexSolid, Disc, DiscStack, Mesh
 
-# Width of a soft rim, in samples.
 RIM_SAMPLES = 1.8
 # Largest distance between a side of the polygon and the rim, in samples.
 LARGEST_SAG = 0.08
@@ -118,22 +117,16 @@ def _sides(radius: float, sample: float) -> int:
 
 
 def _corners(disc: Disc, radius: float, sides: int) -> Array:
-    """Return corners (sides, 3) of a polygon in a disc's plane, around the disc's centre.
-
-    It has the area of a circle of the given radius.
-    """
+    """Return corners (sides, 3) of a polygon in a disc's plane that has the area of a circle."""
     u, v = np.linalg.svd(disc.normal[None])[2][1:]
     angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
-    # Polygon and circle then have the same total light.
+    # With the same area, polygon and circle have the same total light.
     fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
     return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
 
 
 def _band_triangles(sides: int) -> NDArray[np.int_]:
-    """Return triangles (2 sides, 3) between an inner and an outer polygon of ``sides`` corners.
-
-    The indices of the inner corners come first.
-    """
+    """Return triangles (2 sides, 3) between an inner and an outer polygon of ``sides`` corners."""
     here = np.arange(sides)
     there = np.roll(np.arange(sides), -1)
     return np.concatenate(
@@ -264,10 +257,7 @@ class PaintedSolids:
         return laid
 
     def carrier(self, stack: int) -> int | None:
-        """Return the index of the solid on which a stack of several discs lies, or None.
-
-        The result is also None for a stack of one disc.
-        """
+        """Return the index of the solid on which a stack of two or more discs lies, or None."""
         return next(
             (k for k in self._solids if self._ring_reach[stack] > 0.0 and self._lying[k][stack]),
             None,
@@ -330,10 +320,7 @@ def _is_plain_convex(mesh: Mesh) -> bool:
 
 
 def _lies_over(stack: DiscStack, vertices: Array) -> bool:
-    """Tell whether the discs are parallel, in rising order, and all above the vertices (n, 3).
-
-    Each must be more than CLEARANCE above what lies below it.
-    """
+    """Tell whether the discs are parallel, in rising order, and all above the vertices (n, 3)."""
     normal = stack.discs[0].normal
     heights = np.array([disc.centre @ normal for disc in stack.discs])
     parallel = all(np.allclose(disc.normal, normal, rtol=0.0, atol=1e-9) for disc in stack.discs)

@@ -86,10 +86,7 @@ def opengl_context() -> Any:
 
 @lru_cache(maxsize=1)
 def _shared_atlas() -> "_Atlas":
-    """Return the only atlas of this process; a second one would leak memory.
-
-    Without a display, PyOpenGL is told to use EGL. Raises OpenGLMissingError.
-    """
+    """Return the only atlas of this process. A second one would leak memory."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
@@ -243,10 +240,7 @@ class _Atlas:
     def _clear(
         self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
-        """Clear each cell to its level in ``grounds``, and the depth buffer if ``with_depth``.
-
-        ``places`` are the viewports (x, y, w, h) of the cells.
-        """
+        """Clear cells (x, y, w, h) to their ``grounds``, and the depth buffer if ``with_depth``."""
         gl = self._gl
         level = float(grounds[0])
         gl.glClearColor(level, level, level, 1.0)

@@ -23,7 +23,7 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene_bodies import Patch
 
-# m: bodies nearer or farther than these planes are not drawn.
+# m: what is nearer or farther than these planes need not be drawn.
 NEAR = 0.2
 FAR = 10.0
 

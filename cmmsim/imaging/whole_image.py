@@ -21,7 +21,7 @@ from cmmsim.imaging.row_sweep import swept
 PASTED_SIZE = 24
 # px: largest side of a finely drawn window; larger spots are drawn coarsely.
 LARGEST_PASTED_SIZE = 96
-# px: width of the finely drawn margin around a spot that is too large for PASTED_SIZE.
+# px: smallest finely drawn margin around a spot, unless the size is fixed.
 DARK_RIM = 8
 # Radiance above which a spot is drawn finely.
 BRIGHT = 0.4

@@ -78,8 +78,7 @@ def draw_pattern(
 class CameraNoise:
     """Noise parameters of one camera after EMVA 1288.
 
-    Raises CmmError if electrons, gain or full well are not positive, a noise is negative, the bit
-    depth is unknown, or ``frames`` is below 1.
+    Raises CmmError for parameters that are out of range.
 
     electrons_at_white  electrons at radiance 1 after one exposure, e-
     gain                system gain K, grey values per e-

@@ -217,7 +217,7 @@ class Ellipses(NamedTuple):
     centres    (2, m, 2), px
     shapes     (2, m, 2, 2), px
     smears     (2, m, 2), movements during the exposure, px
-    seen       (2, m), True for wholly visible ellipses
+    seen       (2, m), True for stickers that face the camera and are not hidden
     noise      (2, m, 6), standard normal numbers: two for the centre, three for the shape, and one
                for the limit of thin ellipses
     contrasts  (2, m), grey values

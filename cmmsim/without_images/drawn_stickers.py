@@ -255,10 +255,7 @@ class DrawnStickers:
         return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
-        """Simulate the fit of the sticker nearest to the middle of each window.
-
-        The parameters are those of ``StickerExposure``.
-        """
+        """Simulate the fit of the sticker nearest to each window's middle (``StickerExposure``)."""
         from cmmsim.without_images.drawn_fit_kernels import nearest_stickers
 
         windows = _empty_windows(2 * corners.shape[1], observer)

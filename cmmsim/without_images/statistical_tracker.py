@@ -53,14 +53,12 @@ from cmmsim.without_images.verified import require_short
 OVAL = np.linspace(-0.78, 0.78, 14)
 # Number of tabulated mean half axes. The largest is half the side of the fitted part.
 RADII = 8
-# Largest ovalness hypot(p, q) of an ellipse; entries of the table beyond it are those of this
-# limit.
+# Largest ovalness hypot(p, q) of an ellipse; entries of the table beyond have this ovalness.
 MOST_OVAL = 0.85
 # Number of positions within a pixel along each axis, without and with a point spread.
 SHARP_PHASES = 5
 BLURRED_PHASES = 2
-# Smallest distance of a tabulated ellipse in the middle of the fitted part from the part's edge,
-# px.
+# px: smallest distance of a tabulated ellipse from the edge of the fitted part, if it is centred.
 EDGE_PX = 0.2
 # Fractions of full light at which the growth of the covariance is computed.
 LIGHTS = np.array([0.4, 0.7, 1.0])
@@ -238,7 +236,7 @@ class StatisticalTracker:
         return MeasuredPoses(found, spreads, stickers)
 
     def _scene_of(self, camera: StatisticalStereoCamera) -> StereoScene:
-        """Return the cameras and their scene in the form for the kernels.
+        """Return the cameras and their scene in the form that the kernels take.
 
         If only the cameras have changed since the previous call, the rest is reused.
         """
@@ -270,7 +268,7 @@ class StatisticalTracker:
 
 
 def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoScene:
-    """Return the cameras and their scene in the form for the kernels."""
+    """Return the cameras and their scene in the form that the kernels take."""
     settings = estimator.settings
     taught = estimator.taught
     own = camera.scene.owners == 0

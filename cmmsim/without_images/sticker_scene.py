@@ -57,7 +57,7 @@ class StickerScene:
     def placed(self, camera_from_bodies: Array) -> tuple[Array, Array]:
         """Return the positions and normals (m, 3) of the stickers in the axes of a camera.
 
-        ``camera_from_bodies`` (b, 4, 4) are the transforms of the bodies.
+        ``camera_from_bodies`` is (b, 4, 4).
         """
         # Imported late, because importing numba takes time.
         from cmmsim.geometry.disc_kernels import place_discs
@@ -93,7 +93,7 @@ class StickerScene:
 
     @cached_property
     def occluders(self) -> Solids:
-        """Solids in the form for ``hidden_stickers``."""
+        """Solids in the form that ``hidden_stickers`` takes."""
         from cmmsim.without_images.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]
