@@ -48,15 +48,15 @@ def fit_plane(
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
         raise LostError(
-            f"plane {name}: {count} visible stickers, at least {FEWEST_STICKERS} needed"
+            f"plane {name}: {count} visible stickers, but at least {FEWEST_STICKERS} are needed"
         )
     middle = points.mean(axis=-2)
     arms = points - middle[..., None, :]
-    _, spread, axes = np.linalg.svd(arms)
-    if (width := float(spread[..., 1].min())) < SMALLEST_SPREAD:
+    _, widths, axes = np.linalg.svd(arms)
+    if (width := float(widths[..., 1].min())) < SMALLEST_SPREAD:
         raise LostError(
-            f"plane {name}: its {count} visible stickers lie on one line to {width * 1e3:.1f} mm, "
-            f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+            f"plane {name}: its {count} visible stickers lie on one line to within "
+            f"{width * 1e3:.1f} mm, but at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
     normal = axes[..., 2, :]
     normal = normal * np.where(_dot(normal, rough_normals) > 0.0, 1.0, -1.0)[..., None]
@@ -79,8 +79,8 @@ def fit_plane(
     # the fit has the parameters [tilts, shift], and the offset is shift + n . middle
     to_offset = np.zeros((*shift.shape, 3, 3)) + np.eye(3)
     to_offset[..., 2, :2] = (middle[..., None, :] @ tangents)[..., 0, :]
-    spread = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
-    return FittedPlane(normal, shift + _dot(normal, middle), tangents, spread)
+    covariance = to_offset @ covariance @ to_offset.swapaxes(-1, -2)
+    return FittedPlane(normal, shift + _dot(normal, middle), tangents, covariance)
 
 
 def frame_from_planes(normals: Array, offsets: Array) -> Array:

@@ -58,13 +58,13 @@ def require_spread(points: Array) -> None:
     """Raise LostError for fewer than three points (n, 3), or for points that lie on one line."""
     if len(points) < 3:
         raise LostError(
-            f"{len(points)} visible stickers, at least 3 that are not on one line are needed"
+            f"{len(points)} visible stickers, but at least 3 that are not on one line are needed"
         )
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
-    if spread < SMALLEST_SPREAD:
+    width = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
+    if width < SMALLEST_SPREAD:
         raise LostError(
-            f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, at "
-            f"least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+            f"the {len(points)} visible stickers lie on one line to within {width * 1e3:.1f} mm, "
+            f"but at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
         )
 
 

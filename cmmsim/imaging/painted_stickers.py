@@ -182,7 +182,7 @@ def painter_of(
     marked: Sequence[MarkedBody],
     drawable: Drawable,
 ) -> StickerPainter | None:
-    """Return the painter of a sensor file's light and print, or None if nothing is to be painted."""
+    """Return the painter of a sensor file's light and print, or None if both are plain."""
     light = file.light
     plain = file.print.is_perfect and not light.lamps and light.fall_off == 0.0
     if plain and light.clutter == 0:

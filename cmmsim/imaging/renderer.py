@@ -265,7 +265,10 @@ def choose_renderer(name: str) -> Renderer:
             require_opengl()
         except OpenGLMissingError as error:
             reason = " ".join(str(error.__cause__ or error).split())
-            text = f"images are drawn by the analytic renderer, pyrender found no OpenGL: {reason}"
+            text = (
+                "images are drawn by the analytic renderer, because pyrender found no OpenGL: "
+                f"{reason}"
+            )
             # With line 0, Python cannot add a source line, so the warning is one line.
             warnings.warn_explicit(text, UserWarning, __name__, 0, registry=_WARNED)
             return _renderer("analytic")

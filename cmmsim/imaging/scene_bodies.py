@@ -308,7 +308,7 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
         corners = HalfspaceIntersection(half_spaces, inside).intersections
         if not np.isfinite(corners).all():
             raise SensorFileError(
-                f"{body.name}: its planes and cuts enclose no solid, one side is open"
+                f"{body.name}: its planes and cuts enclose no solid, because one side is open"
             )
         return trimesh.convex.convex_hull(corners)
     except QhullError as error:

@@ -49,7 +49,7 @@ def sub_frame_poses(
     ):
         raise CmmError(
             f"a sticker moves {far:.0f} px during the exposure of {exposure:g} s at pose rate "
-            f"{rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
+            f"{rate.tolist()}, but at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
         )
     fractions = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
     return [

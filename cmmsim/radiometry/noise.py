@@ -109,7 +109,10 @@ class CameraNoise:
 
     def __post_init__(self) -> None:
         if min(self.electrons_at_white, self.gain, self.full_well) <= 0.0 or self.dark_noise < 0.0:
-            raise CmmError(f"camera noise needs positive electrons, gain and full well, got {self}")
+            raise CmmError(
+                "camera noise needs positive electrons, gain and full well, and dark_noise >= 0, "
+                f"got {self}"
+            )
         if min(self.prnu, self.dsnu) < 0.0 or self.bit_depth not in BIT_DEPTHS or self.frames < 1:
             raise CmmError(
                 f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= "

@@ -66,7 +66,7 @@ def refuse_images(*_: object, **__: object) -> NoReturn:
     """Raise CmmError, with the names of the renderers that draw images."""
     drawing = ", ".join(name for name in RENDERERS if name != NAME)
     raise CmmError(
-        f"renderer {NAME!r} draws no images, it only simulates the results of detection; {drawing} "
+        f"renderer {NAME!r} draws no images but only simulates the results of detection; {drawing} "
         "draw images"
     )
 

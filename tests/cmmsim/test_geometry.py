@@ -251,7 +251,7 @@ def test_several_sets_of_points_are_fitted_as_each_alone():
     [
         (
             lambda: fit_plane(LINE[:2], EACH[:2], UP, "B"),
-            "plane B: 2 visible stickers, at least 3 needed",
+            "plane B: 2 visible stickers, but at least 3 are needed",
         ),
         (lambda: fit_plane(LINE, EACH, UP, "B"), "plane B: its 5 visible stickers lie on one line"),
         (lambda: register(LINE[:2], LINE[:2], EACH[:2]), "2 visible stickers"),

@@ -201,7 +201,8 @@ def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_l
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("warning")]
     assert lines == [
-        "warning: images are drawn by the analytic renderer, pyrender found no OpenGL: no EGL here"
+        "warning: images are drawn by the analytic renderer, because pyrender found no OpenGL: "
+        "no EGL here"
     ]
     assert load_scenario(str(out / "scenario.toml")).renderer == "analytic"
 
