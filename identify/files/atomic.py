@@ -27,9 +27,10 @@ TEMPORARY = ".cmmsim-"  # prefix of the names of files and folders that are bein
 
 @contextmanager
 def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
-    """Convert an exception in a block that writes a file into a WriteError with one line.
+    """Convert an OSError or ValueError in the block into a WriteError with a one-line message.
 
-    ``size`` is the number of bytes of the file, if known.
+    ``size`` is the number of bytes of the file, if known. The message then names it and the free
+    space.
     """
     try:
         yield
@@ -40,9 +41,9 @@ def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
     else:
         return
     needed = "" if size is None else _needed(Path(path), size)
-    # A message names a file in `atomic_contents` by its final place.
-    place = Path(*(part for part in Path(path).parts if not part.startswith(TEMPORARY)))
-    raise WriteError(f"cannot write {place}: {reason}{needed}; name another place")
+    # A message names a file in `atomic_contents` by its final path.
+    final = Path(*(part for part in Path(path).parts if not part.startswith(TEMPORARY)))
+    raise WriteError(f"cannot write {final}: {reason}{needed}; name another place")
 
 
 def write_bytes(path: Path | str, content: bytes, *, parents: bool = False) -> None:
@@ -70,7 +71,7 @@ def figure_bytes(figure: "Figure", suffix: str, dpi: int = 150) -> bytes:
     import matplotlib as mpl
 
     stream = io.BytesIO()
-    # Hinting widens letters by an amount that depends on dpi, and text leaves the figure.
+    # Hinting widens letters by an amount that depends on dpi, so that text would leave the figure.
     with mpl.rc_context({"text.hinting": "none"}):
         figure.savefig(stream, format=suffix.removeprefix("."), dpi=dpi)
     return stream.getvalue()
@@ -85,10 +86,13 @@ def write_files(
 ) -> None:
     """Write several files: all of them, or none.
 
-    ``parents`` is as in `write_bytes`. ``check`` is called with the temporary path of the first
-    file before any file is in place, and can refuse the files by an exception.
+    Files are renamed once all of them are on the disk. If a rename fails, which is rare, new files
+    are removed, but files that have already replaced older ones stay.
 
-    Raises WriteError.
+    ``parents`` is as in `write_bytes`. ``check`` is called with the temporary path of the first
+    file before any file is renamed, and can refuse the files by an exception.
+
+    Raises WriteError as `write_bytes` does, and the exceptions of ``check``.
     """
     mark = token_hex(4)  # the same for all files, so that `check` can find the other files
     folders: list[Path] = []
@@ -132,7 +136,10 @@ def check_writable(path: Path | str) -> None:
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder and its parents. Return the folders that were missing, the outermost first."""
+    """Make a folder and its parents. Return the folders that were missing, the outermost first.
+
+    Raises OSError if the folder cannot be made. New parents are then removed.
+    """
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,7 +157,10 @@ def remove_empty_folders(folders: list[Path]) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove incomplete files of a killed process from a folder and its subfolders."""
+    """Remove temporary files and folders of a killed process from a folder and its subfolders.
+
+    Folders within subfolders are not searched.
+    """
     for path in (*folder.glob(f"{TEMPORARY}*"), *folder.glob(f"*/{TEMPORARY}*")):
         with suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -161,9 +171,10 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder, whose contents are moved into ``folder`` after the block.
 
     The temporary folder is within ``folder``, which is never replaced and can thus be the current
-    directory. After an exception, ``folder`` is unchanged.
+    directory. It must not contain entries with the names of the new contents, because they would be
+    replaced. After an exception, the new contents are removed.
 
-    Raises WriteError.
+    Raises WriteError for an OSError or ValueError, also for one in the block.
     """
     folders: list[Path] = []
     moved: list[Path] = []
@@ -190,7 +201,7 @@ def _write_beside(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError:
-        # Removed first, so that the message counts the space of the incomplete file as free.
+        # The incomplete file is removed first, so that the message counts its space as free.
         with suppress(OSError):
             path.unlink(missing_ok=True)
         raise

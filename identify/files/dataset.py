@@ -1,7 +1,7 @@
-"""Described xarray datasets over time, with checked dimensions, units and names, in netCDF groups.
+"""Datasets of described variables over time, and covariances, in groups of netCDF files.
 
-Files are written completely or not at all. `covariance.nc` has the covariance of the estimated
-parameters, in SI units.
+Files are written completely or not at all. Dimensions, shapes and names are checked. The file
+`covariance.nc` has the covariance of the estimated parameters, in SI units.
 """
 
 import io
@@ -23,17 +23,14 @@ from identify.files.untrusted import ENGINE, Content, load, load_in_process
 
 
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
-    """Write datasets as groups of one file (see `netcdf`), completely or not at all.
-
-    Raises WriteError.
-    """
+    """Write datasets as groups of one file (see `netcdf`), or raise WriteError."""
     write_bytes(path, netcdf(groups))
 
 
 def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
     """Return the bytes of a file with datasets by the names of their groups.
 
-    The name ``""`` is the main group. Groups are written one by one, because an `xarray.DataTree`
+    The name ``""`` is the root group. Groups are written one by one, because an `xarray.DataTree`
     would give the group of a truth the coordinates of its record.
     """
     stream = io.BytesIO()
@@ -47,10 +44,11 @@ def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
 
 
 def read_group(path: Path | str, group: str = "") -> xr.Dataset:
-    """Read one group into memory.
+    """Read one group into memory. The name ``""`` is the root group.
 
     Raises RecordError if there is no such file or group, or if the file is damaged. A file without
-    a digest must also be readable within the limits of `identify.files.untrusted`.
+    a digest must also be readable within the limits of `identify.files.untrusted` and
+    `identify.files.limited_process`.
     """
     names, dataset = _read(path, group)
     if dataset is None:
@@ -59,9 +57,9 @@ def read_group(path: Path | str, group: str = "") -> xr.Dataset:
 
 
 def group_names(path: Path | str) -> list[str]:
-    """Return the sorted names of all groups, nested ones as ``run01/truth``.
+    """Return the sorted names of all groups except the root, nested ones as ``run01/truth``.
 
-    Raises the same exceptions as `read_group`.
+    Raises RecordError as `read_group` does.
     """
     return _read(path, None)[0]
 
@@ -73,7 +71,7 @@ def _read(path: Path | str, group: str | None) -> Content:
         content = Path(path).read_bytes()
     except OSError as error:
         raise RecordError(f"cannot read {path}: {error.strerror or error}") from None
-    # A file with the right digest was written by this program, and is safe to read.
+    # A file with the right digest is as this program wrote it, unless somebody forged the digest.
     if has_digest(path, content):
         return load(content, group)
     try:
@@ -83,12 +81,12 @@ def _read(path: Path | str, group: str | None) -> Content:
 
 
 def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
-    numbers = [name for name, variable in dataset.variables.items() if variable.dtype.kind in "fiu"]
+    numeric = [name for name, variable in dataset.variables.items() if variable.dtype.kind in "fiu"]
     compressed = {
-        str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1
+        str(name): {"zlib": True, "complevel": 4} for name in numeric if dataset[name].ndim > 1
     }
     # xarray would add a fill value of its own.
-    plain = {str(name): {"_FillValue": None} for name in numbers}
+    plain = {str(name): {"_FillValue": None} for name in numeric}
     return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
 
 
@@ -121,7 +119,7 @@ SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 
 
 def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
-    """Return the variables with the joint units of sliding or of turning actuators."""
+    """Return the variables with the joint units of sliding (``prismatic``) or turning actuators."""
     if not prismatic:
         return variables
     return {
@@ -131,15 +129,15 @@ def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
 
 
 def joint_numbers(values: ArrayLike) -> list[int]:
-    """Return the labels of the joints, from 1 on, for values whose last axis is the joint."""
+    """Return joint numbers from 1 on for values (..., N joints), none for fewer than two axes."""
     shape = np.shape(values)
     return list(range(1, (shape[-1] if len(shape) > 1 else 0) + 1))
 
 
 def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) -> dict[str, Array]:
-    """Return position and orientation (N, 3) of poses (N, 6), by the names of both.
+    """Return positions and orientations, each (N, 3), of poses (N, 6) under the two given names.
 
-    Raises RecordError for another shape.
+    Raises RecordError for another shape. The message calls the poses ``name``.
     """
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != 6:
@@ -176,9 +174,10 @@ def described_dataset(
 
 
 def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None:
-    """Raise RecordError if a dataset lacks a variable, or has it with other dimensions.
+    """Raise RecordError if a dataset lacks a variable, or has it with another shape.
 
-    The message names the variable.
+    RecordError is also raised for a time dimension without times. The message names the variable
+    and ``source``, the origin of the dataset.
     """
     missing = [name for name in variables if name not in data]
     if missing:
@@ -196,9 +195,9 @@ def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None
 
 
 def check_finite(values: Array, name: str, source: str) -> None:
-    """Raise RecordError if values are not finite.
+    """Raise RecordError if any of the values is not finite.
 
-    The message names the variable and the number of wrong values.
+    The message names the variable and the number of such values.
     """
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
@@ -223,7 +222,7 @@ def plain(value: object) -> object:
 
 
 def as_number(value: object) -> float:
-    """Return an attribute's value as a number; NaN for a boolean or anything else."""
+    """Return an attribute's value as a float. A boolean, or anything but a number, gives NaN."""
     return (
         float(value)
         if isinstance(value, int | float | np.number) and not isinstance(value, bool)
@@ -234,13 +233,17 @@ def as_number(value: object) -> float:
 VARIABLE = "covariance"
 PARTS = "source_covariance"
 SOURCE = "source"
-# Largest difference of a covariance and the sum of its parts, in standard deviations.
+# An entry of a covariance and the sum of its parts differ by less than this fraction of the product
+# of the two standard deviations.
 SUM_TOLERANCE = 1e-9
 DIMENSIONS = ("parameter", "parameter_2")
 
 
 def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict[str, str]:
-    """Return the units of a robot's parameters, and of others, whose names end with their units."""
+    """Return the units of a robot's parameters and of other quantities.
+
+    The names of ``others`` end with ``_`` and the unit. A name without ``_`` has the unit ``1``.
+    """
     units = {name: layout.unit(name) for name in layout.names}
     return units | {name: name.rpartition("_")[2] if "_" in name else "1" for name in others}
 
@@ -250,8 +253,8 @@ def covariance_netcdf(
 ) -> bytes:
     """Return the bytes of a file with a covariance (p, p) of quantities.
 
-    `units` are the units of the quantities by their names. `sources` are the parts of the
-    covariance (p, p) by the sources of the uncertainty.
+    `units` are the units of the quantities by their names. `sources` are the parts (p, p) of the
+    covariance by the names of the sources of uncertainty.
     """
     labels: dict[str, list[str]] = {name: list(units) for name in DIMENSIONS}
     described = {
@@ -268,9 +271,10 @@ def covariance_netcdf(
 
 
 def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
-    """Read the parts of a covariance (p, p) by the sources of the uncertainty.
+    """Read the parts (p, p) of a covariance (p, p) by the names of the sources of uncertainty.
 
-    Raises RecordError if the file has none, or if their sum is not the covariance.
+    Raises RecordError if the file is damaged or has no such parts, or if the sum of the parts is
+    not the given covariance.
     """
     data = read_group(path)
     if PARTS not in data or data[PARTS].dims != (SOURCE, *DIMENSIONS):
@@ -281,8 +285,8 @@ def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
     parts = np.asarray(data[PARTS].values, dtype=float)
     std = np.sqrt(np.diag(covariance))
     fits = parts.shape[1:] == covariance.shape
-    off = (parts.sum(axis=0) - covariance) / np.outer(std, std) if fits else np.array(np.nan)
-    if not np.abs(off).max() < SUM_TOLERANCE:
+    excess = (parts.sum(axis=0) - covariance) / np.outer(std, std) if fits else np.array(np.nan)
+    if not np.abs(excess).max() < SUM_TOLERANCE:
         raise RecordError(f"{path}: the sources of the covariance do not sum up to it")
     return dict(zip(map(str, data[SOURCE].values), parts, strict=True))
 
@@ -290,13 +294,16 @@ def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:
     """Read the names (p,) of parameters and their covariance (p, p).
 
-    Raises RecordError if the file is damaged, or if a variance is not positive.
+    The tuple of names is empty if the file has no names.
+
+    Raises RecordError if the file is damaged or lacks the covariance, if a covariance is not
+    finite, or if a variance is not positive.
     """
     data = read_group(path)
     if VARIABLE not in data or data[VARIABLE].dims != DIMENSIONS:
         raise RecordError(f"{path} lacks {VARIABLE} on {' and '.join(DIMENSIONS)}")
-    found = tuple(map(str, data[DIMENSIONS[0]].values)) if DIMENSIONS[0] in data.coords else ()
+    names = tuple(map(str, data[DIMENSIONS[0]].values)) if DIMENSIONS[0] in data.coords else ()
     covariance = np.asarray(data[VARIABLE].values, dtype=float)
     if not np.isfinite(covariance).all() or not (np.diag(covariance) > 0).all():
         raise RecordError(f"{path}: {VARIABLE} has variances that are not positive numbers")
-    return found, covariance
+    return names, covariance

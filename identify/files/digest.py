@@ -1,9 +1,9 @@
 """Files with a digest of their own content, by which a damaged file is recognised.
 
-The digest is after the end of a netCDF file, in the first entry of a JSON file, and in the first
+The digest follows the end of a netCDF file, is the first entry of a JSON file, or is in the first
 line of a TOML file. It is written and removed together with the file. A complete file is therefore
 never mistaken for a damaged one, even if the program that writes it is killed. A file without a
-digest was not written by this program.
+digest is accepted, because users write and change files by hand.
 """
 
 import json
@@ -14,7 +14,7 @@ from typing import Any
 
 from identify.errors import RecordError
 
-KEY = "sha256"  # name of the first entry of a JSON file, which has its digest
+KEY = "sha256"  # key of the first entry of a JSON file, its digest
 
 _TRAILER = b"\ncmmsim sha256 "
 _HEX = 2 * sha256().digest_size
@@ -28,7 +28,7 @@ def with_digest(content: bytes) -> bytes:
 
 
 def has_digest(path: Path | str, content: bytes) -> bool:
-    """Return whether a netCDF file has a digest.
+    """Return True if a netCDF file has the right digest, and False if it has none.
 
     Raises RecordError if the digest is wrong.
     """
@@ -72,7 +72,7 @@ def toml_with_digest(text: str) -> str:
 def check_toml(path: Path) -> Path:
     """Return the path of a TOML file that has the right digest or none.
 
-    Raises RecordError if the digest is wrong or there is no such file.
+    Raises RecordError if the digest is wrong or the file cannot be read.
     """
     first, _, text = _content(path).partition(b"\n")
     comment = _COMMENT.encode()

@@ -1,7 +1,8 @@
 """Calls of functions in another process, within limits of time and memory.
 
 On a damaged or malicious file, a library can hang, crash, or allocate all memory. The process that
-reads such a file is killed if it exceeds the limits.
+reads such a file is killed at the time limit. Beyond the memory limit its allocations fail, which
+ends the library's call with an error, or the process.
 """
 
 import os
@@ -15,9 +16,10 @@ from typing import Any
 
 from dynamics.errors import DynamicsError
 
-LIMIT_S = 8  # time limit for reading, s
+LIMIT_S = 8  # longest time for reading, s
 START_S = 60  # additional time for the process to start on a busy machine, s
-# Largest number of bytes that reading may allocate, on systems that can limit it.
+# Largest amount of data in the process, with that of the imported libraries, in bytes. Some systems
+# cannot limit it.
 LIMIT_MEMORY = 1_000_000_000
 
 CODE = "from identify.files.limited_process import serve; serve()"
@@ -28,12 +30,13 @@ class UntrustedFileError(Exception):
 
 
 def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None = None) -> Any:
-    """Call a function of a module in another process, within the limits, and return its result.
+    """Call a function in another process, within the limits, and return its result.
 
-    `limit_s` replaces the time limit, for valid files that take longer to read.
+    The other process imports the function by its name and module. `limit_s` replaces LIMIT_S, for
+    valid files that take longer to read.
 
     Raises UntrustedFileError with the reason if a limit is exceeded, if the process dies, or if the
-    function raises an exception. Exceptions of `dynamics` pass unchanged.
+    function raises an exception. A DynamicsError passes unchanged.
     """
     limited = os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
@@ -57,10 +60,10 @@ def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None 
         raise UntrustedFileError(too_long)
     if done.returncode:
         raise UntrustedFileError(f"the library that reads it ends with status {done.returncode}")
-    found = pickle.loads(done.stdout)
-    if isinstance(found, Exception):
-        raise found
-    return found
+    result = pickle.loads(done.stdout)
+    if isinstance(result, Exception):
+        raise result
+    return result
 
 
 def _ended_by_alarm(status: int) -> bool:
@@ -72,7 +75,7 @@ def serve() -> None:
     # Output of the library must not be mixed with the bytes of the pickle.
     out = sys.stdout
     sys.stdout = sys.stderr
-    # Functions are pickled by name: this imports their modules, before the limits are set.
+    # Functions are pickled by name. Their modules are imported here, before the limits are set.
     read, given, limit = pickle.loads(sys.stdin.buffer.read())
     with suppress(ImportError, ValueError, OSError):
         import resource
@@ -81,11 +84,11 @@ def serve() -> None:
     if hasattr(signal, "alarm"):  # on other systems, only the calling process limits the time
         signal.alarm(limit)
     try:
-        found = read(*given)
+        result = read(*given)
     except DynamicsError as error:
-        found = error
+        result = error
     except Exception as error:  # the library can raise any error for such a file
-        found = UntrustedFileError(" ".join(str(error).split()) or type(error).__name__)
+        result = UntrustedFileError(" ".join(str(error).split()) or type(error).__name__)
     if hasattr(signal, "alarm"):
-        signal.alarm(0)  # what follows is not limited
-    out.buffer.write(pickle.dumps(found))
+        signal.alarm(0)  # the time to return the result is not limited
+    out.buffer.write(pickle.dumps(result))

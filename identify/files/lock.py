@@ -1,4 +1,4 @@
-"""Lock of a folder, such as that of a run or a study, for one process at a time."""
+"""Lock of a folder, such as the folder of a run or a study, for one process at a time."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -36,11 +36,11 @@ def lock_folder(folder: Path) -> Iterator[None]:
 def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
     """Lock a folder for this process during the block, at the latest until the process ends.
 
-    Leftovers of a killed process in the folder are removed first. A lock file of another user,
-    which cannot be opened, is ignored.
+    Leftovers of a killed process in the folder are removed first. If the lock file belongs to
+    another user and cannot be opened, the block runs without a lock.
 
     Raises the given error if another process has locked the folder. Raises WriteError if nothing
-    can be written into it.
+    can be written into the folder.
     """
     lock = FileLock(folder / LOCK, mode=PRIVATE, blocking=False)
     with writing(folder):
@@ -50,7 +50,7 @@ def locked(folder: Path, error: type[IdentifyError]) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            # While the file is locked, no other process can lock it, so that it can be removed.
+            # The file is removed while it is locked, because no other process can lock it then.
             with suppress(OSError):
                 (folder / LOCK).unlink()
             lock.release()

@@ -1,6 +1,6 @@
 """Folder of a run: its files, the stages that write them, and its figures in result.json.
 
-Figures here are numbers, written as standard JSON. A figure that does not exist is null.
+Figures here are numbers, written as standard JSON. A figure that is not finite is null.
 """
 
 import json
@@ -20,7 +20,7 @@ from identify.files.lock import LOCK, lock_folder
 
 LARGEST_JSON = 100_000_000  # largest size, in bytes, of a result or of measured static poses
 
-# The stage of ``cmmsim`` that writes each file.
+# The stage of ``cmmsim`` that first writes each file.
 WRITTEN_BY = {
     "scenario.toml": "excite",
     "trajectories.json": "excite",
@@ -33,7 +33,7 @@ WRITTEN_BY = {
     "report.html": "report",
 }
 
-# Files that `excite` writes before the scenario. Without the scenario, a plan is not complete.
+# Folder and file that `excite` writes before the scenario. A plan without a scenario is incomplete.
 UNFINISHED = ("geometry", "trajectories.json")
 # Files and folders that the folder of an unfinished run may hold.
 BEGUN = ("geometry", "figures", "budget", *WRITTEN_BY)
@@ -44,11 +44,13 @@ class RunFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.scenario = path / "scenario.toml"  # resolved
-        self.trajectories = path / "trajectories.json"  # of excitation and validation; the seed
+        self.scenario = path / "scenario.toml"  # resolved scenario
+        # Trajectories of excitation and validation, and the seed of the run.
+        self.trajectories = path / "trajectories.json"
         self.experiment = path / "experiment.nc"  # record and truth of the excitation run
-        self.payload = path / "payload.nc"  # the same with a load, if that is the scale anchor
-        self.covariance = path / "covariance.nc"  # of the estimated parameters
+        # Record and truth of the run with the payload, if the payload sets the scale.
+        self.payload = path / "payload.nc"
+        self.covariance = path / "covariance.nc"  # covariance of the estimated parameters
         self.validation = path / "validation.nc"  # records and truth of the validation runs
         self.model = path / "model.nc"  # poses of the models on the same trajectories
         self.result = path / "result.json"  # figures of the run
@@ -58,9 +60,9 @@ class RunFolder:
 
     @property
     def whole_scenario(self) -> Path:
-        """Path of the scenario.
+        """Path of the scenario, whose digest is checked first.
 
-        Raises RecordError if the file is damaged or was changed by hand.
+        Raises RecordError if the file is missing or damaged, or was changed by hand.
         """
         return check_toml(self.scenario)
 
@@ -71,7 +73,10 @@ class RunFolder:
 
     @property
     def records(self) -> tuple[str, ...]:
-        """Names of the files with records for an identification, in their order."""
+        """Names of the files with records for an identification.
+
+        Records of excitation runs are sorted by name. The record with the payload follows them.
+        """
         found = sorted(path.name for path in self.path.glob("experiment*.nc"))
         return (*found, *([self.payload.name] if self.payload.is_file() else []))
 
@@ -80,8 +85,9 @@ class RunFolder:
 
         The digests of netCDF files are compared before a library opens any of these files.
 
-        Raises OutputFolderError if a file is missing. The message names the first one and the stage
-        that writes it. Raises RecordError if a netCDF file cannot be read, or its digest is wrong.
+        Raises OutputFolderError if the folder or a file is missing. The message names the first
+        missing file and the stage that writes it. Raises RecordError if a netCDF file cannot be
+        read, or its digest is wrong.
         """
         if not self.path.is_dir():
             raise OutputFolderError(
@@ -101,10 +107,10 @@ class RunFolder:
 def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[RunFolder]:
     """Lock a new or empty folder for this process, see `lock_folder`.
 
-    The folder may contain the names in ``also``. Leftovers of a killed process are ignored.
+    The folder may contain the names in ``also``. Leftovers of a killed process are removed.
 
-    Raises OutputFolderError if the folder contains anything else, or if another process works in
-    it. Raises WriteError if it cannot be made.
+    Raises OutputFolderError if the folder contains anything else, if it is a file, or if another
+    process works in it. Raises WriteError if the folder cannot be made or written to.
     """
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -138,10 +144,7 @@ ENTRIES = {
 
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
-    """Write a result, completely or not at all.
-
-    Raises WriteError.
-    """
+    """Write a result, completely or not at all. Raises WriteError."""
     write_bytes(path, result_json(result))
 
 
@@ -151,7 +154,7 @@ def result_json(result: dict[str, Any]) -> bytes:
 
 
 def as_json(result: dict[str, Any]) -> str:
-    """Return a result as text. Arrays become lists; numbers that are not finite become null."""
+    """Return a result as JSON. Arrays become lists, and numbers that are not finite become null."""
     return _text(_plain(result))
 
 
@@ -161,8 +164,9 @@ def save_files(
     """Write files by name into a folder, all of them or none. A missing folder is made.
 
     The content of a file is bytes, text, figures of a run (dict, written as JSON), or a drawn
-    figure, written in the format of its suffix. ``check`` is as in `write_files`. Raises
-    WriteError.
+    figure, written in the format of its suffix. ``check`` is as in `write_files`.
+
+    Raises WriteError, and the exceptions of ``check``.
     """
     contents = {folder / name: _content(name, content) for name, content in files.items()}
     write_files(contents, parents=True, check=check)
@@ -211,7 +215,10 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
 
 
 def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
-    """Return the six figures [um, urad] of one entry. They are NaN if they are null or absent."""
+    """Return the six figures [um, urad] of one entry, ``rms`` or ``std`` as named by ``of``.
+
+    A null figure is NaN. Without an entry, all six are NaN.
+    """
     if not figures:
         return [math.nan] * 6
     values = [*figures[f"position_{of}_um"], *figures[f"orientation_{of}_urad"]]
@@ -221,7 +228,7 @@ def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
 def predicted_row(run: dict[str, Any]) -> list[float]:
     """Return the six predicted standard deviations [um, urad] of a validation entry.
 
-    They are NaN if nothing was predicted.
+    All are NaN if nothing was predicted.
     """
     return rms_row(run.get("predicted"), "std")
 

@@ -11,14 +11,14 @@ from identify.files.limited_process import within_limits
 
 ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
-# Largest size of the numbers in a group. A record of a million frames has this size.
+# Largest size of the numbers in a group, bytes. A record of a million frames has this size.
 LIMIT_BYTES = 256_000_000
 # Names of the groups, and one group. The group is None if it was not requested or does not exist.
 Content = tuple[list[str], xr.Dataset | None]
 
 
 def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
-    """Load a group of at most ``most`` bytes of numbers, and the names of all groups.
+    """Load the sorted names of all groups, and a group of at most ``most`` bytes of numbers.
 
     Raises the exceptions of the library, and ValueError if the group is larger.
     """
@@ -39,9 +39,9 @@ def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
 
 
 def load_in_process(content: bytes, group: str | None) -> Content:
-    """Load as `load` does, but in another process and within limits.
+    """Load as `load` does, but in another process and within limits of time and memory.
 
-    Raises UntrustedFileError.
+    Raises UntrustedFileError if the content exceeds the limits or cannot be read.
     """
-    found: Content = within_limits(load, content, group, LIMIT_BYTES)
-    return found
+    loaded: Content = within_limits(load, content, group, LIMIT_BYTES)
+    return loaded

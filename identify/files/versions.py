@@ -42,7 +42,7 @@ def _version(name: str) -> str:
 
 
 class OtherVersionsWarning(UserWarning):
-    """Warning that some rows were computed with other versions of packages."""
+    """Warning that rows were or will be computed with other versions of packages."""
 
 
 @cache
@@ -52,26 +52,26 @@ def product_version() -> str:
 
 
 def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
-    """Compare the versions of this process with those of other places, such as workers, by name.
+    """Compare the versions of this process with those of workers or of earlier rows, by name.
 
     Rows from another version of cmmsim belong to another simulation, which is an error. Other
     versions of numerical packages change figures slightly or not at all. A warning names each
     differing version once. ``remedy`` is the advice at the end of the exception's message.
 
-    Raises StudyError if a place has another version of cmmsim, or none.
+    Raises StudyError if an entry of ``there`` has another version of cmmsim, or none.
     """
     here = versions()
-    places = dict[tuple[str, str], list[str]]()
-    for place, theirs in there.items():
-        require_product(place, theirs["cmmsim"], here["cmmsim"], remedy)
+    owners = dict[tuple[str, str], list[str]]()
+    for owner, theirs in there.items():
+        require_product(owner, theirs["cmmsim"], here["cmmsim"], remedy)
         for package, version in theirs.items():
             if version != here.get(package, version):
-                places.setdefault((package, version), []).append(place)
-    if places:
+                owners.setdefault((package, version), []).append(owner)
+    if owners:
         text = "; ".join(
             f"{package} {version} ({first}{f' and {len(more)} more' if more else ''}), here "
             f"{here[package]}"
-            for (package, version), (first, *more) in places.items()
+            for (package, version), (first, *more) in owners.items()
         )
         warnings.warn(
             f"figures may differ slightly between versions of packages: {text}",
@@ -81,6 +81,6 @@ def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
 
 
 def require_product(place: str, there: str, here: str, remedy: str) -> None:
-    """Raise StudyError, with both versions, if a place has another version of cmmsim."""
+    """Raise StudyError, with both versions, if ``place`` has another version of cmmsim."""
     if there != here:
         raise StudyError(f"{place} has cmmsim {there}, here is {here}; {remedy}")

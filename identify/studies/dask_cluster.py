@@ -34,7 +34,7 @@ from identify.studies.study_design import Case, Finished, Shared
 
 # Longest allowed time without workers, s. On a busy machine workers start slowly.
 WORKERLESS_SECONDS = 180
-ANSWER_SECONDS = 30  # longest allowed time for an answer of a scheduler, s
+ANSWER_SECONDS = 30  # longest wait for an answer, after which the cluster is checked, s
 
 SCHEDULER_LOST = (
     "the Dask scheduler is gone; the same command with another scheduler continues the study"
@@ -64,8 +64,8 @@ class DaskExecutor:
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches in the order in which they finish.
 
-        Raises StudyError if the scheduler or all workers are gone, or workers cannot run this
-        program.
+        Raises StudyError if the scheduler is gone, if there has been no worker for
+        WORKERLESS_SECONDS, or if a worker cannot run this program.
         """
         try:
             while self._send_more(shared, batches):
@@ -77,7 +77,7 @@ class DaskExecutor:
             raise scheduler_lost(error) from error
 
     def _send_more(self, shared: Shared, batches: Batches) -> bool:
-        """Submit batches so that all workers are busy. Return False at the end.
+        """Submit batches so that all workers are busy. Return False once no batch is open.
 
         Rows during which workers have died come last, one at a time.
         """
@@ -99,8 +99,8 @@ class DaskExecutor:
     def _next(self) -> list[Finished]:
         """Return the next finished batch.
 
-        The result is empty if no batch has finished yet, or if the workers died and the batch was
-        split.
+        The list is empty if no batch has finished within a second, or if workers died with the
+        batch and its rows will be computed again.
         """
         try:
             future = self._done.get(timeout=1.0)
@@ -124,7 +124,7 @@ class DaskExecutor:
         """Return the rows of a finished batch.
 
         If the rows were lost with their worker, Dask computes them again. The wait is unlimited,
-        but ends with an exception if the cluster has no workers.
+        but ends with StudyError if the cluster has no workers for too long.
         """
         while True:
             try:
@@ -172,9 +172,10 @@ def scheduler_lost(error: OSError) -> StudyError:
     return StudyError(f"{SCHEDULER_LOST}: {' '.join(str(error).split())}")
 
 
-# Longest allowed time for the first answer of a scheduler, s. TLS takes seconds if it is busy.
+# Longest wait for the first answer of a scheduler, and for its first worker, s. With TLS a busy
+# scheduler takes seconds.
 CONNECT_SECONDS = 20
-ENCRYPTED = ("tls", "wss")  # kinds of address for which both sides present a certificate
+ENCRYPTED = ("tls", "wss")  # protocols in which both sides present a certificate
 
 
 @contextmanager
@@ -184,23 +185,24 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
     address   Address of the scheduler.
     insecure  Also accept a scheduler to which everyone on the network can connect.
 
-    Raises StudyError if no scheduler answers at the address, everyone can connect to it, it has no
-    workers, or a worker has another version of cmmsim.
+    Raises StudyError if no scheduler answers at the address, the scheduler has no workers, or a
+    worker has another version of cmmsim. Unless ``insecure``, StudyError is also raised for a
+    scheduler on another machine that asks for no certificate.
     """
     _silence_dask()
     try:
-        kind, place = parse_address(address)
-        # For an address of an unknown kind, a client would keep trying in the background.
-        host = get_backend(kind).get_address_host(place)
+        protocol, location = parse_address(address)
+        # For an address with an unknown protocol, a client would keep trying in the background.
+        host = get_backend(protocol).get_address_host(location)
     except (ValueError, ImportError) as error:
         raise _no_scheduler(address, str(error)) from error
-    if kind not in ENCRYPTED and not insecure and not _is_here(host):
+    if protocol not in ENCRYPTED and not insecure and not _is_here(host):
         raise StudyError(
             f"{address} asks for no certificate: everyone who reaches it can run code under your "
             "account; name a tls:// address, or use --insecure"
         )
     security = Security()
-    if kind in ENCRYPTED:
+    if protocol in ENCRYPTED:
         _check_certificates(address, security)
     try:
         asyncio.run(_identity(address, security))
@@ -226,7 +228,7 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
 
 
 def _is_here(host: str) -> bool:
-    """Return whether only this machine can reach a host."""
+    """Return whether a host is this machine, reached only from itself (loopback)."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -236,12 +238,12 @@ def _is_here(host: str) -> bool:
 def _check_certificates(address: str, security: Security) -> None:
     """Raise StudyError if there are no certificates for a scheduler."""
     try:
-        there = security.get_connection_args("client").get("ssl_context")
+        certificates = security.get_connection_args("client").get("ssl_context")
         why = "none are named"
     except (OSError, ValueError) as error:
-        there = None
+        certificates = None
         why = str(error)
-    if not there:
+    if not certificates:
         raise StudyError(
             f"{address} asks for certificates ({why}): name them in Dask's configuration, "
             "distributed.comm.tls.ca-file, client.cert and client.key"
@@ -252,7 +254,7 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
     """Compare the versions on the workers, by address, with the versions in this process.
 
     A worker that answered with an error cannot run cmmsim. A worker that did not answer (OSError)
-    is gone, and is not checked.
+    is gone, and is not checked. Other versions of other packages give a warning.
 
     Raises StudyError if a worker has another cmmsim, or none.
     """

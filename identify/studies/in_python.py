@@ -44,11 +44,6 @@ class Study:
     seed : int
         Seed of all rows.
 
-    Raises
-    ------
-    StudyError
-        A value does not fit.
-
     Examples
     --------
     >>> import identify
@@ -94,7 +89,10 @@ class Study:
         Raises
         ------
         StudyError
-            The study is not valid, or a row failed.
+            The study is not valid, or a row failed. The other rows are then kept in ``folder``
+            only.
+        ScenarioError
+            The scenario is not valid, or the factors of the first row contradict each other.
         StudyInterrupted
             Ctrl-C stopped the study.
         """
@@ -109,10 +107,8 @@ class Study:
         check_memory(study, shared, max(count, 1))
         computing = partial(local_processes, count) if count else in_this_process
         with tempfile.TemporaryDirectory(prefix="cmmsim-study-") as temporary:
-            place = Path(temporary) / "study" if folder is None else Path(folder)
-            outcome = run_study(
-                study, place, progress or SilentProgress(), computing, shared=shared
-            )
+            kept = Path(temporary) / "study" if folder is None else Path(folder)
+            outcome = run_study(study, kept, progress or SilentProgress(), computing, shared=shared)
         if outcome.failures:
             raise StudyError(
                 f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}"

@@ -21,7 +21,7 @@ SUFFIXES = {
     "_percent": "%",
 }
 
-WIDEST = 28  # largest number of letters in a line of a label
+WIDEST = 28  # largest number of characters in a line of a label
 
 
 def factor_unit(path: str) -> str:
@@ -56,9 +56,9 @@ def labelled(name: str, study: Study) -> str:
 
 
 def axis_label(name: str, study: Study, per: str | None = None) -> str:
-    """Describe a column, or the ratio of two columns, in words with its unit in brackets.
+    """Describe a column, or its ratio to column ``per``, in words with the unit in brackets.
 
-    The text is wrapped to lines of WIDEST letters.
+    The text is wrapped to lines of WIDEST characters.
     """
     words = _words(name, study)
     unit = _unit(name, study)
@@ -76,22 +76,25 @@ def setting(path: str, value: object) -> str:
 
 
 def short_number(value: object) -> str:
-    """Format a float with four digits, or with all digits before the point if there are more."""
+    """Format a float with four significant digits, or from 1e4 to 1e7 as an integer.
+
+    Other values are converted by `str`.
+    """
     if not isinstance(value, float):
         return str(value)
     return f"{value:.4g}" if not 1e4 <= abs(value) < 1e7 else f"{value:.0f}"
 
 
 def _words(name: str, study: Study) -> str:
-    """Return the first part of a column's description, or the column's name if it has none."""
+    """Return a column's description up to ";" or ":", or the column's name if it has none."""
     columns = KINDS[study.kind].columns if study.kind in KINDS else {}
     if name in columns:
-        said = columns[name].meaning
+        description = columns[name].meaning
     else:
         kind = KINDS.get(study.kind)
         field = field_of(name, kind.options if kind else None)
-        said = (field.description if field is not None else None) or ""
-    first = re.split(r"[;:]", said)[0]
+        description = (field.description if field is not None else None) or ""
+    first = re.split(r"[;:]", description)[0]
     # A description that begins with "the same" refers to another column, so the name is used.
     return _plain_name(name) if not first or first.startswith("the same") else first
 
@@ -108,6 +111,6 @@ def _plain_name(name: str) -> str:
 
 
 def _suffix(name: str) -> tuple[str, str]:
-    """Split a name into its first part and the unit at its end."""
+    """Split a name into its first part and the unit at its end, which is empty if there is none."""
     end = next((end for end in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(end)), "")
     return name.removesuffix(end) if end else name, SUFFIXES.get(end, "")

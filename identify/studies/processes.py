@@ -6,8 +6,8 @@ the disk. If a process dies, a new process replaces it. The rows of the dead pro
 again at the end, each alone. If a process dies again during such a row, the row gets an error.
 
 `concurrent.futures.ProcessPoolExecutor` is not used. If one process dies, that executor ends all
-processes and does not report the rows of the dead process. If the main process is killed, its
-processes wait forever.
+processes and does not report the rows of the dead process. If the main process is killed, the
+processes of that executor wait forever.
 """
 
 import os
@@ -28,7 +28,7 @@ from identify.studies.study_design import Case, Finished, Shared
 from identify.studies.study_file import Range, Study
 from identify.studies.worker import work
 
-# Factors that determine the length of a record or of a stretch of a path.
+# Factors whose largest values give the longest records and stretches of a path.
 LENGTH = ("scenario.excitation.duration_s", "scenario.timing.frame_rate_hz", "options.stretch_s")
 PROCESS = 0.5e9  # memory of a process before its first row, bytes
 
@@ -36,7 +36,10 @@ GB = 1e9
 
 
 def check_memory(study: Study, shared: Shared, workers: int) -> None:
-    """Raise StudyError if the longest rows, one per worker, need more memory than is installed."""
+    """Raise StudyError if the longest rows, one per worker, need more memory than is installed.
+
+    Nothing is checked for a kind of row that does not state its memory.
+    """
     kind = find_kind(study.kind)
     if kind.memory is None:
         return
@@ -44,13 +47,13 @@ def check_memory(study: Study, shared: Shared, workers: int) -> None:
     case = Case(0, 0, longest)
     options = kind.checked(shared.row_options(case))
     needed = PROCESS + kind.memory(Setup(shared.row_scenario(case)), options)
-    available = psutil.virtual_memory().total
-    if workers * needed > available:
-        fit = int(available // needed)
+    installed = psutil.virtual_memory().total
+    if workers * needed > installed:
+        fit = int(installed // needed)
         raise StudyError(
             f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in "
             f"{workers} processes "
-            f"{workers * needed / GB:.3g} GB, and this machine has {available / GB:.3g} GB: "
+            f"{workers * needed / GB:.3g} GB, and this machine has {installed / GB:.3g} GB: "
             + (f"--workers {fit} fits" if fit else "shorten its rows")
         )
 
@@ -59,12 +62,12 @@ def _largest(values: list[float] | Range) -> float:
     return values.high if isinstance(values, Range) else max(values)
 
 
-# Start method of the processes, by which they inherit neither threads nor locks.
+# Start method with which processes inherit neither threads nor locks.
 SPAWN = get_context("spawn")
 # Variables that limit a process to one thread, because there are as many processes as cores. They
 # are set before a process loads its libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-MEMORY_SHARE = 0.95  # share of the machine's memory that all processes together are allowed to use
+MEMORY_SHARE = 0.95  # largest fraction of the installed memory, of which processes get equal parts
 LOOK_S = 1.0  # interval at which the memory of the processes is checked, s
 # The study fails after this number of consecutive processes that die before they are ready.
 MOST_FAILED_STARTS = 3
@@ -83,7 +86,7 @@ class ProcessExecutor:
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches in the order in which they finish.
 
-        Raises StudyError if processes cannot be started, or die before they compute anything.
+        Raises StudyError if processes cannot be started, or repeatedly die before they are ready.
         """
         suspects = Suspects()
         try:
@@ -117,7 +120,7 @@ class ProcessExecutor:
             ) from error
 
     def _assign_batches(self, shared: Shared, batches: Batches, suspects: Suspects) -> bool:
-        """Give each idle process a batch. Return False at the end.
+        """Give each idle process a batch. Return False once no rows are left.
 
         Rows during which a process died come last, one at a time.
         """
@@ -131,23 +134,23 @@ class ProcessExecutor:
         return not ready or any(worker.cases for worker in ready)
 
     def _wait(self) -> list["_Worker"]:
-        """Wait for processes that have become ready, have finished a batch or have died, and return
-        them.
+        """Return the processes that have become ready, have finished a batch, or have died.
 
-        The wait takes at most LOOK_S. The memory of all processes is checked as well.
+        The method waits at most LOOK_S for such a process. Processes that use too much memory are
+        killed.
         """
         if time.monotonic() > self._looked + LOOK_S:
             self._looked = time.monotonic()
             limit = MEMORY_SHARE * psutil.virtual_memory().total / self._count
             for worker in self._workers:
-                worker.limit_memory(limit)
+                worker.kill_above(limit)
         reporting = wait([worker.pipe for worker in self._workers], timeout=LOOK_S)
         return [worker for worker in self._workers if worker.pipe in reporting]
 
     def _collect(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
-        """Return the rows that a process has finished, or its failed rows if it has died.
+        """Return the rows that a process has computed, or the failed row of a process that has died.
 
-        The list is empty for a process that has become ready.
+        The list is empty if the process has become ready, or if its rows will be computed again.
         """
         cases = worker.cases
         try:
@@ -177,9 +180,9 @@ class ProcessExecutor:
 class _Worker:
     """Process of this machine, and the pipe to it.
 
-    ready       Whether the process has loaded its libraries.
+    ready       True once the process has loaded its libraries.
     cases       Rows that the process computes now.
-    end_reason  Text for an error message about the end of the process.
+    end_reason  What happened to the process, for an error message.
     pipe        Main process's end of the pipe.
     """
 
@@ -205,7 +208,7 @@ class _Worker:
                 self.pipe.send((shared, cases))
 
     def receive(self) -> list[Finished]:
-        """Return finished rows, or an empty list if the process has become ready.
+        """Return the computed rows, or an empty list if the process has become ready.
 
         Raises EOFError or OSError if the process has died.
         """
@@ -214,15 +217,15 @@ class _Worker:
         self.cases = []
         return finished
 
-    def limit_memory(self, limit: float) -> None:
-        """Kill the process if it uses more memory than the limit, bytes."""
+    def kill_above(self, limit: float) -> None:
+        """Kill the process if its memory (resident set) exceeds the limit, bytes."""
         with suppress(psutil.Error):
             if psutil.Process(self._process.pid).memory_info().rss > limit:
                 self.end_reason = f"took more than {limit / GB:.3g} GB of memory"
                 self._process.kill()
 
     def end(self) -> None:
-        """Kill the process."""
+        """Close the pipe, kill the process, and wait up to END_S for its end."""
         self.pipe.close()
         self._process.kill()
         self._process.join(END_S)

@@ -51,7 +51,7 @@ class Outcome:
         return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
-# Function that computes all batches, and yields their rows in the order in which they finish.
+# Function that computes all batches, and yields the rows of each batch when it finishes.
 Executor = Callable[[Shared, "Batches"], Iterator[list[Finished]]]
 # Function that returns an executor as a context. The workers live as long as the context.
 Workers = Callable[[], AbstractContextManager[Executor]]
@@ -71,8 +71,8 @@ def _serial(shared: Shared, batches: "Batches") -> Iterator[list[Finished]]:
 
 
 SoFar = Callable[[pd.DataFrame], object]  # function that gets the table of the rows finished so far
-# Shortest interval between tables of finished rows, seconds, and the largest share of the time that
-# these tables take.
+# Shortest interval between tables of finished rows, seconds, and the largest fraction of the time
+# that these tables take.
 SO_FAR_S, SO_FAR_SHARE = 30.0, 0.02
 
 
@@ -84,7 +84,7 @@ def run_study(
     so_far: SoFar = lambda frame: None,
     shared: Shared | None = None,
 ) -> Outcome:
-    """Run a study in its folder, or continue it there.
+    """Run a study in its folder, or continue it there, and write its table and arrays.
 
     The figures do not depend on the workers. Finished rows are stored, and the same call continues
     the study.
@@ -95,8 +95,8 @@ def run_study(
     so_far    Function that gets the table of finished rows from time to time while the study runs.
     shared    Common data of the rows, from `prepare`. By default it is prepared from the study.
 
-    Returns the table of all rows. Raises StudyError if the study is not valid (see
-    `identify.studies.study_design.prepare`), the folder cannot be used (see
+    Returns the table of all rows, failed ones included, with counts. Raises StudyError if the study
+    is not valid (see `identify.studies.study_design.prepare`), the folder cannot be used (see
     `identify.studies.store.open_folder`), the disk is full, or the workers are lost. Raises
     StudyInterrupted if Ctrl-C stopped the study.
     """
@@ -122,7 +122,7 @@ def run_study(
 
 
 def _rate_limited(show: Callable[[], object]) -> Callable[[], None]:
-    """Return a function that calls `show`, but only from time to time."""
+    """Return a function that calls `show`, at the intervals of SO_FAR_S and SO_FAR_SHARE."""
     next_time = time.perf_counter() + SO_FAR_S
 
     def show_if_due() -> None:
@@ -132,7 +132,7 @@ def _rate_limited(show: Callable[[], object]) -> Callable[[], None]:
             return
         show()
         took = time.perf_counter() - began
-        # A table of many rows takes long, so its share of the time is limited.
+        # A table of many rows takes long, so the fraction of the time for tables is limited.
         next_time = began + took + max(SO_FAR_S, took / SO_FAR_SHARE)
 
     return show_if_due
@@ -159,11 +159,11 @@ def _compute_pending(
             shown()
 
 
-# Duration of a batch, s. It is long enough that sending costs little. If all processes are killed,
-# each loses at most this much work.
+# Intended duration of a batch, s. It is long enough that sending costs little. A process that is
+# killed loses its batch. A row that takes longer is a batch by itself.
 BATCH_SECONDS = 0.25
 
-LARGEST_BATCH = 500
+LARGEST_BATCH = 500  # largest number of rows in a batch
 
 
 class Batches:
@@ -175,7 +175,7 @@ class Batches:
     def __init__(self, cases: Iterator[Case], count: int) -> None:
         self._cases = cases
         self._left = count
-        self._row_seconds = BATCH_SECONDS
+        self._row_seconds = BATCH_SECONDS  # so the first batches have one row
 
     def next_batch(self, workers: int) -> list[Case]:
         """Return the next batch for one of `workers` workers, empty if all rows are handed out.
@@ -198,8 +198,8 @@ class Batches:
 class Suspects:
     """Rows of batches whose process died.
 
-    Each row is computed again, alone, because another row of the batch can be the cause. If its
-    process dies again, the row gets an error.
+    Each row is computed again, alone, because another row of the batch can be the cause. If the
+    process dies again during this row, the row gets an error.
     """
 
     def __init__(self) -> None:
@@ -213,8 +213,8 @@ class Suspects:
     def record_death(self, cases: list[Case], end_reason: str = "died") -> list[Finished]:
         """Register the end of a process that computed these rows.
 
-        If a row was computed alone, and its process ended for the second time, the row is returned
-        with an error.
+        A row that was computed alone, and whose process ended for the second time, is returned with
+        an error. Otherwise the list is empty, and `next_batch` will return the rows.
         """
         self._deaths.update(case.number for case in cases)
         if len(cases) == 1 and self._deaths[cases[0].number] > 1:
@@ -229,9 +229,9 @@ class Suspects:
 def compute(shared: Shared, cases: list[Case]) -> list[Finished]:
     """Compute rows one after the other. An exception in a row does not affect the other rows.
 
-    Only this function runs in other processes and on other machines.
+    Other processes and other machines compute rows only by this function.
     """
-    # The user has allowed these modules in the main process, which other processes do not know.
+    # Other processes do not know which modules the user has allowed in the main process.
     allow_plugin(*shared.plugins)
     return [_compute(shared, case) for case in cases]
 
@@ -256,7 +256,7 @@ def _plain(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
     """Return figures as plain numbers.
 
     Raises ArithmeticError for a figure that is not finite, so that no average hides it. Raises
-    ValueError for a figure with a name in `taken`, the other columns of the table.
+    ValueError for a figure with a name in `taken`, the names of the other columns of the table.
     """
     if hidden := sorted(taken & set(figures)):
         raise ValueError(

@@ -1,14 +1,14 @@
-"""Folder of a study: its study, the lock while the study runs, and the journal of its rows.
+"""Folder of a study: the resolved study, the lock while it runs, and the journal of its rows.
 
 ``study.json`` is the resolved study, with the versions of the software that began the study.
 ``rows.jsonl`` is the journal of finished rows, ``study.parquet`` the table of these rows, and
 ``study.nc`` their figures by factors.
 
-The journal is an append-only file of JSON lines. Finished rows are on the disk before a worker gets
-its next batch. A line counts only if it is complete. After a crash, an incomplete last line is cut
-off when the file is opened again. A database (sqlite3, write-ahead log) appends 22,000 rows per
-second and this journal 9,000, while rows finish at about 100 per second. With one damaged byte in
-the log, the database silently returned 99 rows of 200. This journal reports the damaged line.
+The journal is an append-only file of JSON lines. Finished rows are flushed to the disk when they
+arrive. A line counts only if it is complete. After a crash, an incomplete final line is cut off
+when the file is opened again. A database (sqlite3, write-ahead log) appends 22,000 rows per second
+and this journal 9,000, while rows finish at about 100 per second. With one damaged byte in the log,
+the database silently returned 99 rows of 200. This journal reports the damaged line.
 """
 
 import json
@@ -59,7 +59,7 @@ class Journal:
     path              The file.
     surplus           Number of rows in the file that belong to repeats that the study no longer
                       has.
-    finished (rows,)  True for each finished row.
+    finished (rows,)  True for each finished row, also for a failed one.
     """
 
     def __init__(self, path: Path, rows: int) -> None:
@@ -72,7 +72,7 @@ class Journal:
         for row, end in self._complete_lines():
             self._note(row)
             self._end = end
-        # An incomplete last line is removed, so that the next row begins a new line.
+        # An incomplete final line is removed, so that the next row begins a new line.
         os.ftruncate(self._file, self._end)
 
     def __enter__(self) -> "Journal":
@@ -122,7 +122,10 @@ class Journal:
             self.surplus += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
-        """Yield the row and the end position of each line, up to an incomplete last line."""
+        """Yield the row and the end (byte offset) of each line, without an incomplete final line.
+
+        Raises StudyError for a damaged line.
+        """
         with self.path.open("rb") as file:
             end = 0
             for number, line in enumerate(file, 1):
@@ -141,10 +144,7 @@ class Journal:
 
 
 def resolved(study: Study, shared: Shared) -> dict[str, Any]:
-    """Return everything on which the rows of a study depend, as JSON values.
-
-    The entries are the study, its scenario, and its sensor.
-    """
+    """Return the study, its scenario and its sensor, on which its rows depend, as JSON values."""
     scenario = shared.scenario
     sensor = read_sensor_file(scenario.sensor, scenario.sensor_changes)
     entry = {
@@ -167,8 +167,8 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
     rows   Number of its rows.
 
     Raises StudyError if the folder belongs to another study, is in use, holds other files or cannot
-    be made, if one of its files is damaged, or if its rows were computed by another version of
-    cmmsim.
+    be made, if one of its files is damaged, or if another version of cmmsim computed the first rows
+    and rows are missing.
     """
     _check_content(folder)
     _check_entries(folder)
@@ -204,7 +204,7 @@ def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> 
 
 
 def _check_content(folder: Path) -> None:
-    """Refuse a folder with files that do not belong to a study."""
+    """Raise StudyError for a path that is a file, or a folder with files of something else."""
     if folder.exists() and not folder.is_dir():
         raise StudyError(f"study folder {folder} is a file; name another with --out")
     if folder.is_dir() and not (folder / STUDY).exists():
@@ -216,7 +216,7 @@ def _check_content(folder: Path) -> None:
 
 
 def _check_entries(folder: Path) -> None:
-    """Refuse links, pipes and the like under the names of a study's files.
+    """Raise StudyError if a link, a pipe or the like has the name of a study's file.
 
     Reading a pipe would wait forever, and rows would be written to the target of a link.
     """
@@ -227,9 +227,9 @@ def _check_entries(folder: Path) -> None:
 
 
 def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
-    """Write study.json, or refuse if the folder belongs to another study.
+    """Write study.json, and return the versions of the software that computed the first rows.
 
-    Returns the versions of the software that computed the first rows.
+    Raises StudyError if the folder belongs to another study.
     """
     here = _study_file(folder / STUDY)
     stored: dict[str, str] | None = here.pop(VERSIONS, None) if here else None
@@ -258,7 +258,10 @@ def _has_rows(folder: Path) -> bool:
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
-    """Return the content of study.json, or None if there is no such file."""
+    """Return the content of study.json, or None if there is no such file.
+
+    Raises StudyError if the file is damaged.
+    """
     if not path.exists():
         return None
     try:
@@ -272,8 +275,10 @@ def _differences(one: Any, other: Any, path: str = "") -> list[str]:
     if isinstance(one, dict) and isinstance(other, dict):
         keys = [*one, *(key for key in other if key not in one)]
         return [
-            d
-            for k in keys
-            for d in _differences(one.get(k), other.get(k), f"{path}.{k}" if path else k)
+            different
+            for name in keys
+            for different in _differences(
+                one.get(name), other.get(name), f"{path}.{name}" if path else name
+            )
         ]
     return [] if one == other or path in MAY_CHANGE else [path]

@@ -42,13 +42,13 @@ def write(
     others   Names and finished rows of other studies, which are plotted beside this study.
 
     Returns the content of summary.json. Raises WriteError if a file cannot be written. Raises
-    StudyError if the study chooses a figure that no row has.
+    StudyError as `main_figures` does.
     """
     done = frame[frame["error"] == ""]
     names = [
         name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])
     ]
-    # Single probabilities have no rms that says anything, so they are tested together.
+    # The rms of probabilities says nothing, so their uniformity is tested instead.
     names = [name for name in names if not name.startswith(PROBABILITY)]
     points = _points(study, done, names)
     verdicts = check_laws(study, frame)
@@ -93,7 +93,7 @@ def main_figures(study: Study, names: list[str]) -> list[str]:
 
     The study names these figures. If it names none, they are the main figures of a built-in kind,
     or the first six figures of a user's own kind. Raises StudyError if the study names a figure
-    that no row has.
+    that neither the rows nor their kind have. Without rows, no name is checked.
     """
     if study.figures is not None:
         # The first rows of a running study can lack a figure of the kind.
@@ -114,10 +114,10 @@ def main_figures(study: Study, names: list[str]) -> list[str]:
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
-    """Return factors and statistics of each point that has a row.
+    """Return factors and statistics of each point that has a finished row.
 
     Points of a grid have the order of the grid, and points of a sample are sorted. A sample without
-    repeats is summarised as one point.
+    repeats is summarised as one point without factors.
     """
     paths = list(study.factors)
     if not len(done):

@@ -1,6 +1,6 @@
 """Finished rows as one tidy table in Parquet, and as arrays over the factors in netCDF.
 
-The metadata of the table contain the study. The columns are:
+The metadata of the table contain the resolved study. The columns are:
 
 - ``row`` and ``repeat``;
 - ``seed_entropy`` and ``seed_spawn_key``, the arguments of ``numpy.random.SeedSequence``;
@@ -46,7 +46,7 @@ VERSIONS_KEY = b"cmmsim.versions"
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     """Return the table of a study's finished rows, ordered by row.
 
-    Factor values that are lists are stored as JSON text.
+    Factor values that are lists or tables become JSON text.
     """
     design = Design(study)
     count = len(design)
@@ -110,7 +110,7 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     """Read the table and the study in a `study.parquet`.
 
-    Raises StudyError if there is no such file, or if it is not the table of a study.
+    Raises StudyError if there is no such file, or if it is damaged or not the table of a study.
     """
     entry = study_in(Path(path))
     if entry is None:
@@ -125,8 +125,7 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
 def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.DataFrame]]:
     """Read names and finished rows of other studies, to be plotted beside a study.
 
-    If two studies have the same name, the name of the folder is used, or else the path of the
-    folder.
+    If a name is taken, the study gets the name of its folder, or else the path of its folder.
 
     Raises StudyError if a folder has no table, its rows are of another kind or have other factors,
     or the folder is named twice.
@@ -187,14 +186,17 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
     view = xr.Dataset.from_dataframe(figures)
     lists = {path: values for path, values in study.factors.items() if isinstance(values, list)}
     wanted = {path: [plain(value) for value in lists[path]] for path in lists if path in view.dims}
-    # from_dataframe has sorted the values, and dropped values without a row.
+    # from_dataframe sorts the values, and lacks values without a row.
     view = view.reindex(wanted | {"repeat": np.arange(study.repeats)})
     if study.sample is not None:
         design = Design(study)
         cases = [design.case(point) for point in range(study.points)]
         view = view.reindex(point=np.arange(study.points))
         view = view.assign_coords(
-            {path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors}
+            {
+                path: ("point", [plain(case.factors[path]) for case in cases])
+                for path in study.factors
+            }
         )
     for name, variable in view.variables.items():
         if unit := unit_of(str(name), study):

@@ -1,6 +1,6 @@
 """Uniformity of the probabilities that rows give to values below the truth.
 
-A figure of a row whose name begins with `PROBABILITY` is the probability that a stated distribution
+A figure whose name begins with `PROBABILITY` is the probability that a distribution stated by a row
 gives to values below the truth. If the distribution is right, the figure is uniform between 0 and 1
 over the rows. Each figure has a Kolmogorov-Smirnov test, with a correction for the number of
 figures. The plot shows the cumulative distribution of each figure minus the uniform one. If the
@@ -27,17 +27,20 @@ from identify.studies.rows.kind import PROBABILITY
 FEWEST = 20  # smallest number of rows with a figure for which it is tested
 LEVEL = 0.01  # corrected p value below which a figure counts as not uniform
 BAND = 0.95  # probability that the whole curve of a right distribution is in the band
-POINTS = 200  # number of points at which the band is computed
-SIMULATED = 4000  # number of simulated curves, which determine the probability of the band to 0.4 %
+POINTS = 200  # the band is computed at the multiples of 1 / POINTS between 0 and 1
+# Number of simulated curves. The standard error of the probability of the band is 0.3 %.
+SIMULATED = 4000
 
 
 @dataclass(frozen=True)
 class Uniformity:
     """Test of one figure.
 
-    name: figure without `PROBABILITY`. point: values of the factors. values (n,): the figure in the
-    rows of the point that have it, in ascending order. p_value: p value of Kolmogorov and Smirnov's
-    test. corrected: p value multiplied by the number of tests (Bonferroni).
+    name           Name of the figure without `PROBABILITY`.
+    point          Values of the factors, as text.
+    values (n,)    The figure in the rows of the point that have it, ascending.
+    p_value        p value of the Kolmogorov-Smirnov test.
+    corrected      p value multiplied by the number of tests (Bonferroni), at most 1.
     """
 
     name: str
@@ -53,17 +56,17 @@ class Uniformity:
 
     @property
     def mean(self) -> float:
-        """Mean of the figure, 0.5 if the estimates are right on average."""
+        """Mean of the figure, about 0.5 if the stated distributions are right."""
         return float(self.values.mean())
 
     @property
     def fails(self) -> bool:
-        """True if the figure is not uniform."""
+        """True if the corrected p value is below LEVEL, so that the figure is not uniform."""
         return self.corrected < LEVEL
 
     @property
     def label(self) -> str:
-        """Name of the figure, after the values of the factors."""
+        """Values of the factors, followed by the name of the figure."""
         return " ".join((*self.point, self.name))
 
     @property
@@ -74,9 +77,9 @@ class Uniformity:
 
 
 def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniformity]:
-    """Return the tests of all probabilities in a table of finished rows, the worst first.
+    """Return the tests of all probabilities in a table of rows, the smallest p value first.
 
-    Each figure is tested at each point of the factors.
+    Each figure is tested at each point of the factors where enough rows have it.
     """
     figures = probabilities_at_points(done, factors)
     found = []
@@ -90,7 +93,7 @@ def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniform
 def probabilities_at_points(
     done: pd.DataFrame, factors: Sequence[str]
 ) -> dict[tuple[tuple[str, ...], str], Array]:
-    """Return the probabilities by point and name of the figure, where enough rows have them."""
+    """Return the probabilities by point and name, where at least FEWEST rows have the figure."""
     points = (
         [(tuple(map(str, key)), rows) for key, rows in done.groupby(list(factors))]
         if factors
@@ -109,9 +112,10 @@ def probabilities_at_points(
 def simultaneous_band(rows: int) -> tuple[Array, Array, Array]:
     """Return the band of the cumulative distribution of uniform numbers, minus its mean.
 
-    The results are the points (k,) and the lower and upper ends (k,) of the band. At each point the
-    ends are quantiles of the binomial distribution, and one level of these quantiles holds for the
-    whole curve with probability BAND. The level is found by simulation with a fixed seed.
+    The results are the points (k,) and the lower and upper ends (k,) of the band for a number of
+    rows. At each point the ends are quantiles of the binomial distribution. All points have the
+    same level of these quantiles, at which the band contains the whole curve with probability BAND.
+    The level is found by simulation with a fixed seed.
     """
     points = np.arange(1, POINTS) / POINTS
     drawn = np.random.default_rng(0).random((SIMULATED, rows))
@@ -126,7 +130,7 @@ def simultaneous_band(rows: int) -> tuple[Array, Array, Array]:
 def uniformity_figure(found: list[Uniformity]) -> Figure:
     """Plot the curve of each tested figure, times the root of its number of rows, and the band.
 
-    Figures that fail have a name and a colour.
+    The band is that of the median number of rows. Figures that fail have a name and a colour.
     """
     rows = int(np.median([one.rows for one in found]))
     points, low, high = simultaneous_band(rows)
