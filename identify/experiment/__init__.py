@@ -1,4 +1,4 @@
 """Simulated experiment: the true plant, the sensor in its loop, and the truth.
 
-Only validation and reports read the truth.
+The estimator never reads the truth.
 """

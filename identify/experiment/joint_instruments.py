@@ -1,7 +1,7 @@
 """Simulated torque sensors and encoders at the joints, an optional addition to the experiment.
 
-The visual experiment does not need them, but estimators of the literature do. Their readings are
-stored in a separate file beside the record.
+The visual experiment does not need these instruments, but estimators of the literature do. The
+readings are stored in a separate file beside the record.
 
 The torque is the mean over one frame around the instant of exposure. Under a held command the joint
 controller's torque is a sawtooth in time. Samples at the frames would always fall on the same point
@@ -127,7 +127,7 @@ def measure_joints(
     at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
     angle = truth[at_encoder].values
     zeros = truth["joint_zero_error"].values if "joint_zero_error" in truth else 0.0
-    # commands as the drives receive them, about the true zeros
+    # Commands as the drives receive them, relative to the true zeros.
     sent = record["command"].values
     for unit in ("rad", "m"):
         if (limits := truth.attrs.get(f"plant_command_limits_{unit}")) is not None:
@@ -140,16 +140,16 @@ def measure_joints(
     law = joint_law(
         truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s")
     )
-    each = np.full(len(command), timing.latency_s) if latencies is None else latencies
+    delays = np.full(len(command), timing.latency_s) if latencies is None else latencies
     sampled = truth["joint_torque"].values
     # A filtered derivative does not jump with the rate of the command.
-    at_jump = np.array([law.lp, law.ld * (0.0 if law.filter_time else law.rate_weight)])
-    torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
+    jumps = np.array([law.lp, law.ld * (0.0 if law.filter_time else law.rate_weight)])
+    torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], jumps, timing, delays)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
-    read = angle - zeros + instruments.encoder_noise * rng.standard_normal(angle.shape)
+    reading = angle - zeros + instruments.encoder_noise * rng.standard_normal(angle.shape)
     step = instruments.encoder_resolution
-    read = step * np.round(read / step) if step else read
-    values = {"joint_torque": torque, "joint_angle": read}
+    reading = step * np.round(reading / step) if step else reading
+    values = {"joint_torque": torque, "joint_angle": reading}
     variables = with_joint_units(VARIABLES, instruments.prismatic)
     channels = described_dataset(
         values, record["time"].values, variables, joint=joint_numbers(torque)

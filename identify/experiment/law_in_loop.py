@@ -101,10 +101,11 @@ def prepared(
     latencies (frames,)  Latencies of the commands, s, that the law knows. The default is the
                          latency of the timing.
 
-    Raises ScenarioError if the law is unknown, if it needs torque commands but the drives do not
-    accept them, or if the actuators cannot hold the platform. Raises TrajectoryError if the motion
-    leaves the robot's reach or a joint's travel. The message names the time and the leg. Raises
-    SimulationError if the gains are unstable with this model, or a user's own law fails.
+    Raises ScenarioError if the law is unknown or returns no `LawInLoop`, if it needs torque
+    commands but the drives do not accept them, or if the actuators cannot hold the platform. Raises
+    TrajectoryError if the motion leaves the robot's reach or a joint's travel. The message names
+    the time and the leg. Raises SimulationError if the gains are unstable with this model, or a
+    user's own law fails.
     """
     loop = plant.loop
     timing = plant.runs.timing
@@ -123,34 +124,36 @@ def prepared(
             settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time)
         )
     model = Model(robot, known.parameters, settings.friction, known.doubt)
-    asked = feedback(loop.control, timing)
+    settled = feedback(loop.control, timing)
     usual = np.full(len(times), timing.latency_s)
-    found = chosen_law(
+    in_loop = chosen_law(
         Assignment(
             model=model,
             motion=motion.motion,
             frames=len(times),
             settings=settings,
-            feedback=asked,
+            feedback=settled,
             holding=plant.holding(desired[0]),
             latencies=usual if latencies is None else latencies,
             noise=seen.noise,
             common=seen.common,
         )
     )
-    if not isinstance(found, LawInLoop):
-        raise ScenarioError(f"law {law!r} must return a LawInLoop, returned {type(found).__name__}")
-    if found.drives.torques and not loop.control.torque_access:
+    if not isinstance(in_loop, LawInLoop):
+        raise ScenarioError(
+            f"law {law!r} must return a LawInLoop, returned {type(in_loop).__name__}"
+        )
+    if in_loop.drives.torques and not loop.control.torque_access:
         raise ScenarioError(
             f"law {law} sets torques, but the drives of {robot.name} do not accept them: "
             "control.torque_access = false; feedforward needs only joint commands"
         )
     # The feedback of this law uses the model, so a wrong model can make it unstable.
     if law == "computed_torque":
-        check_torque_gains(model, settings, desired[0], asked)
-    if isinstance(found.controller, EveryFrame):
-        return replace(found, controller=EveryFrame(_plugin_law(law, found.controller.command)))
-    return replace(found, controller=found.controller and _plugin_law(law, found.controller))
+        check_torque_gains(model, settings, desired[0], settled)
+    if isinstance(in_loop.controller, EveryFrame):
+        return replace(in_loop, controller=EveryFrame(_plugin_law(law, in_loop.controller.command)))
+    return replace(in_loop, controller=in_loop.controller and _plugin_law(law, in_loop.controller))
 
 
 def _plugin_law(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:

@@ -31,7 +31,7 @@ def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
 
 
 def meshed_parts(geometry: RobotGeometry) -> NDArray[np.bool_]:
-    """Return which parts of the legs are meshes of the robot file, in the order of the meshes."""
+    """Return whether each part of `robot_meshes`, in their order, is a mesh of the robot file."""
     return np.array([bool(geometry.meshes_of(part.body)) for part in _drawn(geometry)[0]])
 
 
@@ -69,20 +69,20 @@ def stated_mesh(stated: BodyMesh, name: str) -> trimesh.Trimesh:
 
 @lru_cache(maxsize=16)
 def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """Return the parts of a geometry sorted by body, their names, and their unsorted indices."""
+    """Return the parts of a geometry sorted by body, their names, and their indices (n,) in it."""
     parts = parts_of(geometry).all
-    places = sorted(range(len(parts)), key=lambda place: parts[place].body)
+    order = sorted(range(len(parts)), key=lambda place: parts[place].body)
     return (
-        [parts[place] for place in places],
-        tuple(parts[place].name for place in places),
-        np.array(places),
+        [parts[index] for index in order],
+        tuple(parts[index].name for index in order),
+        np.array(order),
     )
 
 
 def robot_transforms(robot: Robot, pose: Array) -> PlacedBodies:
-    """Return base_from_body (4, 4) of all parts of the legs with the platform at a pose (6,).
+    """Return base_from_body (n, 4, 4) of all parts of the legs with the platform at a pose (6,).
 
-    The order is that of their meshes.
+    The order is that of `robot_meshes`.
     """
     _, names, order = _drawn(robot.geometry)
     parts = parts_of(robot.geometry)

@@ -155,7 +155,7 @@ class Plant:
         load: Array | None = None,
         law: LawInLoop | None = None,
     ) -> ClosedLoopRun:
-        """Follow a reference under a servo that knows the nominal robot.
+        """Follow a reference under a control law, by default a servo that knows the nominal robot.
 
         Parameters
         ----------
@@ -168,7 +168,7 @@ class Plant:
         load : ndarray, shape (p,), optional
             Change of the parameters by the load on the platform.
         law : LawInLoop, optional
-            Control law. The default is the servo alone.
+            Control law, possibly with a feedforward to the servo. The default is the servo alone.
 
         Returns
         -------
@@ -178,8 +178,8 @@ class Plant:
         Raises
         ------
         LoopFailure
-            If the robot leaves its reach. Under the servo, the message adds whether the linearised
-            loop is stable.
+            If the loop is unstable or the robot leaves its reach. Under the servo, the message adds
+            whether the linearised loop is stable.
         DynamicsError
             Errors of `dynamics.closed_loop.simulate_servo`.
         ScenarioError
@@ -211,11 +211,11 @@ class Plant:
             # The linearised loop describes only the servo.
             if law.controller is not None and not law.by_servo:
                 raise
-            said = stability.verdict(self.robot, parameters, settings, reference.poses[0])
-            raise LoopFailure(f"{error}; {said}", error.frame, error.saturated) from None
+            verdict = stability.verdict(self.robot, parameters, settings, reference.poses[0])
+            raise LoopFailure(f"{error}; {verdict}", error.frame, error.saturated) from None
 
     def without_latency(self) -> Plant:
-        """Return the plant in a loop without latency. Control laws know that there is none."""
+        """Return the plant in a loop without latency and dropout, as control laws then know."""
         none = ("latency_s", "latency_jitter_s", "latency_std_s", "dropout")
         timing = self.runs.timing.model_copy(update=dict.fromkeys(none, 0.0))
         settings, known = (
@@ -245,9 +245,9 @@ class Plant:
             prismatic=self.robot.layout.prismatic,
         )
         # These are already among the parameters or variables.
-        among = {"drive_gains", "values", "inertia", "gains", "passive_friction"}
-        among |= {"joint_zero_error_rad", "joint_zero_error_m"}
-        switches = self.switches.model_dump(exclude_none=True, exclude=among)
+        stated = {"drive_gains", "values", "inertia", "gains", "passive_friction"}
+        stated |= {"joint_zero_error_rad", "joint_zero_error_m"}
+        switches = self.switches.model_dump(exclude_none=True, exclude=stated)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
@@ -277,10 +277,11 @@ class Plant:
 def with_command_errors(
     settings: LoopSettings, nominal: Robot, switches: PlantSwitches, zeros: bool
 ) -> LoopSettings:
-    """Return the settings of a loop with the commands that the drives of a plant receive.
+    """Return the settings of a loop with the errors of commands on their way to a plant's drives.
 
-    zeros: False if the true geometry contains the zeros of the joints, as that of a plant whose
-    geometry is calibrated. Raises the ScenarioErrors of `true_zeros`.
+    They are joint zeros, scale, resolution and limits. zeros: False if the true geometry already
+    contains the zeros of the joints, as for a plant whose geometry is calibrated. Raises the
+    ScenarioErrors of `true_zeros`.
     """
     off = true_zeros(nominal, switches)
     limits = of_actuators(nominal, switches, "command_limits")
@@ -338,10 +339,9 @@ class PlatformLoad:
 
 
 def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator) -> PlatformLoad:
-    """Draw a known load.
+    """Draw the true load about a stated load, with the stated standard deviations.
 
-    The true values scatter about the stated values with the stated standard deviations. Draws with
-    a negative mass or moment are repeated. Raises the RecordError of `load_parameters`.
+    Draws with a negative mass or moment are repeated. Raises the RecordError of `load_parameters`.
     """
     figures = np.array(load.figures)
     std = np.array(load.figures_std)
@@ -354,12 +354,12 @@ def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator)
     true = drawn()
     while (true[[0, 4, 5, 6]] < 0).any():
         true = drawn()
-    spread = np.linalg.norm(load_errors(layout, figures, std), axis=1)
+    changes_std = np.linalg.norm(load_errors(layout, figures, std), axis=1)
     return PlatformLoad(
         figures,
         std,
         true,
         load_parameters(layout, figures),
-        spread,
+        changes_std,
         load_parameters(layout, true),
     )

@@ -1,8 +1,8 @@
 """Stereo rig as the estimator knows it.
 
-It is known exactly, from a calibration with pictures of a board, or with a stated covariance. The
-covariance comes from a calibration file, or from a calibration with fifteen photographs. The true
-cameras are always those of the sensor file.
+The rig is known exactly, from a calibration with pictures of a board, or with a stated covariance.
+The covariance comes from a calibration file, or from a calibration with fifteen photographs. The
+true cameras are always those of the sensor file.
 """
 
 from dataclasses import replace
@@ -32,7 +32,7 @@ from identify.scenario.sections import RIG_KNOWN, Rig
 LARGEST_RATIO = 1.5
 # Largest angle [rad] of right cameras, or of baselines, at which two rigs count as the same.
 ANGLE = np.deg2rad(10.0)
-SHARE = 0.1  # largest distance of principal points of such rigs, as a share of the image size
+SHARE = 0.1  # largest distance of principal points of such rigs, as a fraction of the image size
 
 
 def known_rig(
@@ -154,9 +154,9 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
         return float(estimates[index]), float(rig.parameters[index])
 
     # The last six parameters are translation and rotation vector of right_from_left.
-    places = [(Rotation.from_rotvec(one[21:]), one[18:21]) for one in (estimates, rig.parameters)]
-    turned = (places[0][0].inv() * places[1][0]).magnitude()
-    lengths = [float(np.linalg.norm(place)) for _, place in places]
+    poses = [(Rotation.from_rotvec(one[21:]), one[18:21]) for one in (estimates, rig.parameters)]
+    turned = (poses[0][0].inv() * poses[1][0]).magnitude()
+    lengths = [float(np.linalg.norm(baseline)) for _, baseline in poses]
     ratios = {f"{side}.fx_px": both(f"{side}.fx_px") for side in ("left", "right")} | {
         "baseline [m]": tuple(lengths)
     }
@@ -171,8 +171,8 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
             there, here = both(name)
             if not abs(there - here) < SHARE * size:
                 return f"{name} is {there:.5g} there, {here:.5g} of the sensor"
-    along = np.arccos(np.clip(places[0][1] @ places[1][1] / np.prod(lengths), -1.0, 1.0))
-    for what, angle in (("right camera", turned), ("baseline", along)):
+    swung = np.arccos(np.clip(poses[0][1] @ poses[1][1] / np.prod(lengths), -1.0, 1.0))
+    for what, angle in (("right camera", turned), ("baseline", swung)):
         if not angle < ANGLE:
             return (
                 f"the direction of the {what}, seen from the left camera, differs by "

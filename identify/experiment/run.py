@@ -106,7 +106,7 @@ def run_plant(
     duration_s  Length of the run.
     seed        Seed of the experiment.
     run         Number of the run; 0 is the excitation.
-    advance     Function that is called once per frame.
+    advance     Function that is called with the number of further frames, 1 by default.
     load        Load on the platform.
     law         Name of the control law. It knows the scenario's initial guess and the stated load.
 
@@ -133,9 +133,9 @@ def run_plant(
         )
         model = guess.values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
-    done = plant.run(reference, eye.over(times), latencies.true, true_load, in_loop)
-    record = _record(plant, reference, done, eye, seed, latencies.known)
-    truth = plant.truth(done)
+    motions = plant.run(reference, eye.over(times), latencies.true, true_load, in_loop)
+    record = _record(plant, reference, motions, eye, seed, latencies.known)
+    truth = plant.truth(motions)
     if in_loop is not None:
         store_law(record, law, in_loop.drives)
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
@@ -143,13 +143,13 @@ def run_plant(
     if (
         isinstance(sensor, cmmsim.Sensor)
         and (not runs.rig.exact or sensor.method == "registration")
-        and done.measured_ok.any()
+        and motions.measured_ok.any()
     ):
         # A late exposure shifts a pose in proportion to its rate, so rates are needed.
-        poses = without_gaps(done.measured, done.measured_ok)
+        poses = without_gaps(motions.measured, motions.measured_ok)
         rates = spline_derivatives(poses, runs.timing.frame_rate_hz)[0]
-        found = sensor.common_errors(poses, rates)
-        store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
+        common = sensor.common_errors(poses, rates)
+        store_common_errors(record, CommonErrors(common.names, common.changes, common.covariance))
     if watch is not None and (finding := watch.finding).judged_frames:
         store_finding(record, finding.to_dict())
     store_anchor(
@@ -164,7 +164,7 @@ def run_plant(
 def delay_right_camera(sensor: PoseSensor, rig: Rig, seed: int) -> None:
     """Delay the right camera's exposure by a random draw from its stated uncertainty.
 
-    All runs of a seed have the same delay.
+    All runs of a seed have the same delay. A rig with a stated delay keeps this delay.
     """
     if isinstance(sensor, cmmsim.Sensor) and rig.right_later_s is None and rig.right_later_std_s:
         drawn = np.random.default_rng(stream_seed(seed, EXPOSURES)).standard_normal()
@@ -174,7 +174,7 @@ def delay_right_camera(sensor: PoseSensor, rig: Rig, seed: int) -> None:
 def _watched(sensor: PoseSensor, rig: Rig, frames: int) -> DriftWatch | None:
     """Let the cameras drift during a run of this many frames, and return the drift watch.
 
-    It is None for poses by planes and for a sensor without images.
+    The watch is None if it is turned off, for poses by planes, and for a sensor without images.
     """
     if not isinstance(sensor, cmmsim.Sensor):
         return None
@@ -193,9 +193,9 @@ def drawn_latencies(timing: Timing, frames: int, seed: int, run: int) -> Latenci
     if not timing.latency_std_s:
         return Latencies(known, known)
     drawn = np.random.default_rng(stream_seed(seed, MEAN_LATENCY)).standard_normal()
-    off = timing.latency_std_s * drawn
+    error = timing.latency_std_s * drawn
     # No command acts before it is issued.
-    true = np.maximum((timing.latency_s if known is None else known) + np.full(frames, off), 0.0)
+    true = np.maximum((timing.latency_s if known is None else known) + np.full(frames, error), 0.0)
     return Latencies(true, known)
 
 

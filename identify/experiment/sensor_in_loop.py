@@ -24,7 +24,8 @@ from identify.progress import Advance, Progress
 from identify.random_streams import CALIBRATION, TEACHING, stream_seed
 from identify.scenario.sections import Rig
 
-# Largest distance, m, from a leg's end to the sensor file's platform, and between both homes.
+# Largest allowed distance, m, of a leg's end outside the sensor file's platform, and between the
+# homes of this platform and of the robot.
 OFF_PLATFORM_M = 0.05
 # Next step if the platform of the sensor is not that of the robot.
 OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE names it"
@@ -120,7 +121,8 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
 def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
     """Return how far (n,) [m] the legs' ends lie outside the platform of a sensor file.
 
-    The second value is the distance [m] between the home of this platform and the robot's home.
+    Ends inside have negative values. The second value is the distance [m] between the home of this
+    platform and the robot's home.
     """
     body = marked_body("platform", file.platform)
     cuts = file.platform.cuts
@@ -167,7 +169,7 @@ def _covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
 class PoseSensor(Protocol):
     """Sensor in the loop: `cmmsim.Sensor`, or an object with the same methods.
 
-    For a sensor with `sees_bodies = False`, the places of the legs are not computed.
+    For a sensor with `sees_bodies = False`, the poses of the legs are not computed.
     """
 
     def start_run(self, seed: int) -> None:
@@ -190,9 +192,9 @@ class PoseSensor(Protocol):
 class DrawnFrames:
     """Measurements of a sensor that does not look at the platform, drawn before the run.
 
-    noise (N, 6): what each measurement adds to the true pose, m and rad. covariance (6, 6):
-    covariance of one measurement. lost: the reason for which each frame is lost, empty for a
-    measured frame.
+    noise (N, 6)       Error of each measurement, m and rad.
+    covariance (6, 6)  Covariance of one measurement.
+    lost               Reason for which each frame is lost, empty for a measured frame.
     """
 
     noise: Array
@@ -238,7 +240,7 @@ class SensorInLoop:
 
     @property
     def common(self) -> Array:
-        """Covariance (6, 6) of the teaching error, which all poses near home have in common."""
+        """Covariance (6, 6) of the teaching error that all poses near home share, 0 if untaught."""
         taught = getattr(self._sensor, "taught", None)
         return (
             np.zeros((6, 6))
@@ -251,7 +253,7 @@ class SensorInLoop:
 
         Only the renderer uses the true pose. The rate causes motion blur.
         """
-        # Computing the places of the legs does not count as time of the sensor.
+        # Computing the poses of the legs does not count as time of the sensor.
         bodies = robot_transforms(self._robot, pose) if self._sees_bodies else None
         began = time.perf_counter()
         measured = self._sensor.measure(pose, bodies, rate)

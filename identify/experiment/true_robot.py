@@ -35,7 +35,8 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
     Full bodies and passive friction are those of the robot file, unless the plant states others. A
     body is also full if the plant states a true first moment or product of inertia of it, and a
     passive joint has friction if the plant states its true value. Raises ScenarioError, with the
-    valid names, for a true value of a parameter that the robot does not have.
+    valid names, for a true value of a parameter that the robot or the law of its drives does not
+    have.
     """
     of_plant = in_form(in_file, switches)
     stated = of_plant.layout
@@ -78,7 +79,7 @@ def with_true_bodies(robot: Robot, in_file: Robot, switches: PlantSwitches) -> R
 
 
 def _gains(layout: ParameterLayout) -> str:
-    """Return the names of the gains of a plant, with the setting for gains of each joint."""
+    """Return text with the names of a plant's gains, and the setting for gains of each joint."""
     names = ", ".join(JOINT_PID)
     if layout.own_gains:
         return f"with plant.gains = 'each' also with {names}"
@@ -86,7 +87,7 @@ def _gains(layout: ParameterLayout) -> str:
 
 
 def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
-    """Return the true parameters (p,): a named set with the drive gains and values of the plant.
+    """Return the true parameters (p,): a named set, changed by the plant's drive gains and values.
 
     Raises ScenarioError for a body that cannot exist, or a value that is not allowed.
     """
@@ -114,6 +115,7 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
 def true_zeros(robot: Robot, switches: PlantSwitches) -> Array:
     """Return the true coordinate minus the reading of each joint (n,) of a plant, rad or m.
 
+    The plant states a list of these zeros, or the standard deviation with which they are drawn.
     Raises ScenarioError for a list of a wrong length.
     """
     error = of_actuators(robot, switches, "joint_zero_error")
@@ -141,15 +143,15 @@ def true_friction_offsets(robot: Robot, switches: PlantSwitches) -> Array:
     key = f"plant.friction_offset_{unit.replace(' ', '_')}"
     if isinstance(offset, list) and len(offset) != joints:
         raise ScenarioError(f"{key} has {len(offset)} values, but {robot.name} has {joints} joints")
-    found = np.broadcast_to(np.array(offset, dtype=float), joints).copy()
+    offsets = np.broadcast_to(np.array(offset, dtype=float), joints).copy()
     coulomb = true_parameters(robot, switches)[robot.layout.coulomb]
-    if (beyond := np.abs(found) > coulomb).any():
+    if (beyond := np.abs(offsets) > coulomb).any():
         joint = int(np.argmax(beyond))
         raise ScenarioError(
-            f"{key} of joint {joint + 1} is {found[joint]:g} {unit}, beyond its Coulomb friction "
+            f"{key} of joint {joint + 1} is {offsets[joint]:g} {unit}, beyond its Coulomb friction "
             f"of {coulomb[joint]:g} {unit}: one direction would have less than none"
         )
-    return found
+    return offsets
 
 
 def true_robot(
@@ -158,8 +160,8 @@ def true_robot(
     """Return the robot with its true geometry.
 
     Without a calibration the geometry has the errors that the plant states. If this run calibrates
-    the geometry, the offsets of the encoders are added. With an earlier calibration, the true
-    geometry is drawn at random about the calibrated geometry, with its covariance.
+    the geometry, the zeros of the joints and the offsets of the encoders are added. With an earlier
+    calibration, the true geometry is drawn about the calibrated geometry from its covariance.
 
     Raises ScenarioError if the plant states errors and there is an earlier calibration.
     """
@@ -186,8 +188,8 @@ def true_deviations(
 ) -> Array:
     """Return the deviations (g,) of the true from the nominal geometric numbers, m and rad.
 
-    They include the zeros of the joints, and the offsets of the encoders, which are drawn with the
-    seed.
+    The deviations include the zeros of the joints and the offsets of the encoders. The offsets are
+    drawn with the seed.
     """
     drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
     true = misplaced(robot, switches).geometry

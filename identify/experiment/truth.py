@@ -1,4 +1,4 @@
-"""Truth of a simulated run, in its own netCDF group. Only validation and reports read it."""
+"""Truth of a simulated run, in its own netCDF group. The estimator never reads the truth."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -103,8 +103,8 @@ def build_truth(
 def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
     """Read and check the truth of a file, or of one of its runs (``"run01"``).
 
-    Raises RecordError if the file is truncated or holds no truth, or if a variable is missing or
-    has a wrong shape.
+    Raises RecordError if the file is truncated or holds no truth, or if a variable is missing, has
+    a wrong shape or is not finite.
     """
     group = f"{run}/{TRUTH_GROUP}" if run else TRUTH_GROUP
     return check_truth(read_group(path, group), f"{path}:{group}")
@@ -129,13 +129,13 @@ def true_values(truth: Mapping[str, float], names: Iterable[str]) -> list[float]
     For parameters that the plant has in another form see `known_value`. Raises RecordError if a
     parameter is missing.
     """
-    found = []
+    values = []
     for name in names:
         value = known_value(truth, name)
         if value is None:
             raise RecordError(f"the truth has no {name}")
-        found.append(value)
-    return found
+        values.append(value)
+    return values
 
 
 def true_parameters(truth: xr.Dataset) -> dict[str, float]:
@@ -150,10 +150,7 @@ def true_parameters(truth: xr.Dataset) -> dict[str, float]:
 
 
 def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
-    """Return the truth if it is complete and finite.
-
-    Raises RecordError that names the first fault.
-    """
+    """Return the truth if it is complete and finite, or raise RecordError for the first fault."""
     expected = VARIABLES | {name: entry for name, entry in MISMATCH.items() if name in truth}
     check_variables(truth, expected, source)
     for name in expected:

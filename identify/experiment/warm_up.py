@@ -42,8 +42,8 @@ def warm_up(
     """Compile the code of the runs of a plant, and of further robots, into the caches on disk.
 
     Each task has its own process, because LLVM compiles on one core. All cores are used. The loop
-    depends on the number of joints, not on the robot. Robots with as many joints as another one
-    wait until that one is compiled, and then find the loop in the cache.
+    depends on the number of joints, not on the robot. A robot with as many joints as an earlier one
+    waits until the earlier one is compiled, and then finds the loop in the cache.
 
     Raises the errors of a run before its first frame, IdentifyError if a process dies, and
     WriteError if code cannot be stored.
@@ -103,7 +103,7 @@ def _side_by_side(
         while waiting or running:
             unfinished = {process.name for process in waiting + running}
             ready = [one for one in waiting if after.get(one.name) not in unfinished]
-            # tasks for which others wait begin first
+            # Tasks for which others wait begin first.
             ready.sort(key=lambda one: one.name not in after.values())
             for process in ready[: cores() - len(running)]:
                 waiting.remove(process)

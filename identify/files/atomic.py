@@ -86,8 +86,7 @@ def write_files(
 ) -> None:
     """Write several files: all of them, or none.
 
-    Files are renamed once all of them are on the disk. If a rename fails, which is rare, new files
-    are removed, but files that have already replaced older ones stay.
+    If a final rename fails, however, files that have already replaced older ones stay.
 
     ``parents`` is as in `write_bytes`. ``check`` is called with the temporary path of the first
     file before any file is renamed, and can refuse the files by an exception.
@@ -136,10 +135,7 @@ def check_writable(path: Path | str) -> None:
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Make a folder and its parents. Return the folders that were missing, the outermost first.
-
-    Raises OSError if the folder cannot be made. New parents are then removed.
-    """
+    """Make a folder and its parents, or none. Return those that were missing, outermost first."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -157,10 +153,7 @@ def remove_empty_folders(folders: list[Path]) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of a killed process from a folder and its subfolders.
-
-    Folders within subfolders are not searched.
-    """
+    """Remove temporary files and folders of a killed process from a folder and its subfolders."""
     for path in (*folder.glob(f"{TEMPORARY}*"), *folder.glob(f"*/{TEMPORARY}*")):
         with suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()

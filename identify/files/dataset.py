@@ -292,9 +292,7 @@ def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:
-    """Read the names (p,) of parameters and their covariance (p, p).
-
-    The tuple of names is empty if the file has no names.
+    """Read the names (p,) of parameters, empty if the file has none, and their covariance (p, p).
 
     Raises RecordError if the file is damaged or lacks the covariance, if a covariance is not
     finite, or if a variance is not positive.

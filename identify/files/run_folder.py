@@ -73,10 +73,7 @@ class RunFolder:
 
     @property
     def records(self) -> tuple[str, ...]:
-        """Names of the files with records for an identification.
-
-        Records of excitation runs are sorted by name. The record with the payload follows them.
-        """
+        """Names of the records for an identification: runs by name, then that with the payload."""
         found = sorted(path.name for path in self.path.glob("experiment*.nc"))
         return (*found, *([self.payload.name] if self.payload.is_file() else []))
 
@@ -215,9 +212,9 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
 
 
 def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
-    """Return the six figures [um, urad] of one entry, ``rms`` or ``std`` as named by ``of``.
+    """Return the six figures [um, urad] of one entry, ``rms`` or ``std`` according to ``of``.
 
-    A null figure is NaN. Without an entry, all six are NaN.
+    A null figure is NaN. Without an entry, all figures are NaN.
     """
     if not figures:
         return [math.nan] * 6

@@ -6,7 +6,7 @@ from pydantic import model_validator
 
 from identify.scenario.section import Section, quantity
 
-# Figures of a load, with their units: mass, centre of mass, and moments about it.
+# Units of a load's figures: mass, centre of mass, and moments of inertia about the centre of mass.
 FIGURES = {
     "mass": "kg",
     "x": "m",

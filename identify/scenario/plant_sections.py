@@ -34,10 +34,7 @@ AUTO = "auto"  # drive of a model whose law is determined from the record
 
 
 def check_filter(drive: str, seconds: float | None) -> None:
-    """Check that only the filtered drive has a time constant of a filter.
-
-    Raises ValueError otherwise.
-    """
+    """Raise ValueError unless the filtered drive, and no other, has a filter's time constant."""
     if (drive == FILTERED) != (seconds is not None):
         raise ValueError(
             f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs "
@@ -358,10 +355,7 @@ class Model(_Side):
 
     @property
     def drive_law(self) -> DriveName:
-        """Law of the drives.
-
-        If it is determined from the record, it is the law of the paper until then.
-        """
+        """Law of the drives. The law auto stands for the paper's PID until a record settles it."""
         return "pid" if self.drive == "auto" else self.drive
 
     def with_drive(self, law: DriveName) -> "Model":

@@ -34,8 +34,8 @@ from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, 
 if TYPE_CHECKING:
     from cmmsim.files import SensorFile
 
-# Sections of a scenario that only the estimator reads. A user can change them after the record was
-# made, but no other sections.
+# Sections of a scenario with the settings of the estimator. A user can change these, and no other
+# sections, after the record was made.
 ESTIMATOR_SECTIONS = ("identification", "model", "filter")
 # Settings in these sections on which the record depends. The record includes what its scale anchor
 # measured.
@@ -216,7 +216,7 @@ class Scenario(Section):
         return self.with_overrides(overrides) if overrides else self
 
     def estimator_settings(self) -> dict[str, Any]:
-        """Return all settings of the estimator by dotted path, except those that are not set."""
+        """Return all settings of the estimator by dotted path, except those that are None."""
         return {
             f"{section}.{name}": value
             for section in ESTIMATOR_SECTIONS
@@ -316,8 +316,8 @@ def _dotted(entries: Mapping[str, Any], section: str = "") -> Iterator[tuple[str
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
     """Read a scenario from TOML text, whose paths are relative to the current folder.
 
-    ``source`` names it in error messages. Raises ScenarioError if the text is not TOML or not a
-    valid scenario.
+    ``source`` names the text in error messages. Raises ScenarioError if the text is not TOML or not
+    a valid scenario.
     """
     return SCENARIOS.from_toml(text, source)
 
@@ -344,7 +344,7 @@ def tables_by_name() -> Iterator[tuple[str, Any]]:
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    # The keys of such a table can contain dots, so the path is split only up to the table.
+    # Names in a table by name can contain dots, so the path is split only up to the table.
     tables = ("sensor_changes", *(table for table, _ in tables_by_name()))
     table = next((one for one in tables if path.startswith(f"{one}.")), "")
     *sections, key = path.split(".", table.count(".") + 1 if table else -1)

@@ -1,4 +1,4 @@
-"""Sections of a scenario that do not concern the control loop.
+"""Sections of a scenario about excitation, estimator, cameras, validation and geometry.
 
 Each field states its unit and its limits. A section checks only its own values.
 """
@@ -105,7 +105,7 @@ RIG_KNOWN = ["exact", "calibrated", "photographs"]
 
 
 class Rig(Section):
-    """Estimator's knowledge of the cameras.
+    """Estimator's knowledge of the cameras, and their errors and drift.
 
     The true cameras, which take the images, are described in the sensor file.
     """
@@ -261,7 +261,7 @@ class Validation(Section):
 class Geometry(Section):
     """Kinematic calibration by static poses (`cmmsim geometry`).
 
-    It also states how well servo and estimator of a run know the geometry.
+    The section also states how well servo and estimator of a run know the geometry.
     """
 
     known: str = Field(

@@ -102,8 +102,8 @@ class SettingsFiles(Generic[Settings]):
 def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
     """Return the absolute path of a file that is named relative to a folder.
 
-    A built-in name is returned unchanged. So is a name that is neither built in nor a file, because
-    the reader of the file then refuses it and lists the valid names.
+    A built-in name is returned unchanged. So is a name that does not end with .toml and is no file,
+    because the reader of the file then refuses it and lists the valid names.
     """
     path = folder / name
     if name in built_in or not (path.suffix == ".toml" or is_file(path)):
@@ -123,7 +123,7 @@ def to_toml(model: BaseModel) -> str:
 def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
     """Return TOML text as a template for a file.
 
-    It is the text of `to_toml`, but a value that is not stated is commented out, and shows the
+    The text is that of `to_toml`, but a value that is not stated is commented out, and shows the
     default or no value. Only the given fields and sections are written, by default all of them.
     """
     return _text(model, lambda owner, name: "" if name in owner.model_fields_set else "# ", only)
@@ -134,10 +134,7 @@ def _text(
     before: Callable[[BaseModel, str], str | None],
     only: Collection[str] | None = None,
 ) -> str:
-    """Return TOML text.
-
-    ``before`` returns the prefix of a field's entry, or None if the field has no entry.
-    """
+    """Return TOML text. ``before`` returns the prefix of a field's entry, or None for no entry."""
 
     def entries(section: BaseModel) -> list[str]:
         fields = type(section).model_fields.items()
@@ -234,7 +231,7 @@ def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
     """
     owner: Any = model
     for part in path[:-1]:
-        # The next part of the path is a key chosen by the user, and names no field.
+        # In a mapping, this part of the path is a key chosen by the user, and names no field.
         if get_origin(owner) is dict:
             owner = get_args(owner)[1]
         elif (

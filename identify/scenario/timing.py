@@ -1,8 +1,8 @@
 """Timing of sensor, servo and model: the times of exposures and of their commands.
 
-The file of the sensor states it, with keys without units, and a scenario can replace single values.
-Only this module uses both kinds of keys. It imports the sensor within functions, because the help
-of the command line does not need it.
+The sensor file states the timing, with keys without units. A scenario can replace single values.
+This module relates the two kinds of keys. It imports the sensor within functions, because the help
+of the command line does not need the sensor.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cmmsim.files import SensorFile
     from cmmsim.files import Timing as SensorTiming
 
-# Number of standard deviations by which the mean latency can exceed the stated one.
+# The loop must allow a true mean latency this number of standard deviations above the stated one.
 LATENCY_STDS = 5.0
 
 # Keys in the file of the sensor, by the keys in ``[timing]`` of a scenario.
@@ -86,7 +86,7 @@ class Timing(Section):
         return np.arange(self.frames(duration_s), dtype=float) * self.frame_period_s
 
     def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array | None:
-        """Draw the latency of each frame (frames,) [s]. None if all are equal to the mean."""
+        """Draw the latency of each frame (frames,) [s], or return None if all equal the mean."""
         return self.of_sensor().drawn_latencies(frames, rng) if self.latency_jitter_s else None
 
     def of_sensor(self) -> "SensorTiming":

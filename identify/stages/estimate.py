@@ -47,15 +47,15 @@ from identify.validation.unseen import model_on_record
 
 
 def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | None = None) -> None:
-    """Estimate the parameters from the record, and write result.json and covariance.nc.
+    """Estimate the parameters from the records of a run, and write result.json and covariance.nc.
 
-    The result does not contain the truth.
+    For a user's own record, model.nc is written as well. The result does not contain the truth.
 
     ``settings`` of the estimator, by dotted path, replace settings of the scenario. After a
     successful identification, scenario.toml holds them for the later stages.
 
-    Raises the errors of `identify.identify`, and ScenarioError for settings that do not
-    belong to the estimator.
+    Raises the errors of `identify.identify` and `RunFolder.require`, and ScenarioError for settings
+    that do not belong to the estimator.
     """
     run_folder = RunFolder(folder)
     if run_folder.holds_own_record:
@@ -154,7 +154,7 @@ def _identified_files(
     diagnosis = None
     finding = read_finding(first)
     misses = needs_cause(result.misfit, result.driven_misfit, result.whiteness.suspicious)
-    # The diagnosis has causes only for records with joint commands, and none of the sensor.
+    # The diagnosis needs joint commands, and knows no cause in the sensor, such as its drift.
     if result.drive.in_loop and misses and not (finding or {}).get("warning"):
         with progress.stage("diagnosis", 1) as advance:
             diagnosis = diagnosed(asked, result)
@@ -169,13 +169,13 @@ def _identified_files(
     ok = first["measured_ok"].values.astype(bool)
     covariance = result.whole_covariance
     # Later stages check by these digests whether the result belongs to its files.
-    made_of = {name: digest(one) for name, one in zip(names, asked.records, strict=True)}
-    made_of["covariance.nc"] = digest(covariance)
+    digests = {name: digest(one) for name, one in zip(names, asked.records, strict=True)}
+    digests["covariance.nc"] = digest(covariance)
     files = {}
     if heading["seed"] is None:
         runs = model_groups(build_model_run(first["time"].values, before, after))
         files[run_folder.model] = netcdf(runs)
-        made_of["model.nc"] = digest(runs)
+        digests["model.nc"] = digest(runs)
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     units = parameter_units(result.layout, result.common_errors.names)
     files[run_folder.covariance] = covariance_netcdf(units, covariance, result.sources)
@@ -183,7 +183,7 @@ def _identified_files(
         **heading,
         "date": str(first.attrs.get("created", ""))[:10] or None,
         "versions": versions(),
-        ENTRY: made_of,
+        ENTRY: digests,
         "seconds": {
             "record": first.attrs.get("record_seconds"),
             "identify": ended - began,

@@ -117,7 +117,8 @@ def error_budget(folder: Path | str) -> Budget:
         Variances by source of each entry of the measured pose (`pose.x`, ...), of each parameter,
         and of each entry of the predicted pose on the validation trajectories
         (`prediction.x`, ...). Variances of poses are means over all frames. There are no
-        predictions before the run is validated.
+        predictions before the run is validated, or for a validation run that the model fails to
+        predict.
 
     Raises
     ------
@@ -158,8 +159,8 @@ def error_budget(folder: Path | str) -> Budget:
 def pose_budget(record: xr.Dataset, side: ModelSide) -> Budget:
     """Return the budget of the measured poses of a record, as means over its frames.
 
-    It includes all common errors that the record states, even those that the identification takes
-    as exact.
+    The budget includes all common errors that the record states, even those that the identification
+    takes as exact.
     """
     noise = predicting_model(record, side).covariance
     parts = {NOISE: np.diag(noise)}

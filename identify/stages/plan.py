@@ -46,7 +46,7 @@ def is_planned(setup: Setup, folder: Path) -> bool:
 
 
 def begin(setup: Setup, folder: Path, progress: Progress) -> tuple[Setup, dict[str, float]]:
-    """Design the trajectories and teach the sensor.
+    """Design the trajectories, teach the sensor, and write the plan into a folder.
 
     Returns the setup with the taught sensor, and the duration of each stage in seconds.
     """
@@ -97,8 +97,8 @@ def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | Non
         return None, setup
     outcome = run_geometry(setup, progress)
     nominal = outcome.calibration.nominal
-    found = outcome.calibration.robot.geometry
-    robot = nominal.moved(found.deviations_from(nominal.geometry))
+    calibrated = outcome.calibration.robot.geometry
+    robot = nominal.moved(calibrated.deviations_from(nominal.geometry))
     known = KnownGeometry(robot, outcome.calibration.covariance)
     return outcome, replace(setup, loaded=setup.in_file, calibrated=known)
 
@@ -106,7 +106,7 @@ def _calibrated(setup: Setup, progress: Progress) -> tuple[GeometryOutcome | Non
 def check_planned(
     file: Path, record: xr.Dataset, setup: Setup, trajectories: TrajectorySet
 ) -> None:
-    """Raise EstimationError if a file's record does not follow the planned trajectory."""
+    """Raise EstimationError if a file's record does not follow the planned exciting trajectory."""
     scenario = setup.scenario
     try:
         duration_s = scenario.excitation.duration_s
@@ -116,7 +116,7 @@ def check_planned(
 
 
 def record_files(settings: Identification) -> tuple[str, ...]:
-    """Return the file names of the record and, if the anchor needs it, of the run under a load."""
+    """Return the file names of the record and, if it is the anchor, of the run with the payload."""
     return RECORDS if settings.scale_anchor == "payload" else RECORDS[:1]
 
 

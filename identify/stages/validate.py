@@ -54,7 +54,8 @@ def validate(
 ) -> None:
     """Run plant and models on the validation trajectories, and compare with the truth.
 
-    Writes validation.nc, model.nc and result.json.
+    Writes validation.nc, model.nc and result.json. ``taught`` are the frames of the sensor. By
+    default the sensor is taught again, with the same result. For the workers see `run_unseen`.
 
     Raises RecordError if the result is incomplete, or was made from another record or covariance.
     Raises OutputFolderError for a user's own record, because its truth is unknown.

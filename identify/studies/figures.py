@@ -49,8 +49,8 @@ BESIDE = 1.02  # ratio between the abscissae of two neighbouring curves with the
 # Largest number of separate curves. If the other factors have more settings, all rows form one
 # curve.
 MOST_CURVES = 6
-NEAREST_TICKS = 0.09  # smallest distance of two ticks of a vertical axis, as a share of the axis
-LETTER = 0.034  # width of a letter of a tick label, as a share of the axis
+NEAREST_TICKS = 0.09  # smallest distance of two ticks of a vertical axis, as a fraction of the axis
+LETTER = 0.034  # width of a letter of a tick label, as a fraction of the axis
 # Choices of ticks within a decade of a logarithmic axis. The first choice that fits is used.
 TICKS: list[list[float]] = [
     [1 + k / 10 for k in range(90)],
@@ -60,7 +60,7 @@ TICKS: list[list[float]] = [
     [1, 3],
     [1],
 ]
-MOST_TICKS = 7
+MOST_TICKS = 7  # largest number of ticks of an axis
 
 Others = Sequence[tuple[str, pd.DataFrame]]  # names and finished rows of other studies
 
@@ -135,7 +135,7 @@ def _figures(
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
     """Plot the rms of each figure with its band against one factor.
 
-    There is a curve for each setting of the other factors.
+    There is a curve for each setting of the other factors. For a sample, single rows are plotted.
     """
     figure, panels = panel_grid(len(shown), *PANEL)
     others = [other for other in study.factors if other != path]
@@ -145,9 +145,9 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
             axes.plot(_shown(have[path]), have[name], ".", markersize=4)
         else:
             curves = _curves(have, others)
-            for place, (label, rows) in enumerate(curves):
-                levels = _beside(rows[path], place, len(curves))
-                _curve(axes, levels, rows[name].to_numpy(dtype=float), label, place)
+            for index, (label, rows) in enumerate(curves):
+                levels = _beside(rows[path], index, len(curves))
+                _curve(axes, levels, rows[name].to_numpy(dtype=float), label, index)
         drawn = (name, None, path)
         laws = [one for one in study.theory if (one.figure, one.per, one.factor) == drawn]
         if laws and laws[0].exponent is not None:
@@ -164,7 +164,7 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
 def map_figure(
     study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]
 ) -> Figure:
-    """Draw maps of the rms of each figure over two factors. Other factors are averaged."""
+    """Draw maps of the rms of each figure over two factors, whatever the other factors are."""
     figure, panels = panel_grid(len(shown), *PANEL)
     for axes, name in zip(panels, shown, strict=True):
         squares = done.assign(square=done[name] ** 2)
@@ -201,8 +201,8 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         others = [path for path in study.factors if path != factor and factor in study.factors]
         have = rows_with_figures(law, done)
         curves = _curves(have, others)
-        for place, (label, rows) in enumerate(curves):
-            levels = _beside(_levels(study, rows, factor), place, len(curves))
+        for index, (label, rows) in enumerate(curves):
+            levels = _beside(_levels(study, rows, factor), index, len(curves))
             look = looks.setdefault(label, len(looks))
             _curve(axes, levels, law_data(law, rows), label, look)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
@@ -240,7 +240,7 @@ def _title(figure: Figure, text: str) -> None:
 
 
 def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
-    """Draw one legend of all panels below them, where it covers no data."""
+    """Draw one legend below all panels, where it covers no data, if any curve has a label."""
     found: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
@@ -268,11 +268,11 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
     ]
 
 
-def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
-    """Shift the levels of one of several curves a little, so that bands do not overlap."""
+def _beside(levels: pd.Series, index: int, count: int) -> pd.Series:
+    """Shift the levels of one of several curves, if positive, so that bands do not overlap."""
     if count == 1 or not pd.api.types.is_numeric_dtype(levels) or not (levels > 0).all():
         return levels
-    return levels * BESIDE ** (place - (count - 1) / 2)
+    return levels * BESIDE ** (index - (count - 1) / 2)
 
 
 def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, look: int) -> None:
@@ -283,14 +283,14 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, look: int) 
     groups = pd.Series(values, index=levels.index).groupby(
         levels, sort=pd.api.types.is_numeric_dtype(levels)
     )
-    places, points = zip(
+    drawn, points = zip(
         *[(level, point_statistics(one.to_numpy())) for level, one in groups], strict=True
     )
-    shown = _shown(pd.Series(places))
+    abscissae = _shown(pd.Series(drawn))
     rms = np.array([point.rms for point in points])
     low, high = np.array([point.rms_band or (point.rms, point.rms) for point in points]).T
     axes.errorbar(
-        shown,
+        abscissae,
         rms,
         yerr=(rms - low, high - rms),
         capsize=3,
@@ -317,7 +317,7 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
 
 
 def scale(axes: Axes, factor: pd.Series) -> None:
-    """Make axes logarithmic if all their values are positive, with ticks that do not touch."""
+    """Make each axis logarithmic if all its values are positive, with ticks that do not touch."""
     if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
         levels = (
@@ -354,9 +354,9 @@ def _log_ticks(low: float, high: float) -> list[float]:
     """Return round numbers between the ends of a logarithmic axis, as many as fit."""
     decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     inside: list[float] = []
-    for places in TICKS:
-        found = [place * 10.0**decade for decade in decades for place in places]
-        inside = [value for value in found if low <= value <= high]
+    for mantissas in TICKS:
+        ticks = [mantissa * 10.0**decade for decade in decades for mantissa in mantissas]
+        inside = [value for value in ticks if low <= value <= high]
         if len(inside) <= MOST_TICKS and _far_apart(inside, low, high) == inside:
             return inside
     # No choice fits, so every k-th tick of the last choice is used, with k rounded up.
@@ -370,15 +370,15 @@ def _set_ticks(axis: Axis, values: list[float]) -> None:
 
 
 def _far_apart(
-    values: list[float], low: float, high: float, share: float = NEAREST_TICKS
+    values: list[float], low: float, high: float, distance: float = NEAREST_TICKS
 ) -> list[float]:
     """Return a selection of ascending values with a minimum distance.
 
-    `share` is this distance as a share of a logarithmic axis.
+    `distance` is a fraction of the logarithmic axis from `low` to `high`.
     """
     kept: list[float] = []
     for value in values:
-        if not kept or np.log(value / kept[-1]) >= share * np.log(high / low):
+        if not kept or np.log(value / kept[-1]) >= distance * np.log(high / low):
             kept.append(value)
     return kept
 

@@ -17,15 +17,15 @@ from identify.studies.rows.gauntlet.verdict import GROUPS
 from identify.studies.study_file import Study
 
 STEM = "gauntlet"  # name of the files, before their suffix
-DOUBLED = 2.0  # smallest misfit with which a case counts in the shares of one and two causes
-LEVEL = 0.95  # probability of the intervals of shares
+DOUBLED = 2.0  # smallest misfit with which a case counts in the fractions of one and two causes
+LEVEL = 0.95  # confidence of the intervals of fractions
 
 
 @dataclass(frozen=True)
 class Share:
-    """Share of cases.
+    """Fraction ``share`` of right answers, from their number ``right`` and that of the cases.
 
-    low, high: Clopper and Pearson's interval of the share (binomial). goal: goal as text.
+    low, high: Clopper and Pearson's interval of the fraction (binomial). goal: goal as text.
     """
 
     what: str
@@ -40,8 +40,8 @@ class Share:
 def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each case in the table of a study of kind `gauntlet`.
 
-    Kinds of trouble and groups of causes have their names, while the table has numbers for them. A
-    row that could not be computed has the verdict "failed".
+    Kinds of trouble and groups of causes have their names, while the table has numbers for them.
+    The verdict is "failed" if the diagnosis is wrong or the row could not be computed.
     """
     own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
     # A row that could not be computed lacks its figures, which are NaN here.
@@ -101,9 +101,12 @@ def _name(names: tuple[str, ...], places: pd.Series) -> list[str]:
 
 
 def shares(cases: pd.DataFrame) -> list[Share]:
-    """Return the share of right answers for each sort of case, and for the fitted sizes."""
+    """Return the fraction of right answers for each sort of case, and for the fitted sizes.
+
+    Sorts without cases are left out.
+    """
     shown = cases["misfit"] >= DOUBLED
-    # a case that stopped with an error has no misfit, but counts as well
+    # A case that stopped with an error has no misfit, but counts as well.
     shown |= cases["stopped"] == 1
     one, two = (cases[(cases["wrong"] == sort) & shown] for sort in ("one", "two"))
     known = pd.concat([one, two])
@@ -135,11 +138,11 @@ def _share(what: str, values: pd.Series, goal: str) -> Share:
 
 
 def coverage(cases: pd.DataFrame) -> dict[str, float]:
-    """Return the share of intervals that contain the truth in cases whose cause was named.
+    """Return the percentage of intervals that contain the truth in cases diagnosed right.
 
-    Its standard deviation is that between cases, because the intervals of one case depend on each
-    other. Cases in which nothing is identified after the remedy are counted separately. The result
-    is empty if no cause was named.
+    ``std_percent`` is the standard error of the mean over cases, because the intervals of one case
+    depend on each other. Cases without identified quantities after the remedy, and thus without
+    intervals, are counted separately. The result is empty if no case has intervals.
     """
     named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
     percent = named["covered_percent"].dropna()
@@ -156,9 +159,10 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
 
 
 def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
-    """Yield each kind of trouble, its number of cases and of right ones, median misfit, coverage.
+    """Yield each kind of trouble with figures of the cases that have this one trouble only.
 
-    The cases have this one trouble only.
+    The figures are the numbers of cases and of right answers, the median misfit, and the mean
+    percentage of intervals that contain the truth.
     """
     single = cases[cases["wrong"].isin(["one", "outside"])]
     for name in TROUBLES:

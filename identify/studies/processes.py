@@ -36,10 +36,7 @@ GB = 1e9
 
 
 def check_memory(study: Study, shared: Shared, workers: int) -> None:
-    """Raise StudyError if the longest rows, one per worker, need more memory than is installed.
-
-    Nothing is checked for a kind of row that does not state its memory.
-    """
+    """Raise StudyError if the longest rows, one per worker, need more memory than is installed."""
     kind = find_kind(study.kind)
     if kind.memory is None:
         return
@@ -148,7 +145,7 @@ class ProcessExecutor:
         return [worker for worker in self._workers if worker.pipe in reporting]
 
     def _collect(self, worker: "_Worker", batches: Batches, suspects: Suspects) -> list[Finished]:
-        """Return the rows that a process has computed, or the failed row of a process that has died.
+        """Return the rows that a process has computed, or the failed row of a dead process.
 
         The list is empty if the process has become ready, or if its rows will be computed again.
         """

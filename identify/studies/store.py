@@ -122,10 +122,7 @@ class Journal:
             self.surplus += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
-        """Yield the row and the end (byte offset) of each line, without an incomplete final line.
-
-        Raises StudyError for a damaged line.
-        """
+        """Yield row and end [byte] of each complete line. Raises StudyError for a damaged line."""
         with self.path.open("rb") as file:
             end = 0
             for number, line in enumerate(file, 1):
@@ -258,10 +255,7 @@ def _has_rows(folder: Path) -> bool:
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
-    """Return the content of study.json, or None if there is no such file.
-
-    Raises StudyError if the file is damaged.
-    """
+    """Return the content of study.json, or None without it. Raises StudyError if it is damaged."""
     if not path.exists():
         return None
     try:

@@ -1,10 +1,10 @@
 """Design of a study: its rows, and the checks before any row is computed.
 
-Rows are numbered repeat by repeat, and within a repeat point by point, with the last factor varying
-fastest. The seed of row n is the n-th child that ``numpy.random.SeedSequence(seed).spawn`` returns.
+Rows are numbered from 0 repeat by repeat, and within a repeat point by point, with the last factor
+varying fastest. The seed of row n is ``numpy.random.SeedSequence(seed).spawn(n + 1)[n]``.
 The figures of a row therefore do not depend on the machines, on the order of work, or on further
-repeats. Without repeats they do not depend on further points of a sample either. Rows are generated
-on demand, so a large grid takes no memory.
+repeats. With a single repeat they do not depend on further points of a sample either. Rows are
+generated on demand, so a large grid takes no memory.
 """
 
 import difflib
@@ -124,38 +124,39 @@ class Design:
         lists = {
             path: values for path, values in self._study.factors.items() if isinstance(values, list)
         }
-        places = np.unravel_index(point, [len(values) for values in lists.values()])
+        indices = np.unravel_index(point, [len(values) for values in lists.values()])
         return {
-            path: values[place] for (path, values), place in zip(lists.items(), places, strict=True)
+            path: values[index]
+            for (path, values), index in zip(lists.items(), indices, strict=True)
         }
 
     def _drawn(self, point: int) -> dict[str, Any]:
-        shares = zip(self._study.factors, self._shares[point], strict=True)
-        return {path: self._value(path, share) for path, share in shares}
+        fractions = zip(self._study.factors, self._fractions[point], strict=True)
+        return {path: self._value(path, fraction) for path, fraction in fractions}
 
     @cached_property
-    def _shares(self) -> np.ndarray:
-        """Position of each point (points, factors) between the ends of each factor, in [0, 1)."""
+    def _fractions(self) -> np.ndarray:
+        """Positions (points, factors) of the points between the ends of each factor, in [0, 1)."""
         rng = mixed_generator(SAMPLED_POINTS, self._study.seed)
         return rng.random((self._study.points, len(self._study.factors)))
 
-    def _value(self, path: str, share: float) -> Any:
+    def _value(self, path: str, fraction: float) -> Any:
         values = self._study.factors[path]
         if isinstance(values, list):
-            return values[int(share * len(values))]
+            return values[int(fraction * len(values))]
         # A user's own kind has no model of its options, and its module is not needed here.
         kind = KINDS.get(self._study.kind)
         field = field_of(path, kind.options if kind else None)
         if field is not None and field.annotation is int:
             # All integers from low to high are equally probable.
-            return int(values.low) + int(share * (values.high - values.low + 1))
+            return int(values.low) + int(fraction * (values.high - values.low + 1))
         if values.scale == "log":
-            return float(values.low * (values.high / values.low) ** share)
-        return float(values.low + (values.high - values.low) * share)
+            return float(values.low * (values.high / values.low) ** fraction)
+        return float(values.low + (values.high - values.low) * fraction)
 
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the overrides of a scenario for settings with ``scenario.`` and ``sensor.``."""
+    """Return the overrides of a scenario for settings with ``scenario.`` and ``sensor.`` only."""
     found = {}
     for path, value in settings.items():
         root, _, key = path.partition(".")
@@ -219,16 +220,16 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
                 f"figures has {name!r}, which is not a figure of {study.kind}; "
                 f"{_nearest(name, kind.columns)}"
             )
-    for place, law in enumerate(study.theory, start=1):
+    for number, law in enumerate(study.theory, start=1):
         try:
             _check_law(law, study, list(kind.columns))
         except StudyError as error:
-            raise StudyError(f"[[theory]] {place}: {error}") from error
+            raise StudyError(f"[[theory]] {number}: {error}") from error
     return shared
 
 
 def _check_keys(study: Study, kind: Kind) -> None:
-    """Refuse keys that do not exist or are given twice, and values of the wrong type."""
+    """Raise StudyError for unknown, misplaced or repeated keys, and wrong or repeated values."""
     for path, value in study.changes.items():
         if path.startswith("options."):
             raise StudyError(f"changes.{path}: options of all rows belong in [options]")
@@ -256,7 +257,7 @@ def _check_keys(study: Study, kind: Kind) -> None:
 
 
 def _check_values(path: str, values: list[Any], kind: Kind) -> None:
-    """Refuse a path that does not exist, and values that are not of its type.
+    """Raise StudyError for a path that does not exist, and for values that are not of its type.
 
     Options of a user's own kind are not checked.
     """
@@ -309,7 +310,7 @@ def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
     found: dict[str, FieldInfo] = {}
     for name, field in model.model_fields.items():
         kinds = (field.annotation, *get_args(field.annotation))
-        inner = next((a for a in kinds if isinstance(a, type) and issubclass(a, BaseModel)), None)
+        inner = next((t for t in kinds if isinstance(t, type) and issubclass(t, BaseModel)), None)
         # A list of sections counts as one value, because no dotted path leads to its entries.
         listed = getattr(field.annotation, "__origin__", None) is list
         if inner is None or listed:
@@ -333,7 +334,7 @@ def _nearest(name: str, known: Collection[str]) -> str:
 
 
 def _check_law(law: Law, study: Study, figures: list[str]) -> None:
-    """Refuse a law with unknown figures, or with factors or values that the study does not vary.
+    """Raise StudyError for a law with unknown figures, or with factors or values not varied.
 
     The figures of a user's own kind are unknown before its rows are computed. `figures` is then
     empty, and the figures of the law are not checked.

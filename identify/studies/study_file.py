@@ -194,15 +194,15 @@ class Study(Section):
             if path in single:
                 data[path] = value
             elif root in ("scenario", "sensor", "options") and key:
-                place = "options" if root == "options" else "changes"
+                table = "options" if root == "options" else "changes"
                 name = key if root == "options" else path
                 data["factors"] = _without(data["factors"], path)
-                data[place] = _without(data[place], name)
+                data[table] = _without(data[table], name)
                 is_range = isinstance(value, dict) and set(value) & set(Range.model_fields)
                 if isinstance(value, list) or is_range:
                     data["factors"][path] = value
                 else:
-                    data[place][name] = value
+                    data[table][name] = value
             else:
                 raise StudyError(
                     f"unknown key {path!r} of study {self.name!r}; valid names: "
@@ -264,7 +264,7 @@ def study_schema() -> dict[str, Any]:
 
 
 def _factor(path: str, value: Any) -> Any:
-    """Return a list or a range. Raises ValueError for anything else."""
+    """Return a factor's list of values or range. Raises ValueError for anything else."""
     if isinstance(value, (list, Range)):
         return value
     if not isinstance(value, Mapping):
@@ -283,7 +283,7 @@ def _without(values: dict[str, Any], path: str) -> dict[str, Any]:
 
 
 def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
-    """Flatten nested tables by dotted path. A table with one of the keys ``keep`` is a value."""
+    """Flatten nested tables by dotted path. Tables that are empty or have a key in ``keep`` stay."""
     if not isinstance(tables, Mapping):
         return tables
     found: dict[str, Any] = {}

@@ -17,7 +17,8 @@ they were single normal numbers, the worst case. A single row has no band.
 A law states an exponent or a ratio, with a tolerance. The law fails if no value within the
 tolerance lies in the 99 % interval of the measured value. Otherwise the law passes if the interval
 is narrow. If the interval is wide, there are too few rows, and the law is undecided. One true law
-in a hundred fails by chance.
+in a hundred fails by chance. A law of order passes as soon as its interval excludes every decrease
+beyond the tolerance, however wide the interval is.
 """
 
 from dataclasses import dataclass
@@ -31,9 +32,9 @@ from identify.arrays import Array
 from identify.errors import StudyError
 from identify.studies.study_file import Law, Study
 
-ITERATIONS = 100
-STEP_TOLERANCE = 1e-10
-SMALLEST = 1e-12  # smallest square at the start of the fit, as a share of the largest one
+ITERATIONS = 100  # largest number of steps of the fit
+STEP_TOLERANCE = 1e-10  # the fit ends before a step that changes all logarithms by less than this
+SMALLEST = 1e-12  # smallest square at the start of the fit, as a fraction of the largest one
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
 
 
 def _sandwich(design: Array, residuals: Array) -> Array:
-    """Return the covariance of the coefficients.
+    """Return the sandwich estimate (k, k) of the covariance of the coefficients.
 
     Residuals are enlarged according to their leverage (HC3), because rows can be few.
     """
@@ -106,7 +107,7 @@ def _sandwich(design: Array, residuals: Array) -> Array:
     return np.asarray(bread @ (scores.T @ scores) @ bread, dtype=float)
 
 
-BAND_CONFIDENCE = 0.95
+BAND_CONFIDENCE = 0.95  # confidence of the bands of a mean and an rms
 
 
 @dataclass(frozen=True)
@@ -143,21 +144,21 @@ def point_statistics(values: Array) -> Statistics:
     if count < 2:
         return Statistics(count, mean, None, rms, None, None)
     std = float(np.std(values, ddof=1))
-    wide = reach(BAND_CONFIDENCE, count - 1)
-    half = wide * std / np.sqrt(count)
+    quantile = reach(BAND_CONFIDENCE, count - 1)
+    half = quantile * std / np.sqrt(count)
     # Standard error of the logarithm of the mean square.
-    spread = (
+    log_error = (
         float(np.linalg.norm(values**2 / np.mean(values**2) - 1.0)) / (count - 1) if rms else 0.0
     )
-    factor = float(np.exp(0.5 * wide * spread))
+    factor = float(np.exp(0.5 * quantile * log_error))
     return Statistics(
         count, mean, std, rms, (mean - half, mean + half), (rms / factor, rms * factor)
     )
 
 
-CONFIDENCE = 0.99
-# Largest half-width of an interval with which a law passes. The interval is of an exponent, or of
-# the logarithm of a ratio.
+CONFIDENCE = 0.99  # confidence of the interval of a measured exponent or ratio
+# Largest half-width of an interval with which a law of an exponent or of equality passes. The
+# interval is of the exponent, or of the logarithm of the ratio.
 RESOLUTION = 0.2
 
 
@@ -167,8 +168,8 @@ class Verdict:
 
     law        The law.
     verdict    "passed", "failed" or "undecided".
-    measured   Measured exponent or ratio.
-    low, high  Ends of the interval of the measured value.
+    measured   Measured exponent or ratio, None if nothing could be measured.
+    low, high  Ends of the interval of the measured value, or None.
     rows       Number of rows used.
     reason     Reason why nothing could be measured.
     """
@@ -188,12 +189,12 @@ class Verdict:
         return (
             law
             | {"expected": self.law.expected}
-            | {k: v for k, v in vars(self).items() if k not in ("law", "verdict")}
+            | {name: value for name, value in vars(self).items() if name not in ("law", "verdict")}
         )
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
-    """Return a verdict for each law of a study. `frame` is its table; failed rows are excluded."""
+    """Return a verdict for each law of a study, from its table without the failed rows."""
     done = frame[frame["error"] == ""]
     return [_check(law, study, done) for law in study.theory]
 
@@ -206,8 +207,8 @@ def rows_with_figures(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
     needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
     for name in needed:
         if name not in frame.columns:
-            there = ", ".join(map(str, frame.columns)) if len(frame) else "none, as all rows failed"
-            raise StudyError(f"the rows have no figure {name!r}; they have {there}")
+            known = ", ".join(map(str, frame.columns)) if len(frame) else "none, as all rows failed"
+            raise StudyError(f"the rows have no figure {name!r}; they have {known}")
     return frame.dropna(subset=needed)
 
 
@@ -265,13 +266,13 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
-    """Test by the smallest step whether the figure grows along values of the factor."""
+    """Test by the smallest ratio of neighbours whether the figure grows along the factor."""
     if law.factor not in frame.columns:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
     chosen = frame[frame[law.factor].isin(values)]
-    place = chosen[law.factor].map(values.index).to_numpy(dtype=float)
-    steps = np.column_stack([2.0 * (place >= k) for k in range(1, len(values))])
+    rank = chosen[law.factor].map(values.index).to_numpy(dtype=float)
+    steps = np.column_stack([2.0 * (rank >= k) for k in range(1, len(values))])
     fit = scale_regression(
         law_data(law, chosen) ** 2, np.column_stack([_other_columns(law, study, chosen), steps])
     )
@@ -288,8 +289,8 @@ def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, floa
 
     The interval with the lowest low end is chosen.
     """
-    places = range(len(fit.coefficients) - steps, len(fit.coefficients))
-    low, k = min((fit.interval(k, CONFIDENCE)[0], k) for k in places)
+    indices = range(len(fit.coefficients) - steps, len(fit.coefficients))
+    low, k = min((fit.interval(k, CONFIDENCE)[0], k) for k in indices)
     return low, float(fit.coefficients[k]), fit.interval(k, CONFIDENCE)[1]
 
 
@@ -321,7 +322,7 @@ def _covariates(values: pd.Series) -> Array:
 
 
 def _numeric(name: str, frame: pd.DataFrame) -> Array:
-    """Return the values (n,) of a factor or figure, all positive."""
+    """Return the values (n,) of a factor or figure. Raises StudyError unless all are positive."""
     if name not in frame.columns:
         raise StudyError(f"the rows have no factor or figure {name!r}")
     values = pd.to_numeric(frame[name], errors="coerce").to_numpy(dtype=float)

@@ -25,8 +25,8 @@ class TrackingRun:
     """Run of a robot that follows a motion.
 
     ``desired`` (N, 6) are the desired poses. ``expected`` are the coordinates (N, m) and
-    covariances (N, m, m) that the observer predicted for each frame before its measurement. They
-    are None without an observer.
+    covariances (N, m, m) that the observer predicted for each frame before its measurement, or None
+    without an observer. ``torque_limit`` is the limit of each actuator, N m or N, or None.
     """
 
     run: ClosedLoopRun
@@ -45,10 +45,10 @@ class TrackingRun:
         return saturated_frames(self.run.torque, self.torque_limit)
 
     def normalised_squared_error(self, robot: Robot) -> float | None:
-        """Return the normalised squared error of the observer's predictions.
+        """Return the normalised squared error of the observer's predictions, or None without one.
 
-        It is the mean of e^T P^-1 e / m, with the errors e of the predicted coordinates and their
-        predicted covariance P. It is None without an observer.
+        The error is the mean over frames of e^T P^-1 e / m, with the errors e of the m predicted
+        coordinates and their predicted covariance P.
         """
         if self.expected is None:
             return None
@@ -63,8 +63,8 @@ def by_drawing(
     """Return a substitute for a sensor, which draws the measured poses at random.
 
     The poses scatter about the true poses with a covariance (6, 6). Lost frames (N,) have no pose.
-    With ``exact`` the poses are the true poses, and their stated covariance is nearly zero, so that
-    an observer trusts them.
+    With ``exact`` all frames have their true poses, also lost ones, and the stated covariance is
+    nearly zero, so that an observer trusts the poses.
     """
     # All frames are drawn at once, so that a lost frame does not shift the noise of later ones.
     factor = np.linalg.cholesky(covariance)

@@ -90,11 +90,11 @@ def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:
     speed = 2 * np.pi / turn_s
 
     def angle(t: Array) -> tuple[Array, Array, Array]:
-        share = np.clip(t / turn_s, 0.0, 1.0)
+        s = np.clip(t / turn_s, 0.0, 1.0)
         # The integral of the smooth step of fifth degree.
-        travelled = share**4 * (2.5 - 3 * share + share**2)
-        step = share**3 * (10 - 15 * share + 6 * share**2)
-        rising = 30 * share**2 * (1 - share) ** 2 / turn_s
+        travelled = s**4 * (2.5 - 3 * s + s**2)
+        step = s**3 * (10 - 15 * s + 6 * s**2)
+        rising = 30 * s**2 * (1 - s) ** 2 / turn_s
         turned = speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0))
         return turned, speed * step, speed * rising
 
@@ -104,7 +104,7 @@ def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:
         rows[:, 1] += radius * second
         return rows
 
-    def place(t: Array) -> Array:
+    def position(t: Array) -> Array:
         phi = angle(np.asarray(t))[0]
         return laid(np.cos(phi) - 1, np.sin(phi), home)
 
@@ -118,15 +118,15 @@ def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:
         second = np.cos(phi) * rising - np.sin(phi) * w**2
         return laid(first, second, 0 * home)
 
-    return CoordinateMotion(robot.geometry.chart, (place, rate, acceleration))
+    return CoordinateMotion(robot.geometry.chart, (position, rate, acceleration))
 
 
 def square(robot: Robot, side: float, edge_s: float) -> CoordinateMotion:
     """Return a motion along a square from home.
 
-    It moves along the first coordinate, then along the second, and back in the same order. Each
-    edge takes ``edge_s``, in s, and is a polynomial of fifth degree from rest to rest. Its jerk is
-    at most 60 side / edge_s^3.
+    The motion follows the first coordinate, then the second, and back in the same order. Each edge
+    takes ``edge_s``, in s, and is a polynomial of fifth degree from rest to rest. The jerk is at
+    most 60 side / edge_s^3.
     """
     home = robot.coordinates(robot.home_pose)
     corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
@@ -138,23 +138,23 @@ def square(robot: Robot, side: float, edge_s: float) -> CoordinateMotion:
         laid[:, :2] += whole * corners[edge] + along[:, None] * np.diff(corners, axis=0)[edge]
         return laid
 
-    def share(t: Array) -> Array:
+    def fraction(t: Array) -> Array:
         edge = np.clip(np.floor(np.asarray(t) / edge_s), 0, 3)
         return np.clip(np.asarray(t) / edge_s - edge, 0.0, 1.0)
 
-    def place(t: Array) -> Array:
-        s = share(t)
+    def position(t: Array) -> Array:
+        s = fraction(t)
         return rows(t, s**3 * (10 - 15 * s + 6 * s**2), home, 1.0)
 
     def rate(t: Array) -> Array:
-        s = share(t)
+        s = fraction(t)
         return rows(t, 30 * s**2 * (1 - s) ** 2 / edge_s, 0 * home, 0.0)
 
     def acceleration(t: Array) -> Array:
-        s = share(t)
+        s = fraction(t)
         return rows(t, 60 * s * (1 - s) * (1 - 2 * s) / edge_s**2, 0 * home, 0.0)
 
-    return CoordinateMotion(robot.geometry.chart, (place, rate, acceleration))
+    return CoordinateMotion(robot.geometry.chart, (position, rate, acceleration))
 
 
 def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:

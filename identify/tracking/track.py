@@ -1,6 +1,6 @@
 """Comparison of laws and models on the same motions.
 
-The results are the tracking error, the effort, and the shares of the error by cause.
+The results are the tracking error, the effort, and the fractions of the squared error by cause.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ MODELS = ("initial", "identified", "true")
 # Number of the first run. The runs of an identification have smaller numbers, so the random streams
 # are separate.
 FIRST_RUN = 2_000_000
-# Parts that are made exact, one at a time, to determine their share of the error.
+# Parts that are made exact, one at a time, to determine their fraction of the squared error.
 EXACT = ("sensor", "model", "latency")
 
 PARTS = ("position", "orientation")
@@ -92,9 +92,9 @@ def track(
     if run_folder and "identified" in models:
         known["identified"] = model_of_run(plant, run_folder, scenario.robot)
     unseen = LoopSensor(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
-    # Whether a law can follow a motion does not depend on the model, so any model will do.
+    # Of these checks, only that of the gains of computed_torque depends on the model. They precede
+    # the teaching of the sensor, because teaching takes long.
     true = known_model(plant, "true")
-    # This check precedes the teaching of the sensor, because teaching takes long.
     for law in laws:
         for motion in followed:
             prepared(plant, law, true, motion, unseen)
@@ -171,9 +171,9 @@ def model_of_result(found: IdentificationResult) -> KnownModel:
 
 
 def _fitted_doubt(misfit: Misfit | None) -> float:
-    """Return the torque uncertainty of an identified model.
+    """Return `KnownModel.doubt` of an identified model.
 
-    If the model does not explain the record, it is the uncertainty of a guess.
+    A model that does not explain its record is doubted like a guess.
     """
     return GUESSED_DOUBT if misfit is None or misfit.significant else FITTED_DOUBT
 
@@ -239,12 +239,12 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
                 frames += error.frame
                 saturated += error.saturated
             # A failed run has figures up to the frame of its failure, and no errors.
-            told = {
+            failure = {
                 "failed": f"{motion.name}: {error}",
                 "frames": frames,
                 "saturated_frames": saturated,
             }
-            return told | rms_figures(np.full((1, 6), np.nan))
+            return failure | rms_figures(np.full((1, 6), np.nan))
         frames += len(done.errors)
         saturated += done.saturated
         errors.append(done.errors)
@@ -273,11 +273,11 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
 def _shares(
     task: Tracking, law: str, known: KnownModel, covariance: Array, advance: Advance
 ) -> dict[str, Any]:
-    """Return the shares of the squared error by cause, for position and orientation.
+    """Return the fractions of the squared error by cause, for position and orientation.
 
-    A share is the part of the error that disappears with an exact sensor, an exact model or zero
-    latency. The rest completes the sum to one. The measured poses of these runs are drawn with the
-    noise that the sensor stated.
+    A cause's fraction disappears with an exact sensor, an exact model or zero latency. The rest
+    completes the sum to one. All are NaN if a run failed. The measured poses of these runs are
+    drawn with the noise that the sensor stated.
     """
     base = _drawn(task, law, known, covariance, None, advance)
     shares = {}
@@ -285,11 +285,11 @@ def _shares(
         exact = _drawn(task, law, known, covariance, what, advance)
         # A component without motion has no error, and a failed run has NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
-            left = [
+            remaining = [
                 np.nansum(exact[part]) / np.nansum(base[part])
                 for part in (slice(0, 3), slice(3, 6))
             ]
-        shares[what] = dict(zip(PARTS, (1 - np.array(left)).tolist(), strict=True))
+        shares[what] = dict(zip(PARTS, (1 - np.array(remaining)).tolist(), strict=True))
     rest = {part: 1 - sum(share[part] for share in shares.values()) for part in PARTS}
     return shares | {"rest": rest}
 
@@ -302,14 +302,17 @@ def _drawn(
     exact: str | None,
     advance: Advance,
 ) -> Array:
-    """Return the mean squared errors (6,) over all motions, with one part exact."""
+    """Return the mean squared errors (6,) over all motions with one part exact.
+
+    They are NaN if a run fails.
+    """
     plant = task.plant
     if exact == "latency":
         plant = plant.without_latency()
     timing = plant.runs.timing
     squares = []
     for number, motion in enumerate(task.motions):
-        # The runs for all causes have the same noise, so it does not affect their differences.
+        # The runs for all causes have the same noise, so that it cancels in their differences.
         rng = np.random.default_rng(child(task.seed, TRACKED, number))
         lost = rng.random(timing.frames(motion.duration_s)) < timing.dropout
         seen = by_drawing(covariance, lost, rng, exact == "sensor")

@@ -2,9 +2,9 @@
 
 A built-in kind is one file here, and an entry in ``KINDS``. A user's own kind is named
 ``module:function``. The function is ``run(scenario, seed)`` or ``run(scenario, seed, options)``,
-where ``seed`` is the row's ``numpy.random.SeedSequence``, and ``options`` are given by name. It
-returns the figures of the row by name, with units in the names. Workers must be able to import the
-module.
+where ``seed`` is the row's ``numpy.random.SeedSequence``, and ``options`` is a dict of the row's
+options by name. The function returns the figures of the row by name, with units in the names.
+Workers must be able to import the module.
 """
 
 import inspect

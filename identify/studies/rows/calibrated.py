@@ -53,9 +53,10 @@ from identify.studies.rows.kind import PROBABILITY, Column, KeysRead, Kind, Row
 from identify.studies.rows.row_sensor import SensorOptions, row_pose_sensor
 from identify.validation.pose_prediction import PosePrediction, predicted_runs
 
+# Children of the seed of a row, in addition to `identified.EXPERIMENT`.
 TRUTH = 1
 TRAJECTORIES = 2
-FRAME = 3  # children of the seed of a row, beside `identified.EXPERIMENT`
+FRAME = 3
 AT_REST = 1e-9  # largest change of a pose, m or rad, while the platform rests
 MOST_TRUTHS = 50  # largest number of truths that are drawn for a row
 INNER = 0.683  # probability of the shorter intervals, one standard deviation to both sides
@@ -124,9 +125,11 @@ def drawn_truth(
 class StableExperiments:
     """Runs of a plant with a drawn truth.
 
-    record: run of the exciting trajectory. unseen: run of another trajectory. unstable: number of
-    truths drawn before, whose loop is unstable. redrawn: number of values, in all truths, that
-    were drawn again because they were impossible.
+    plant     Plant with the truth.
+    record    Run of the exciting trajectory.
+    unseen    Run of another trajectory.
+    unstable  Number of truths drawn earlier, whose loop is unstable.
+    redrawn   Number of values, in all truths, that were drawn again because they were impossible.
     """
 
     plant: Plant
@@ -230,35 +233,35 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Calibrati
 
 
 def log_of_moving_robot(record: xr.Dataset, from_s: float, robot: Robot) -> xr.Dataset:
-    """Return the part of a record from a time on at which the robot already moves.
+    """Return the part of a record that begins at a time at which the robot already moves.
 
-    Its time starts at 0, and it holds no reference. Raises StudyError if fewer than two frames
-    remain, or if the record stores, frame by frame, errors that all frames have in common. The
-    returned record could not state such errors.
+    The time of the part starts at 0, and the part holds no reference. Raises StudyError if fewer
+    than two frames remain, or if the record stores, frame by frame, errors that all frames have in
+    common. The returned record could not state such errors.
     """
-    left = record.isel(time=np.flatnonzero(record["time"].values >= from_s))
-    if left.sizes["time"] < 2:
+    part = record.isel(time=np.flatnonzero(record["time"].values >= from_s))
+    if part.sizes["time"] < 2:
         raise StudyError(
             f"options.log_from_s is {from_s:g} s, the record ends after "
             f"{float(record['time'][-1]):.4g} s"
         )
     if CHANGES in record:
         raise StudyError("options.log_from_s needs options.sensor = drawn")
-    began = float(left["time"][0])
-    made = build_timed_record(
-        time=left["time"].values - began,
-        measured_pose=recorded_poses(left, "measured"),
-        measured_covariance=left["measured_covariance"].values,
-        measured_ok=left["measured_ok"].values,
-        acting=left[COMMAND_TIME].values - began,
-        command=left["command"].values,
+    began = float(part["time"][0])
+    log = build_timed_record(
+        time=part["time"].values - began,
+        measured_pose=recorded_poses(part, "measured"),
+        measured_covariance=part["measured_covariance"].values,
+        measured_ok=part["measured_ok"].values,
+        acting=part[COMMAND_TIME].values - began,
+        command=part["command"].values,
         scenario_toml=record.attrs["scenario"],
         robot=robot.name,
         frame_rate_hz=float(record.attrs["frame_rate_hz"]),
         prismatic=robot.layout.prismatic,
     )
-    store_anchor(made, read_anchor(record, robot.layout))
-    return made
+    store_anchor(log, read_anchor(record, robot.layout))
+    return log
 
 
 def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
@@ -284,18 +287,18 @@ def parameter_figures(result: IdentificationResult, plant: Plant) -> Row:
 
 
 def moving_frames(poses: Array) -> NDArray[np.int_]:
-    """Return the frames whose pose differs from the first of poses (N, 6), or else the last frame.
+    """Return the indices of poses (N, 6) that differ from the first pose, or else the last index.
 
     While joints stick at the start, the platform rests there, and every prediction is exact.
     """
-    left = np.flatnonzero(np.abs(poses - poses[0]).max(axis=1) > AT_REST)
-    return left if len(left) else np.array([len(poses) - 1], dtype=np.int_)
+    moved = np.flatnonzero(np.abs(poses - poses[0]).max(axis=1) > AT_REST)
+    return moved if len(moved) else np.array([len(poses) - 1], dtype=np.int_)
 
 
 def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> Row:
     """Return the probability of values below each true coordinate of a frame, and the coverage.
 
-    The coordinates are those in which the platform moves.
+    Coordinates in which the platform cannot move are left out.
     """
     free = predicted.chart.basis
     error = (true_poses(unseen.truth)[frame] - predicted.poses[frame]) @ free
@@ -310,7 +313,7 @@ def pose_figures(predicted: PosePrediction, unseen: Experiment, frame: int) -> R
 
 
 def inner(below: Array, probability: float) -> Array:
-    """Return whether each truth lies in the central interval of a probability.
+    """Return for each truth whether the central interval of a probability contains it, (n,) bool.
 
     below (n,): stated probabilities of values below the truths.
     """

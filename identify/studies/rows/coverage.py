@@ -43,9 +43,10 @@ def coverage(
     Returns
     -------
     Row
-        Number of intervals of identified quantities, share of these intervals that contain the
-        truth, share of true coordinates on the validation trajectories within their predicted
-        interval, and rms error of the predicted positions.
+        Number of intervals of identified quantities, percentage of these intervals that contain the
+        truth, percentage of true coordinates on the validation trajectories within their predicted
+        interval, and rms error of the predicted positions. The first percentage is absent if
+        nothing is identified.
     """
     held = intervals_hold(result, plant)
     errors = np.concatenate(
@@ -72,9 +73,9 @@ def quantities(
 ) -> Iterator[tuple[str, float, float, bool, bool]]:
     """Yield every parameter, and every group of several parameters, with its error.
 
-    Each entry is the name, the error in standard deviations, the relative standard deviation,
-    whether the quantity counts as identified, and whether its 95 % interval contains the truth.
-    `truth` holds the true parameters (p,).
+    Each entry is the name, the error in standard deviations, the standard deviation relative to the
+    truth (infinite if the truth is zero), whether the quantity counts as identified, and whether
+    its 95 % interval contains the truth. `truth` holds the true parameters (p,).
     """
     groups = result.groups
     parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
@@ -84,12 +85,12 @@ def quantities(
         result.group_intervals,
         groups.several,  # a group of one parameter would count this parameter twice
     )
-    for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
+    for stated, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
         for k in np.flatnonzero(counted):
-            error = found.estimate[k] - true[k]
-            std = found.std[k]
+            error = stated.estimate[k] - true[k]
+            std = stated.std[k]
             low, high = intervals[k]
             inside = bool(low <= true[k] <= high)
             # a product of inertia can be zero
             relative = std / abs(true[k]) if true[k] else np.inf
-            yield names[k], error / std, relative, bool(found.identifiable[k]), inside
+            yield names[k], error / std, relative, bool(stated.identifiable[k]), inside

@@ -85,7 +85,7 @@ COLUMNS = {
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
-    """Compute one row. A figure that an estimator does not return is missing in the row.
+    """Compute one row. A figure that is NaN or infinite for an estimator is absent from the row.
 
     Raises EstimationError, and the exceptions of experiment and sensor.
     """

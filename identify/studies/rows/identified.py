@@ -58,7 +58,7 @@ CHOSEN = {
 }
 """Sets of parameters over which an rms is computed, with their slice of the layout.
 
-Every record identifies these parameters, so their spread follows the noise.
+Every record identifies these parameters, so their errors scatter in proportion to the noise.
 """
 
 UNAWARE = "the same figure, identified without the errors that all frames have in common"
@@ -339,16 +339,16 @@ def prediction_figures(
     """Return the model's position error, and the error that the covariance of parameters predicts.
 
     `models` holds, for each trajectory, the poses (N, 6) of the estimated model and their
-    derivatives (N, 6, p) with respect to the parameters. `true` holds the poses of the true model.
-    Positions scatter less from row to row than single parameters.
+    derivatives (N, 6, p) with respect to the parameters. `true` holds the poses (N, 6) of the true
+    model. Errors of positions scatter less from row to row than errors of single parameters.
     """
     squares = []
     stated = []
     for (poses, slopes), true_ones in zip(models, true, strict=True):
-        shown = slopes[:, :3]
+        positions = slopes[:, :3]
         squares.append(float(np.mean((poses - true_ones)[:, :3] ** 2)))
-        spread = np.einsum("nip,pq,niq->ni", shown, covariance, shown, optimize=True)
-        stated.append(float(np.mean(spread)))
+        variances = np.einsum("nip,pq,niq->ni", positions, covariance, positions, optimize=True)
+        stated.append(float(np.mean(variances)))
     return {
         "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
         "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
@@ -358,8 +358,8 @@ def prediction_figures(
 def designed_trajectories(setup: Setup, seed: int) -> TrajectorySet:
     """Return the trajectories of a setup, designed once per process.
 
-    The design does not depend on the plant, nor on the sections rig and geometry of the scenario.
-    Rows that differ only there share their trajectories.
+    The design does not depend on the renderer, nor on the sections plant, rig and geometry of the
+    scenario. Rows that differ only there share their trajectories.
     """
     design = {"rig": Rig(), "plant": PlantSwitches(), "geometry": Geometry(), "renderer": "auto"}
     return _designed(setup.scenario.model_copy(update=design).to_toml(), seed)

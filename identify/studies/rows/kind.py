@@ -27,7 +27,7 @@ class IneffectiveKeys:
     """Keys that have no effect under a condition.
 
     keys   Dotted paths, or sections.
-    where  Condition: a test of the value of each dotted path. All tests must hold.
+    where  Tests of the values of dotted paths. The condition is that all tests hold.
     why    The condition as text for an error message, after "where".
     """
 
@@ -50,7 +50,7 @@ class KeysRead:
     ineffective: tuple[IneffectiveKeys, ...] = ()
 
     def covers(self, path: str) -> bool:
-        """Return whether the kind reads a dotted path under any condition."""
+        """Return whether the kind reads a dotted path under at least some condition."""
         return path.startswith("options.") or (
             among(path, self.keys) and not among(path, self.excluding)
         )
@@ -91,7 +91,7 @@ SENSOR = (
     "sensor.base.",
 )
 
-# Keys on which pictures and measured poses depend, beside the timing.
+# Keys on which pictures and measured poses depend, apart from the timing.
 PICTURES = ("scenario.sensor", "scenario.renderer", "scenario.pose_method", *SENSOR)
 
 BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientation_amplitude_rad")
@@ -159,12 +159,12 @@ BESIDE = (
 
 
 def check_read(study: Study, reads: KeysRead, first: Scenario, options: BaseModel) -> None:
-    """Refuse factors, changes and options that rows never read, or that have no effect in any row.
+    """Check that each factor, change and option of a study has an effect in at least one row.
 
     The check uses the statements of each kind about its keys. Computing rows to find keys without
     effect would take minutes per key.
 
-    reads    Keys that its kind reads.
+    reads    Keys that the study's kind reads.
     first    Scenario of the first row.
     options  Options of the first row, with their defaults.
 
@@ -252,8 +252,8 @@ class Kind:
                    arguments give the same row, whatever was computed before.
     what           Description of a row.
     columns        Figures of a row.
-    options        Model of the options.
-    reads          Keys that rows read.
+    options        Model of the options. None means that options are not checked.
+    reads          Keys that rows read. None means that keys without effect are not refused.
     takes_options  Whether options are allowed.
     memory         Function (setup, options) that returns the memory needed by a row, bytes. None
                    means little memory.
@@ -288,5 +288,5 @@ class Kind:
 
 @lru_cache(maxsize=4)
 def robot_named(name: str) -> Robot:
-    """Load a robot, once per process."""
+    """Load a robot. Each process caches the four robots used most recently."""
     return load_robot(name)

@@ -3,9 +3,9 @@
 The path is a random trajectory with the scenario's settings of the excitation. Exposure, latency,
 its jitter and dropout have the scenario's values. A row is a short stretch of the path from a
 random instant on. All pictures of the stretch are measured in one call. Each sticker is expected at
-its true place, so there is neither search nor tracking. A measured pose refers to the middle of its
+its true pixel, so there is neither search nor tracking. A measured pose refers to the middle of its
 exposure. The row has the error of the measured poses, and the error of the pose in use, which is
-the last pose that has arrived. Teaching is exact by default.
+the most recent pose that has arrived. Teaching is exact by default.
 """
 
 import numpy as np

@@ -28,7 +28,7 @@ from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16  # number of cached sensors per process. A sensor takes about a megabyte.
 DROPPED = "dropped frame"  # reason for which a drawn frame is lost
-# Way of teaching. ``exact``: frames and sticker places have no error, so rows show observation
+# Way of teaching. ``exact``: frames and sticker positions have no error, so rows show observation
 # noise alone. ``sensor``: the sensor teaches itself from images, seeded by the row (1.4 s per row).
 Teaching = Literal["exact", "sensor"]
 
@@ -48,7 +48,7 @@ class RowSensor:
     sensor       The sensor.
     truth        Teaching without error.
     middle (3,)  Middle of the baseline in the base frame, m.
-    rim          Mean radiance of a sticker and its ring.
+    rim          Mean radiance of a sticker and its ring, as a fraction of white.
     """
 
     sensor: cmmsim.Sensor
@@ -113,7 +113,7 @@ class DrawnSensor:
         return measurement_without_stickers(np.asarray(pose, dtype=float) + noise, self._covariance)
 
     def in_advance(self, frames: int) -> DrawnFrames:
-        """Return what the next calls of `measure` would draw."""
+        """Draw what the next calls of `measure` would draw, in their place."""
         drawn = [self._drawn() for _ in range(frames)]
         noise = np.array([one for one, _ in drawn]).reshape(frames, 6)
         reasons = [DROPPED if dropped else "" for _, dropped in drawn]
@@ -132,7 +132,8 @@ def rms_um(errors: Array) -> float:
 
 
 def stated_um(covariances: Array) -> tuple[float, float]:
-    """Return the rms standard deviations per axis of position, um, and orientation, urad.
+    """Return the rms over poses and axes of the standard deviations of position, um, and
+    orientation, urad.
 
     covariances (n, 6, 6): covariances of poses, m and rad.
     """

@@ -1,7 +1,7 @@
 """Rows of kind `static_pose`: the sensor alone looks at a platform that stands still.
 
 Each row draws one or several poses in the scenario's excitation box around the sensor's home pose,
-and takes several pictures of each pose. Stickers are searched near predicted places. The
+and takes several pictures of each pose. Stickers are searched near predicted pixels. The
 predictions have random errors, like those of a tracker. No picture is searched as a whole. Dropout
 removes pictures without changing the others. Teaching is exact by default, so that rows show
 observation noise alone.
@@ -46,8 +46,8 @@ POSES = 0
 SENSOR = 1
 DROPOUT = 2
 TOGETHER = 256  # pictures that are drawn and measured at once
-# Standard deviation of the predicted pose, m and rad, near which stickers are searched. It is the
-# error of a tracker's prediction.
+# Standard deviation of the error of the predicted pose, m and rad. Stickers are searched near this
+# pose, as by a tracker.
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
 
 COLUMNS = {
@@ -198,15 +198,16 @@ def _sticker_errors(
 ) -> tuple[Array, Array]:
     """Return the errors of the k stickers seen.
 
-    The first array (k, 3) holds distance, error along the line of sight and error across it, m. The
-    second array (2, k, 2) holds the errors of the centres in both images, px.
+    The first array (k, 3) holds the distance from the middle of the baseline, the signed error
+    along the line of sight, and the norm of the error across it, m. The second array (2, k, 2)
+    holds the errors of the centres in both images, px.
     """
     estimator = sensor.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
-    places = apply(cmmsim.pose_to_transform(pose), sensor.truth.platform_places[index])
-    in_camera = apply(invert(sensor.truth.base_from_camera), places)
+    in_base = apply(cmmsim.pose_to_transform(pose), sensor.truth.platform_places[index])
+    in_camera = apply(invert(sensor.truth.base_from_camera), in_base)
     pixels, _ = estimator.rig.project(in_camera)
-    sight = places - sensor.middle
+    sight = in_base - sensor.middle
     distance = np.linalg.norm(sight, axis=1)
     errors = (seen.points - in_camera) @ sensor.truth.base_from_camera[:3, :3].T
     along = np.einsum("ki,ki->k", errors, sight) / distance

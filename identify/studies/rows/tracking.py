@@ -135,7 +135,7 @@ READS = KeysRead(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
-    """Compute one row. Raises the exceptions of sensor, identification and laws (LoopFailure)."""
+    """Compute one row. Raises LoopFailure, and errors of sensor, identification and laws."""
     number = stream_seed(seed, EXPERIMENT)
     setup = row_setup(scenario, number)
     plant = setup.plant
@@ -194,7 +194,7 @@ def _against(done: list[TrackingRun], start: list[TrackingRun], truth: list[Trac
     row: Row = {}
     for name, axes, unit in AXES:
         with_own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
-        # If the platform lacks a coordinate, its error is zero, and the ratio is left out.
+        # If the platform cannot move along these axes, their error is zero, and so has no ratio.
         if with_truth:
             row |= {
                 f"starting_{name}_excess_{unit}": with_start - with_own,
