@@ -60,7 +60,7 @@ def stated_mesh(stated: BodyMesh, name: str) -> trimesh.Trimesh:
     mesh = closed_mesh(Path(stated.file), stated.scale, where)
     if (size := float(np.max(mesh.extents))) > LARGEST_SIZE_M:
         raise RobotFileError(
-            f"{where} is {size:g} m long, at most {LARGEST_SIZE_M:g} m is possible; a file in "
+            f"{where} is {size:g} m long, but at most {LARGEST_SIZE_M:g} m is possible; a file in "
             "millimetres needs scale = 0.001"
         )
     mesh.apply_transform(pose_to_transform(stated.pose))

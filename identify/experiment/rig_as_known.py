@@ -162,7 +162,7 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
     }
     for name, (there, here) in ratios.items():
         if not 1.0 / LARGEST_RATIO < there / here < LARGEST_RATIO:
-            return f"{name} is {there:.4g} there, {here:.4g} of the sensor"
+            return f"{name} is {there:.4g} in the calibration and {here:.4g} in the sensor file"
     for camera in ("left", "right"):
         for name, size in (
             (f"{camera}.cx_px", rig.left.width),
@@ -170,12 +170,12 @@ def _other_rig(estimates: Array, rig: StereoRig) -> str:
         ):
             there, here = both(name)
             if not abs(there - here) < SHARE * size:
-                return f"{name} is {there:.5g} there, {here:.5g} of the sensor"
+                return f"{name} is {there:.5g} in the calibration and {here:.5g} in the sensor file"
     swung = np.arccos(np.clip(poses[0][1] @ poses[1][1] / np.prod(lengths), -1.0, 1.0))
     for what, angle in (("right camera", turned), ("baseline", swung)):
         if not angle < ANGLE:
             return (
                 f"the direction of the {what}, seen from the left camera, differs by "
-                f"{np.rad2deg(angle):.0f} degrees from the sensor"
+                f"{np.rad2deg(angle):.0f} degrees from that in the sensor file"
             )
     return ""

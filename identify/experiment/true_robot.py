@@ -149,7 +149,7 @@ def true_friction_offsets(robot: Robot, switches: PlantSwitches) -> Array:
         joint = int(np.argmax(beyond))
         raise ScenarioError(
             f"{key} of joint {joint + 1} is {offsets[joint]:g} {unit}, beyond its Coulomb friction "
-            f"of {coulomb[joint]:g} {unit}: one direction would have less than none"
+            f"of {coulomb[joint]:g} {unit}: friction would be negative in one direction"
         )
     return offsets
 

@@ -287,7 +287,7 @@ def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
     fits = parts.shape[1:] == covariance.shape
     excess = (parts.sum(axis=0) - covariance) / np.outer(std, std) if fits else np.array(np.nan)
     if not np.abs(excess).max() < SUM_TOLERANCE:
-        raise RecordError(f"{path}: the sources of the covariance do not sum up to it")
+        raise RecordError(f"{path}: the parts of the covariance do not add up to the covariance")
     return dict(zip(map(str, data[SOURCE].values), parts, strict=True))
 
 

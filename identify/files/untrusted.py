@@ -33,7 +33,7 @@ def load(content: bytes, group: str | None, most: float = math.inf) -> Content:
     with xr.open_dataset(io.BytesIO(content), group=group or None, engine=ENGINE) as dataset:
         if dataset.nbytes > most:
             raise ValueError(
-                f"it holds {dataset.nbytes / 1e6:.0f} MB, the limit is {most / 1e6:.0f} MB"
+                f"it holds {dataset.nbytes / 1e6:.0f} MB, but the limit is {most / 1e6:.0f} MB"
             )
         return names, dataset.load()
 

@@ -83,4 +83,4 @@ def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
 def require_product(place: str, there: str, here: str, remedy: str) -> None:
     """Raise StudyError, with both versions, if ``place`` has another version of cmmsim."""
     if there != here:
-        raise StudyError(f"{place} has cmmsim {there}, here is {here}; {remedy}")
+        raise StudyError(f"{place} has cmmsim {there}, but this process has {here}; {remedy}")

@@ -48,10 +48,9 @@ def check_memory(study: Study, shared: Shared, workers: int) -> None:
     if workers * needed > installed:
         fit = int(installed // needed)
         raise StudyError(
-            f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each, in "
-            f"{workers} processes "
-            f"{workers * needed / GB:.3g} GB, and this machine has {installed / GB:.3g} GB: "
-            + (f"--workers {fit} fits" if fit else "shorten its rows")
+            f"the longest rows of study {study.name!r} need {needed / GB:.3g} GB each and "
+            f"{workers * needed / GB:.3g} GB in {workers} processes, but this machine has "
+            f"{installed / GB:.3g} GB: " + (f"--workers {fit} fits" if fit else "shorten its rows")
         )
 
 

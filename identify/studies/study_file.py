@@ -283,7 +283,7 @@ def _without(values: dict[str, Any], path: str) -> dict[str, Any]:
 
 
 def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
-    """Flatten nested tables by dotted path. Tables that are empty or have a key in ``keep`` stay."""
+    """Flatten nested tables by dotted path, except empty ones and those with a key in ``keep``."""
     if not isinstance(tables, Mapping):
         return tables
     found: dict[str, Any] = {}

@@ -139,7 +139,7 @@ def uniformity_figure(found: list[Uniformity]) -> Figure:
     # The deviations of uniform numbers shrink with the root of their number.
     root = np.sqrt(rows)
     axes.fill_between(
-        points, root * low, root * high, color="0.85", label=f"band of right ones, {BAND:.0%}"
+        points, root * low, root * high, color="0.85", label=f"{BAND:.0%} band if uniform"
     )
     for one in reversed(found):
         curve = np.searchsorted(one.values, points, side="right") / one.rows - points
@@ -148,7 +148,7 @@ def uniformity_figure(found: list[Uniformity]) -> Figure:
         )
         axes.plot(points, np.sqrt(one.rows) * curve, **style)
     axes.set_xlabel("stated probability of values below the truth")
-    axes.set_ylabel("(share of rows − probability) · √rows")
+    axes.set_ylabel("(fraction of rows − probability) · √rows")
     axes.set_title(f"{len(found)} quantities, {sum(one.fails for one in found)} not uniform")
     axes.legend(fontsize="x-small", loc="upper right")
     return figure

@@ -186,7 +186,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
         raise TrajectoryError(f"cannot read the motion {path}: {error}") from None
     header = [name.strip() for name in lines[0]] if lines else []
     if len(header) == 1 and ";" in header[0]:
-        raise TrajectoryError(f"{path}: cells are separated by semicolons, and must be by commas")
+        raise TrajectoryError(f"{path}: cells must be separated by commas, not by semicolons")
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise TrajectoryError(

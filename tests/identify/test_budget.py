@@ -173,7 +173,9 @@ def test_a_run_of_an_older_version_and_parts_that_do_not_sum_up_are_refused(
     write_covariance(tmp_path / "covariance.nc", rss6().layout, covariance[:67, :67])
     with pytest.raises(RecordError, match="has no sources of its covariance, because an older"):
         read_sources(tmp_path / "covariance.nc", covariance[:67, :67])
-    with pytest.raises(RecordError, match="the sources of the covariance do not sum up to it"):
+    with pytest.raises(
+        RecordError, match="the parts of the covariance do not add up to the covariance"
+    ):
         read_sources(identified.covariance, covariance + np.diag(1e-6 * np.diag(covariance)))
     assert command("budget", tmp_path / "none") != 0
     assert "no run folder" in one_line(capfd.readouterr().err)

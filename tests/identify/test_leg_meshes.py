@@ -104,7 +104,11 @@ def test_a_mesh_hides_the_stickers_behind_it_and_a_file_written_again_has_it(tmp
         ("links", None, r"there is no body 'links' of a leg; valid: crank, link, crank1, "),
         ("link", None, r"the mesh .*link\.stl of link1: there is no such file"),
         ("link2", "open", r"the mesh .*link2\.stl of link2 is not closed: \d+ of its"),
-        ("crank", "large", r"of crank1 is 50 m long, at most 10 m is possible; .*scale = 0\.001"),
+        (
+            "crank",
+            "large",
+            r"of crank1 is 50 m long, but at most 10 m is possible; .*scale = 0\.001",
+        ),
     ],
 )
 def test_a_mesh_that_cannot_be_used_is_refused_in_one_line(tmp_path, body, mesh, message):
@@ -131,7 +135,7 @@ def test_the_check_of_a_robot_finds_a_mesh_in_another_unit_and_one_that_cannot_b
     trimesh.creation.box((10.0, 10.0, 300.0)).export(tmp_path / "crank.stl")
     (large,) = check_meshes(with_meshes(tmp_path, text.replace("0.001", "1.0")))
     assert not large.ok
-    assert "of crank1 is 300 m long, at most 10 m" in large.text
+    assert "of crank1 is 300 m long, but at most 10 m" in large.text
     assert list(check_meshes(rss6())) == []
 
 

@@ -197,7 +197,9 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path,
 @pytest.mark.thorough
 def test_worker_with_another_version_of_the_product_is_refused_at_the_start_and_later(tmp_path):
     there, here = other_versions(tmp_path / "there", cmmsim="9.8.7"), versions()["cmmsim"]
-    refusal = rf"^worker tcp://\S+ has cmmsim 9\.8\.7, here is {here}; install \S[^\n]*$"
+    refusal = (
+        rf"^worker tcp://\S+ has cmmsim 9\.8\.7, but this process has {here}; install \S[^\n]*$"
+    )
     with cluster(tmp_path, 1) as (address, _, workers):
         workers_there = partial(running_cluster, address)
         come = at(lambda: workers.append(worker(address, tmp_path, there)), 1)

@@ -162,7 +162,7 @@ def test_a_row_of_one_picture_is_lost_and_says_why_or_is_that_of_a_sensor_that_l
     whole, halved = (
         [one_picture(number, dropout) for number in range(12)] for dropout in (0.0, 0.5)
     )
-    lost = "no pose was found in any of 1 pictures: dropped frame (a share of 0.5 drops out)"
+    lost = "no pose was found in any of 1 pictures: dropped frame (with a probability of 0.5)"
     assert 0 < halved.count(lost) < 12
     assert all(half in (one, lost) for one, half in zip(whole, halved, strict=True))
     with pytest.raises(

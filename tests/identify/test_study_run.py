@@ -312,7 +312,8 @@ def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_
     begun_by(cmmsim="9.8.7")
     kept = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(
-        StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; continue with that version"
+        StudyError,
+        match=r"has cmmsim 9\.8\.7, but this process has \S+; continue with that version",
     ):
         run(tmp_path, repeats=2)
     assert (tmp_path / JOURNAL).read_bytes() == kept

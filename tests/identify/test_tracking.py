@@ -121,7 +121,7 @@ def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(t
     path.write_text("\ufeff" + whole, encoding="utf-8")  # as spreadsheets write it
     assert read_motion(path, rss6(), FASTEST).duration_s == 2.0
     path.write_text(whole.replace(",", ";"))
-    assert "separated by semicolons, and must be by commas" in refusal(
+    assert "cells must be separated by commas, not by semicolons" in refusal(
         TrajectoryError, read_motion, path, rss6(), FASTEST
     )
     path.write_text(whole.replace("gamma", "yaw"))

@@ -97,7 +97,7 @@ def test_a_record_without_its_beginning_is_what_the_reader_of_such_a_log_makes()
     for name in ("time", "acting", "command", "measured_position", "measured_orientation"):
         np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-12)
     assert found.attrs["scale_anchor_value"] == 23.5
-    with pytest.raises(StudyError, match=r"log_from_s is 4 s, the record ends after 2\.983 s"):
+    with pytest.raises(StudyError, match=r"log_from_s is 4 s, but the record ends after 2\.983 s"):
         log_of_moving_robot(record, 4.0, rss6())
 
 

@@ -48,7 +48,7 @@ def find_kind(name: str) -> Kind:
         return _own(name, own_function(name, "kind", StudyError))
     if name not in KINDS:
         raise StudyError(
-            f"unknown kind of row {name!r}, valid are {', '.join(KINDS)}, or module:function"
+            f"unknown kind of row {name!r}; valid: {', '.join(KINDS)}, or module:function"
         )
     return KINDS[name]
 

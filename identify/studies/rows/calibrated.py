@@ -65,12 +65,16 @@ COLUMNS = {
     "intervals": Column(
         "1", "quantities that the record identifies: parameters, and groups of several"
     ),
-    "covered_percent": Column("%", "share of their 95 % intervals with the truth", main=True),
+    "covered_percent": Column(
+        "%", "fraction of their 95 % intervals that contain the truth", main=True
+    ),
     "inner_covered_percent": Column(
-        "%", "share of their 68.3 % intervals with the truth", main=True
+        "%", "fraction of their 68.3 % intervals that contain the truth", main=True
     ),
     "poses_covered_percent": Column(
-        "%", "share of the coordinates of an unseen pose in the predicted 95 % interval", main=True
+        "%",
+        "fraction of the coordinates of an unseen pose in the predicted 95 % interval",
+        main=True,
     ),
     "poses_inner_covered_percent": Column("%", "the same for predicted 68.3 % intervals"),
     "noise_ratio": Column(
@@ -242,7 +246,7 @@ def log_of_moving_robot(record: xr.Dataset, from_s: float, robot: Robot) -> xr.D
     part = record.isel(time=np.flatnonzero(record["time"].values >= from_s))
     if part.sizes["time"] < 2:
         raise StudyError(
-            f"options.log_from_s is {from_s:g} s, the record ends after "
+            f"options.log_from_s is {from_s:g} s, but the record ends after "
             f"{float(record['time'][-1]):.4g} s"
         )
     if CHANGES in record:

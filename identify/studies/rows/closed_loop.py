@@ -104,7 +104,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     ok = run.record["measured_ok"].values.astype(bool)
     if not ok.any():
         raise EstimationError(
-            f"no frame of {len(ok)} was measured, the first: {run.record.attrs['lost_frames']}"
+            f"none of {len(ok)} frames was measured: {run.record.attrs['lost_frames']}"
         )
     true = true_poses(run.truth)
     tracking = true - recording.poses(run.record, "reference")

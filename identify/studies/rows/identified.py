@@ -91,7 +91,9 @@ COLUMNS = {
     "intervals": Column(
         "1", "quantities that the record identifies: parameters, and groups of several"
     ),
-    "covered_percent": Column("%", "share of these intervals (95 %) with the truth", main=True),
+    "covered_percent": Column(
+        "%", "fraction of these 95 % intervals that contain the truth", main=True
+    ),
     "noise_ratio": Column(
         "1", "mean squared residual over the variance of the noise; 1 if only noise remains"
     ),
@@ -112,7 +114,7 @@ COLUMNS = {
     ),
     "poses_covered_percent": Column(
         "%",
-        "share of true coordinates on validation trajectories within the predicted 95 % intervals",
+        "fraction of true coordinates on validation trajectories in the predicted 95 % intervals",
     ),
     "predicted_position_rms_um": Column(
         "um",

@@ -101,7 +101,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     ok = np.isfinite(seen.poses[:, 0])
     if ok.sum() < 2:
         raise EstimationError(
-            f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed"
+            f"{ok.sum()} of {frames} frames along the path gave a pose, but 2 are needed"
         )
     errors = (seen.poses - path.pose(times))[ok]
     latencies = scenario.timing.drawn_latencies(

@@ -165,8 +165,8 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
         for (number, pose, _), measured in zip(
             together, sensor.sensor.measure_each(poses, near), strict=True
         ):
-            if dropout.random() < (share := sensor.sensor.timing.dropout):
-                lost = f"dropped frame (a share of {share:.3g} drops out)"
+            if dropout.random() < (probability := sensor.sensor.timing.dropout):
+                lost = f"dropped frame (with a probability of {probability:.3g})"
             elif not measured.ok:
                 lost = measured.reason
             else:
