@@ -39,11 +39,10 @@ BASE = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of the parts, in the axes of the base.
+    """Frames of the parts, in the axes of the base. The last row is the base, with the index -1.
 
-    `origin` (parts, 3) is the joint with the part before, m. `axes` (parts, 3, 3) are columns.
-    `spin` (parts, 3) is the angular velocity, rad/s. The last row is the base, which thus has the
-    index -1.
+    `origin` (parts + 1, 3) is the joint with the part before, m. `axes` (parts + 1, 3, 3) has the
+    axes of each part as columns. `spin` (parts + 1, 3) is the angular velocity, rad/s.
     """
 
     origin: np.ndarray
@@ -55,8 +54,8 @@ class DrawnParts(NamedTuple):
     """Numbers from which the ends of the parts' rods are computed.
 
     `body` and `before` (parts,) are the rows of each part and of the part before it in the
-    placements; the base is -1. `offset` (parts, 3) is in the axes of the part before, m. `centre`
-    (parts, 3) and `ends` (parts, 2, 3) are in the axes of the part, m.
+    placements; the base is -1. `offset` (parts, 3) is that of `Part`. `centre` (parts, 3) is the
+    reference point and `ends` (parts, 2, 3) are the ends of the rod, in the frame of the part, m.
     """
 
     body: np.ndarray
@@ -87,15 +86,15 @@ class Parts:
         layout = geometry.layout
         self.all: list[Part] = []
         rows: list[int] = []
-        first = 0
+        first_row = 0
         for number, leg in enumerate(geometry.legs):
             segments = leg.segments()
             before = -1
-            for place, segment in enumerate(segments):
-                body = layout.of_leg[number][place]
+            for index, segment in enumerate(segments):
+                body = layout.of_leg[number][index]
                 several = len(segment.copies) > 1
                 name = layout.bodies[body]
-                last = place == len(segments) - 1
+                last = index == len(segments) - 1
                 share = 1 / len(segment.copies)
                 for suffix, offset in zip(
                     "abcd" if several else [""], segment.copies, strict=False
@@ -103,9 +102,9 @@ class Parts:
                     self.all.append(
                         Part(name + suffix, number, body, segment, offset, share, before, last)
                     )
-                    rows.append(first + place)
+                    rows.append(first_row + index)
                 before = len(self.all) - 1
-            first += len(segments)
+            first_row += len(segments)
         self._rows = np.array(rows)
         self._before = np.array([part.before for part in self.all])
         self._offset = np.array([part.offset for part in self.all])
@@ -120,7 +119,7 @@ class Parts:
     def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
         """Frames of the parts at a pose (6,) and a twist (6,) of the platform.
 
-        Raises UnreachablePoseError or ChartError.
+        Raises ShapeError, ChartError or UnreachablePoseError.
         """
         robot.check_reach(pose)
         moving = np.zeros(6) if twist is None else twist
@@ -129,7 +128,7 @@ class Parts:
         rows[-1] = BASE
         axes = rows[:, 3:12].reshape(-1, 3, 3)
         origin = rows[:, :3]
-        # the origin of a part is its joint, and that of a placement is the centre of mass
+        # the origin of a part is its joint, and that of a placement is the reference point
         origin[:-1] += (
             axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None]
         )[..., 0]
@@ -144,23 +143,23 @@ class Parts:
         from dynamics.compiled.kernel import chosen
         from dynamics.rod_kernels import place_parts
 
-        at = np.array(floats("pose", pose, (6,)))
+        checked_pose = np.array(floats("pose", pose, (6,)))
         functions = robot.functions
         kinematics = functions["inverse_kinematics"]
         placements = functions["placements"]
         constants = placements.constants
         body_count = placements.outputs[0][0]
         buffers = FunctionBuffers(
-            at=np.concatenate((at, constants)),
-            moving=np.concatenate((at, np.zeros(6), constants)),
+            at=np.concatenate((checked_pose, constants)),
+            moving=np.concatenate((checked_pose, np.zeros(6), constants)),
             reach=np.empty((2, robot.layout.joints)),
             placements=np.empty((body_count, 15)),
         )
         ends = np.empty((len(self.all), 2, 3))
-        inputs = kinematics.address, placements.address, at, self._held, CHART_TOLERANCE
+        inputs = kinematics.address, placements.address, checked_pose, self._held, CHART_TOLERANCE
         if not chosen(place_parts, True)(*inputs, self._drawn, buffers, ends):
             # this call raises the error, with the reason
-            robot.check_reach(at)
+            robot.check_reach(checked_pose)
         return ends
 
 

@@ -27,8 +27,8 @@ def floats(
 ) -> np.ndarray:
     """Value as a float64 array of one of the shapes, in which "N" means any length.
 
-    A float64 array is not copied. Raises `error`, with the value or with the index of an entry that
-    is not finite.
+    A float64 array is not copied. Raises `error` for anything else, with its value or shape. If
+    `finite` is True, raises it also for NaN and infinity, with the index of the entry.
     """
     if (
         type(value) is np.ndarray
@@ -55,8 +55,8 @@ def floats(
         raise error(f"{name} must have shape {_shapes_text(shapes)}, got {array.shape}")
     array = array.astype(float, copy=False)
     if finite and not np.isfinite(array).all():
-        place = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
-        raise error(f"{name}{list(place)} is {array[place]}, must be finite")
+        entry = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
+        raise error(f"{name}{list(entry)} is {array[entry]}, must be finite")
     return array
 
 
@@ -90,7 +90,10 @@ def real(
     above: float | None = None,
     unit: str = "",
 ) -> float:
-    """Value as a finite float, >= least or > above if these are given. Raises `error` otherwise."""
+    """Value as a finite float, >= least or > above if these are given. Raises `error` otherwise.
+
+    In the message, `unit` follows the value. It begins with a space, as in " m".
+    """
     limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}{unit}, must be a number{limit}")
@@ -175,7 +178,7 @@ class Within:
     zero: bool = False
 
     def check(self, value: float | None) -> float | None:
-        """Return the value. Raises ValueError, with the range, if it is outside."""
+        """Return the value or None. Raises ValueError, with the range, for a value outside it."""
         if value is None or self.least <= value <= self.most or (self.zero and value == 0.0):
             return value
         also = "0 or " if self.zero else ""

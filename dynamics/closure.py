@@ -1,7 +1,8 @@
-"""Poses that close the loops of a robot whose geometry deviates, and their derivatives.
+"""Poses that close the loops of a robot near a nominal geometry, and their derivatives.
 
 The gaps of the loops (`rigid_body.jacobians.loop_closure`) depend on the coordinates q of the
-platform and on the geometric numbers. They are zero at a pose that closes the loops. Hence
+platform, the joint coordinates and the geometric numbers. At a pose that closes the loops, the gaps
+are zero. Hence, at constant joint coordinates,
 
     dq/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers)
 

@@ -1,30 +1,30 @@
 """Errors of the dynamics package.
 
-Every message states the value, the limit, and the leg or name.
+Messages state the value, the limit, and the leg or name, where there are such.
 """
 
-LONGEST = 4000  # largest number of characters of a message
+LONGEST = 4000  # number of characters after which a message is cut
 
 
 class DynamicsError(Exception):
     """Base class of all errors of this package. The message is one line."""
 
     def __str__(self) -> str:
-        """Message on one line of at most `LONGEST` characters, even if it quotes a file."""
+        """Message on one line, even if it quotes a file, and cut after `LONGEST` characters."""
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class RobotFileError(DynamicsError):
-    """A robot name or robot file that cannot be used."""
+    """A robot name, robot file or robot geometry that cannot be used."""
 
 
 class ParameterError(DynamicsError):
-    """Dynamic parameters in the wrong number, or outside their physical range."""
+    """Dynamic parameters with unknown names, in the wrong number, or outside their range."""
 
 
 class ShapeError(DynamicsError):
-    """An array of the wrong shape, or with entries that are not finite."""
+    """An array of the wrong shape, or with entries that are not finite numbers."""
 
 
 class UnreachablePoseError(DynamicsError):
@@ -40,7 +40,7 @@ class TravelError(DynamicsError):
 
 
 class SingularPoseError(DynamicsError):
-    """A pose at which a Jacobian cannot be inverted."""
+    """A pose at or near a singularity, or a result that is therefore not finite."""
 
 
 class ConvergenceError(DynamicsError):

@@ -6,7 +6,8 @@ import casadi as ca
 def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
     """CasADi function with dense outputs, in which common subexpressions are computed only once.
 
-    Legs share rotations and lever arms, so that forward dynamics takes half the size and time.
+    Legs share rotations and lever arms. Forward dynamics without repetitions of these has half the
+    operations, and takes half the time.
     """
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 

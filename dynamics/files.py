@@ -17,7 +17,7 @@ from xml.etree import ElementTree as Xml
 import yaml
 from pydantic import AfterValidator, WithJsonSchema
 
-LARGEST = 500_000  # largest size of a file of settings, in bytes
+LARGEST = 500_000  # largest size of a TOML file, in bytes, and of its text, in characters
 LARGEST_XML = 1_000_000  # largest size of an XML file, in bytes
 DEEPEST = 16  # largest depth of tables and lists, and largest number of parts of a dotted key
 DEEPEST_ELEMENT = 150  # largest depth of XML elements
@@ -28,6 +28,7 @@ NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
 
 _YamlLoader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+# Control characters other than tab and line feed.
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 # Strings and comments in TOML. Matches do not backtrack, so that a search takes linear time.
 _TEXTS = re.compile(
@@ -105,8 +106,8 @@ def read_text(path: str | PathLike[str], source: str, error_class: type[Exceptio
 def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str, Any]:
     """Content of TOML text. `source` is its name in messages.
 
-    Raises `error_class` for text that is not TOML or has more than `LARGEST` characters, for tables
-    and lists deeper than `DEEPEST`, for integers beyond 64 bits, for dates, and for control
+    Raises `error_class` for text that is not TOML or has more than `LARGEST` characters, for keys,
+    tables and lists deeper than `DEEPEST`, for integers beyond 64 bits, for dates, and for control
     characters.
     """
     if len(text) > LARGEST:
@@ -125,7 +126,7 @@ def parse_toml(text: str, source: str, error_class: type[Exception]) -> dict[str
     except RecursionError:
         raise error_class(deep) from None
     except ValueError:
-        # int() refuses numbers with more than some thousand digits
+        # int() refuses numbers with more than a few thousand digits
         raise error_class(f"{source} has an integer beyond 64 bits, or an invalid date") from None
     fault = _fault(content)
     if fault:
@@ -142,9 +143,9 @@ def _fault(content: dict[str, Any]) -> str:
             return f"keys, tables or lists more than {DEEPEST} deep"
         if isinstance(value, dict):
             pending += [(key, depth) for key in value]
-            pending += [(one, depth + 1) for one in value.values()]
+            pending += [(item, depth + 1) for item in value.values()]
         elif isinstance(value, list):
-            pending += [(one, depth + 1) for one in value]
+            pending += [(item, depth + 1) for item in value]
         elif isinstance(value, str) and _UNWANTED.search(value):
             return f"a control character in {value[:60]!r}"
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -170,8 +171,8 @@ def parse_json(text: str, source: str, error_class: type[Exception]) -> Any:
 def parse_yaml(content: bytes, source: str, error_class: type[Exception]) -> Any:
     """Content of YAML text with mappings, lists and names. Every scalar is returned as text.
 
-    Raises `error_class` for content that is not YAML, for aliases, for a duplicate key, and for
-    more than `DEEPEST` levels.
+    Raises `error_class` for content that is not YAML, for aliases, for a key that occurs twice at
+    the top level, and for more than `DEEPEST` levels.
     """
     try:
         _check_events(yaml.parse(content, Loader=_YamlLoader), source, error_class)

@@ -17,9 +17,9 @@ def fast_forward_dynamics(
 ) -> StateToAcceleration:
     """Make a function that computes the same as `Robot.forward_dynamics`, for inner loops.
 
-    The function is about 80 times faster than the method, because it does not check reach and
-    conditioning. Every call overwrites and returns the same array, so that the function is not
-    thread safe. At a pose at which the platform can move although all cranks are locked, eq. 40
+    The function is about 80 times faster than the method, because it does not check chart, reach
+    and conditioning. Every call overwrites and returns the same array, so that the function is not
+    thread safe. At a pose at which the platform can move although all actuators are locked, eq. 40
     still holds, and the function returns the acceleration. `Robot.forward_dynamics` refuses such a
     pose, because no controller can hold the platform there.
 
@@ -74,7 +74,7 @@ def fast_forward_dynamics(
         except (TypeError, ValueError):
             _refuse(at_pose, at_twist, at_torque, joints)
         call()
-        # the mass matrix couples all entries: if one is not finite, none is
+        # the mass matrix couples the accelerations: if one is not finite, the first is not either
         first = values[0]
         # false for infinity and NaN
         if not first - first == 0.0:

@@ -17,12 +17,13 @@ from dynamics.legs.leg import Leg
 from dynamics.parameter_set import EXACT, Unstated
 from dynamics.parameters import ParameterLayout, parameter_layout
 
-SAME_PLACE = 1e-6  # distance, m, below which joints of two legs coincide
+# Difference, m, of each coordinate of joints B and A below which two legs coincide.
+SAME_PLACE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class RobotGeometry:
-    """Legs and chart of a robot. Two geometries are equal if all their numbers are equal.
+    """Legs and chart of a robot. Two geometries are equal if they describe the same robot exactly.
 
     `chart` has the entries of the pose that the platform can change, and the home pose.
     `travel_limit` is the largest magnitude of a joint coordinate, rad or m. `gravity` (3,) is in
@@ -35,8 +36,10 @@ class RobotGeometry:
     between this model and the real bodies and joints. `meshes` are drawn in place of the rods of
     bodies of the legs.
 
-    Raises RobotFileError, with legs and numbers, if the degrees of freedom do not match the number
-    of actuators, if two legs coincide, or if a leg cannot reach the home pose.
+    Raises RobotFileError, with legs and numbers, for numbers that are not finite, if the legs do
+    not match each other or the freedoms of the chart, if two legs coincide, if a leg cannot reach
+    the home pose or is singular there, or for a mesh of an unknown body. Raises ParameterError for
+    unknown names in `full_bodies` or `passive_friction`.
     """
 
     legs: tuple[Leg, ...]
@@ -118,7 +121,7 @@ class RobotGeometry:
     def digest(self) -> bytes:
         """Digest of all that compiled functions depend on, for caches.
 
-        It does not depend on the travel limit, the gains, `unstated` and the meshes.
+        It does not depend on the travel limit, `own_gains`, `unstated` or the meshes.
         """
         content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         if any(self.layout.full):
@@ -161,26 +164,27 @@ class RobotGeometry:
         For the platform, it is the characteristic length. For a body of a leg, it is the length of
         its drawn rod.
         """
-        found = np.full(len(self.layout.bodies), self.characteristic_length)
+        lengths = np.full(len(self.layout.bodies), self.characteristic_length)
         for leg, of_leg in zip(self.legs, self.layout.of_leg, strict=True):
             for body, segment in zip(of_leg, leg.segments(), strict=True):
-                found[body] = np.linalg.norm(segment.rod[1] - segment.rod[0])
-        return found
+                lengths[body] = np.linalg.norm(segment.rod[1] - segment.rod[0])
+        return lengths
 
     @property
     def body_reaches(self) -> np.ndarray:
-        """Largest distance (bodies,), m, between each drawn body and its reference point.
+        """Bound (bodies,), m, on the distance of any point of a body from its reference point.
 
-        The platform reaches to its farthest joint, and a body of a leg to the end of its rod.
+        For the platform, it is the distance of the farthest joint. For a body of a leg, it is the
+        distance of the farther end of its drawn rod, plus the offset of its bars and the radius.
         """
         farthest = np.linalg.norm(self.platform_joints, axis=1).max()
-        found = np.full(len(self.layout.bodies), farthest)
+        reaches = np.full(len(self.layout.bodies), farthest)
         for leg, of_leg in zip(self.legs, self.layout.of_leg, strict=True):
             for body, segment in zip(of_leg, leg.segments(), strict=True):
                 to_ends = np.linalg.norm(segment.rod - segment.centre, axis=1).max()
                 aside = np.linalg.norm(segment.copies, axis=1).max()
-                found[body] = to_ends + aside + segment.radius
-        return found
+                reaches[body] = to_ends + aside + segment.radius
+        return reaches
 
     def joints_at(self, pose: np.ndarray) -> np.ndarray:
         """Platform joints A (legs, 3) at a pose (6,), in the axes of the base, m."""
@@ -257,11 +261,11 @@ class RobotGeometry:
         names = self.number_names
         by_unit = {"m": length_std, "rad": turn_std}
         errors = rng.standard_normal(len(names)) * [by_unit[unit] for unit in self.number_units]
-        for place, name in enumerate(names):
+        for index, name in enumerate(names):
             leg, field, entry = f"{name}.".split(".")[:3]
             if field in drawn:
-                number = int(leg.removeprefix("leg")) - 1
-                errors[place] = drawn[field][number, "xyz".index(entry)]
+                leg_index = int(leg.removeprefix("leg")) - 1
+                errors[index] = drawn[field][leg_index, "xyz".index(entry)]
         try:
             return self.moved(errors).zeroed()
         except RobotFileError as error:
@@ -281,13 +285,13 @@ class RobotGeometry:
         charts = ", ".join(f"{count} of `{chart}`" for chart, count in counts.items())
         for number, leg in enumerate(self.legs, 1):
             if leg.chart != self.chart.name:
-                what = (
+                platform = (
                     f"platform with the chart `{self.chart.name}` "
                     f"({', '.join(self.chart.coordinate_names)})"
                 )
                 raise RobotFileError(
                     f"leg {number} is of a kind ({type(leg).__name__}) that works with the chart "
-                    f"`{leg.chart}`, not on a {what}; charts of all legs: {charts}"
+                    f"`{leg.chart}`, not on a {platform}; charts of all legs: {charts}"
                 )
             if leg.prismatic != self.prismatic:
                 raise RobotFileError(

@@ -3,15 +3,15 @@
 A rigid body has a positive mass, and none of its principal moments of inertia is larger than the
 sum of the other two (`moments_fault`). Published tables break this rule, for example for the cranks
 and links in Table 1 of the paper. Multibody engines refuse such bodies. `physical_inertias` names
-them, or changes them as little as possible. If it can, it changes only values without effect on the
-motion:
+them, or changes them as little as possible. Where possible, it changes only values without effect
+on the motion:
 
 - If one moment of a body affects the motion, this moment is kept. An example is a crank that
   rotates about its own z, with Izz.
 - If two moments affect the motion, both are kept, and the third is changed. An example is a link
   without spin, with Ixx and Iyy.
-- If all three moments affect the motion, as for the platform, they are changed to the nearest valid
-  moments in the least-squares sense.
+- If all three moments affect the motion, as for the platform, or none, as for a slider, they are
+  changed to the nearest valid moments in the least-squares sense.
 
 A full body keeps its mass and its centre of mass. The second moments of its mass are changed to the
 nearest positive definite ones.
@@ -34,8 +34,8 @@ from dynamics.workspace import measure
 # Smallest mass and inertia. Engines refuse a moving body without them; MuJoCo's limit is 1e-15.
 SMALLEST = 1e-12
 
-# Relative tolerance: the sum of two rounded moments can be below the third by one unit of the last
-# digit, and MuJoCo compares them exactly.
+# Relative margin by which changed moments obey the rule. Otherwise, the sum of two rounded moments
+# could be below the third by one unit of the last digit, and MuJoCo compares them exactly.
 ROUNDING = 1e-14
 
 
@@ -150,7 +150,7 @@ TRAVEL_ACCELERATION = 10.0
 def acceleration_changes(
     robot: Robot, parameters: np.ndarray, inertias: np.ndarray
 ) -> dict[str, float]:
-    """Largest |change| / |acceleration| of forward dynamics for each changed body.
+    """Largest |change| / |acceleration| of forward dynamics if one body alone is changed, by body.
 
     `inertias` (bodies, 10) are full bodies in the order of the layout. Bodies with the same
     values in the parameters (p,) are omitted. Linear and angular accelerations are compared
@@ -168,10 +168,10 @@ def acceleration_changes(
         changed[rows] = layout.rigid_of(inertias)[rows]
         if not np.array_equal(changed, checked):
             change = robot.forward_dynamics(*state, changed).reshape(-1, 2, 3) - before
-            # sizes are zero if the platform cannot rotate
-            sizes = np.linalg.norm(before, axis=2)
+            # the norm of an angular acceleration is zero if the platform cannot rotate
+            norms = np.linalg.norm(before, axis=2)
             effects[body] = float(
-                (np.linalg.norm(change, axis=2)[sizes > 0] / sizes[sizes > 0]).max()
+                (np.linalg.norm(change, axis=2)[norms > 0] / norms[norms > 0]).max()
             )
     return effects
 

@@ -64,7 +64,10 @@ class Friction(Strict):
 
 
 class PassiveFriction(Strict):
-    """Dry friction, N m, and viscous friction, N m s/rad, of a passive joint of all legs or one."""
+    """Dry friction, N m, and viscous friction, N m s/rad, of a passive joint of all legs or one.
+
+    None means that the robot has no such parameter.
+    """
 
     coulomb: Force | None = None
     viscous: Damping | None = None
@@ -116,10 +119,10 @@ class Parameters(BaseModel):
 class Unstated(Strict):
     """Standard deviations of the differences between real bodies and joints and the model.
 
-    The model of a centred body has its centre of mass at the reference point, and its principal
-    axes of inertia along its own axes. The model of a passive joint without a viscous parameter
-    turns freely. Real bodies and joints differ from these models. The defaults are for an ordinary
-    workshop. Zero states that bodies and joints are exactly as modelled.
+    In the model, a centred body has its centre of mass at the reference point, and its principal
+    axes of inertia along its own axes. A passive joint without a viscous parameter turns freely.
+    Real bodies and joints differ from this model. The defaults are for an ordinary workshop. Zero
+    states that bodies and joints are exactly as modelled.
     """
 
     centre_std: float = Field(
@@ -163,8 +166,9 @@ class ParameterSet:
 def parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
     """Parameter set from its section of a robot file.
 
-    Raises RobotFileError, with the entry, for bodies that the robot does not have, for lists of a
-    wrong length, for bodies that cannot exist, and for gains in a wrong unit.
+    Raises RobotFileError, with the entry, for unknown and missing bodies, for lists of a wrong
+    length, for bodies that cannot exist, and for gains in a wrong unit. Raises ParameterError for a
+    platform without mass.
     """
 
     def per_leg(key: str, value: float | list[float], count: int) -> list[float]:

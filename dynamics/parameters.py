@@ -95,9 +95,9 @@ class ParameterLayout:
 
     @cached_property
     def rigid_names(self) -> tuple[str, ...]:
-        """Names of the parameters of the equation of motion.
+        """Names of the inertial parameters, body by body, and of the friction of passive joints.
 
-        They are the inertial parameters, body by body, and the friction of passive joints.
+        These are the parameters of the equation of motion without friction of the actuators.
         """
         return self.inertial_names + self.passive_names
 
@@ -112,17 +112,17 @@ class ParameterLayout:
 
     @cached_property
     def signed(self) -> np.ndarray:
-        """True for each dynamic parameter (p,) that may be negative, which are those in SIGNED."""
+        """True for each dynamic parameter (p,) that may be negative because it is in SIGNED."""
         return np.isin([name.split(".")[1] for name in self.dynamic_names], SIGNED)
 
     @cached_property
     def coulomb_names(self) -> tuple[str, ...]:
-        """Names of the dry friction parameters."""
+        """Names of the dry friction parameters of the actuated joints."""
         return tuple(f"{joint}.coulomb" for joint in self.joint_names)
 
     @cached_property
     def viscous_names(self) -> tuple[str, ...]:
-        """Names of the viscous friction parameters."""
+        """Names of the viscous friction parameters of the actuated joints."""
         return tuple(f"{joint}.viscous" for joint in self.joint_names)
 
     @cached_property
@@ -147,7 +147,7 @@ class ParameterLayout:
 
     @property
     def rigid(self) -> slice:
-        """Slice of the parameters of the equation of motion."""
+        """Slice of the parameters with `rigid_names`."""
         return slice(0, len(self.rigid_names))
 
     @property
@@ -162,12 +162,12 @@ class ParameterLayout:
 
     @property
     def coulomb(self) -> slice:
-        """Slice of the dry friction parameters."""
+        """Slice of the dry friction parameters of the actuated joints."""
         return slice(self.rigid.stop, self.rigid.stop + self.joints)
 
     @property
     def viscous(self) -> slice:
-        """Slice of the viscous friction parameters."""
+        """Slice of the viscous friction parameters of the actuated joints."""
         return slice(self.coulomb.stop, self.coulomb.stop + self.joints)
 
     @property
@@ -193,7 +193,11 @@ class ParameterLayout:
         return tuple(slice(end - count, end) for end, count in zip(ends, counts, strict=True))
 
     def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
-        """Inertial parameters (..., bodies, 10) of all bodies as full bodies."""
+        """Inertial parameters (..., bodies, 10) of all bodies as full bodies.
+
+        `rigid` (..., r or more) begins with the inertial parameters. Entries that a centred body
+        does not have are zero.
+        """
         full_bodies = np.zeros((*rigid.shape[:-1], len(self.bodies), len(FULL_INERTIAL)))
         for body, rows in enumerate(self.body_slices):
             full_bodies[..., body, ALL_TEN if self.full[body] else CENTRED] = rigid[..., rows]
@@ -218,13 +222,13 @@ class ParameterLayout:
         """
         inertial = other.rigid_of(self.bodies_of(dynamic))
         passive = np.zeros((*dynamic.shape[:-1], len(other.passive_names)))
-        for place, name in enumerate(other.passive_names):
-            for one in self.passive_names:
-                value = dynamic[..., self.dynamic_names.index(one)]
-                if one in (name, of_all_legs(name)):
-                    passive[..., place] = value
-                elif of_all_legs(one) == name:
-                    passive[..., place] += value / self.joints
+        for index, name in enumerate(other.passive_names):
+            for own_name in self.passive_names:
+                value = dynamic[..., self.dynamic_names.index(own_name)]
+                if own_name in (name, of_all_legs(name)):
+                    passive[..., index] = value
+                elif of_all_legs(own_name) == name:
+                    passive[..., index] += value / self.joints
         rest = dynamic[..., self.rigid.stop : self.dynamic.stop]
         return np.concatenate([inertial, passive, rest], axis=-1)
 
@@ -263,9 +267,9 @@ class ParameterLayout:
         return unit_of(name, self.prismatic)
 
     def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Parameters of the equation of motion, of dry and of viscous friction (n,), and gains.
+        """Rigid parameters, dry and viscous friction (n,) of the actuated joints, and gains (n, 3).
 
-        The gains are lp, li, ld of each joint (n, 3).
+        The rigid parameters are those with `rigid_names`. The gains are lp, li, ld of each joint.
         """
         return (
             values[self.rigid],
@@ -290,12 +294,12 @@ class ParameterLayout:
         allowed[..., 0] &= parameters[..., 0] > 0
         if allowed.all():
             return parameters
-        place = tuple(int(index) for index in np.argwhere(~allowed)[0])
-        name = self.dynamic_names[place[-1]]
-        limit = " and > 0" if not place[-1] else "" if self.signed[place[-1]] else " and >= 0"
-        where = f" (row {place[0]})" if len(place) > 1 else ""
+        entry = tuple(int(index) for index in np.argwhere(~allowed)[0])
+        name = self.dynamic_names[entry[-1]]
+        limit = " and > 0" if not entry[-1] else "" if self.signed[entry[-1]] else " and >= 0"
+        where = f" (row {entry[0]})" if len(entry) > 1 else ""
         raise ParameterError(
-            f"{name} = {parameters[place]:g} {self.unit(name)} is not allowed, must be finite"
+            f"{name} = {parameters[entry]:g} {self.unit(name)} is not allowed, must be finite"
             f"{limit}{where}"
         )
 
@@ -347,11 +351,11 @@ def parameter_layout(
     and that of all legs.
     """
     leg_bodies: list[tuple[int, Body]] = []
-    for place in range(max(len(leg.bodies) for leg in legs)):
+    for index in range(max(len(leg.bodies) for leg in legs)):
         leg_bodies += [
-            (number, leg.bodies[place])
+            (number, leg.bodies[index])
             for number, leg in enumerate(legs)
-            if place < len(leg.bodies)
+            if index < len(leg.bodies)
         ]
     of_leg = [
         tuple(1 + k for k, (owner, _) in enumerate(leg_bodies) if owner == number)

@@ -29,8 +29,8 @@ def pseudo_inertia(bodies: np.ndarray) -> np.ndarray:
     moments = bodies[..., 4:7]
     half = moments.sum(axis=-1, keepdims=True) / 2
     pseudo[..., range(3), range(3)] = half - moments
-    for place, (row, column) in enumerate(PAIRS, 7):
-        pseudo[..., row, column] = pseudo[..., column, row] = -bodies[..., place]
+    for index, (row, column) in enumerate(PAIRS, 7):
+        pseudo[..., row, column] = pseudo[..., column, row] = -bodies[..., index]
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = bodies[..., 1:4]
     pseudo[..., 3, 3] = bodies[..., 0]
     return pseudo
@@ -58,8 +58,8 @@ def _unit_factor(coordinates: np.ndarray) -> np.ndarray:
     """Factor U (4, 4) of log-Cholesky coordinates (10,), without its scale exp(alpha)."""
     factor = np.eye(4)
     factor[range(3), range(3)] = np.exp(coordinates[1:4])
-    for place, (row, column) in enumerate(PAIRS, 4):
-        factor[row, column] = coordinates[place]
+    for index, (row, column) in enumerate(PAIRS, 4):
+        factor[row, column] = coordinates[index]
     factor[:3, 3] = coordinates[7:]
     return factor
 
@@ -70,11 +70,11 @@ def log_cholesky_slope(coordinates: np.ndarray) -> np.ndarray:
     scale = np.exp(coordinates[0])
     changes = np.zeros((10, 4, 4))
     changes[0] = factor
-    for place in range(3):
-        changes[1 + place, place, place] = factor[place, place]
-        changes[7 + place, place, 3] = 1.0
-    for place, (row, column) in enumerate(PAIRS, 4):
-        changes[place, row, column] = 1.0
+    for index in range(3):
+        changes[1 + index, index, index] = factor[index, index]
+        changes[7 + index, index, 3] = 1.0
+    for index, (row, column) in enumerate(PAIRS, 4):
+        changes[index, row, column] = 1.0
     products = scale**2 * changes @ factor.T
     return inertial_parameters(products + np.swapaxes(products, 1, 2)).T
 
@@ -93,7 +93,7 @@ def log_cholesky(body: np.ndarray) -> np.ndarray:
 
 
 def about_centre(body: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass (3,), m, of a full body (10,) with a mass, and inertia (3, 3) about it."""
+    """Centre of mass (3,), m, of a full body (10,), and inertia (3, 3) about this centre."""
     xx, yy, zz, xy, xz, yz = body[4:]
     about_reference = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     centre = body[1:4] / body[0]
@@ -162,7 +162,8 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
 def nearest_body(body: np.ndarray, smallest: float) -> np.ndarray:
     """Full body (10,) that exists, with the same mass and centre of mass.
 
-    Principal second moments of the mass, about its centre, are raised to at least `smallest` / 2.
+    A mass below `smallest`, kg, is raised to it. Principal second moments of the mass, about its
+    centre, are raised to at least `smallest` / 2, kg m^2.
     """
     mass = max(body[0], smallest)
     centre, inertia = about_centre(np.array([mass, *body[1:]]))

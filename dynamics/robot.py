@@ -55,8 +55,8 @@ class Robot(RobotDynamics):
     pose that the platform can change. Joint coordinates are angles. If the actuators slide, joint
     coordinates are lengths, and N and N s/m replace N m and N m s/rad. All units are SI.
 
-    Every method also accepts batches with a leading axis, such as (N, 6), and its results then have
-    this axis, too. If `parameters` is None, a method uses `nominal_parameters`.
+    Unless stated otherwise, methods also accept batches with a leading axis, such as (N, 6). Their
+    results then have this axis, too. If `parameters` is None, they use `nominal_parameters`.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Robot(RobotDynamics):
     UnreachablePoseError
         If a pose is out of the reach of a leg.
     SingularPoseError
-        If a Jacobian is singular.
+        If a Jacobian is singular, or a result is not finite.
 
     Examples
     --------
@@ -284,8 +284,9 @@ class Robot(RobotDynamics):
         A passive joint has the name of the body that follows it on the way to the platform. The
         parameter "link_joint.viscous" is shared by the joints of all legs, and the parameter
         "link3_joint.viscous" is for one leg. The friction is viscous or dry, see
-        `rigid_body.passive_friction`. The robot moves as before: a parameter of one leg begins with
-        the value that all legs shared, and a new parameter with zero.
+        `rigid_body.passive_friction`. A parameter of one leg begins with the value that all legs
+        shared, a shared one with the mean over the legs, and a new one with zero. Friction that is
+        not named is lost.
 
         Parameters
         ----------

@@ -123,14 +123,14 @@ def robot_schema() -> dict[str, Any]:
     It is saved in `dynamics/robots/robot.schema.json`.
     """
     schema = RobotFile.model_json_schema()
-    one_a_leg = schema["properties"]["legs"]
+    leg_tables = schema["properties"]["legs"]
     columns = {
         "type": "object",
         "description": "with a family: each key has one value, or a list with one value per leg",
     }
     schema["properties"]["legs"] = {
-        "anyOf": [one_a_leg, columns],
-        "description": one_a_leg.pop("description"),
+        "anyOf": [leg_tables, columns],
+        "description": leg_tables.pop("description"),
     }
     return schema
 
@@ -156,20 +156,20 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
         if name is None:
             raise ValueError(f"legs: unknown key {key}; valid: {', '.join(fields)}")
         vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
-        each = isinstance(value, list) and (
+        per_leg = isinstance(value, list) and (
             not vector or (bool(value) and isinstance(value[0], list))
         )
-        if each and len(value) != family.legs:
+        if per_leg and len(value) != family.legs:
             raise ValueError(
                 f"legs.{key} needs one value, or a list of {family.legs} values, got {len(value)}"
             )
         for number, leg in enumerate(legs):
-            leg[name] = value[number] if each else value
+            leg[name] = value[number] if per_leg else value
     return legs
 
 
 def plural(name: str) -> str:
-    """Key of the column of a field, such as `slider_axes` for `slider_axis`."""
+    """Key of the column of a field: `slider_axes` for `slider_axis`. A length keeps its name."""
     if name.endswith("axis"):
         return name.removesuffix("axis") + "axes"
     return name + "s" if name.endswith(("joint", "direction")) else name
@@ -177,7 +177,10 @@ def plural(name: str) -> str:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """Content of a robot file: name, geometry and parameter sets."""
+    """Content of a robot file: name, geometry and parameter sets.
+
+    Raises RobotFileError for a name that cannot be used as a file name.
+    """
 
     name: str
     geometry: RobotGeometry
@@ -219,8 +222,8 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
     """Read a built-in robot by its name, or a TOML robot file by its path.
 
     Raises RobotFileError for an unknown name, with the valid names; for a file that cannot be read;
-    for an unknown or missing key, with its place; and for geometry or parameters that are not
-    valid.
+    for an unknown or missing key, with the tables that it is in; and for geometry or parameters
+    that are not valid.
     """
     source, text = _read_text(name_or_path)
     return parsed_robot(text, f"robot file {source}", Path(source).absolute().parent)
@@ -252,7 +255,7 @@ def parsed_robot(text: str, source: str, folder: Path = Path()) -> RobotDescript
 
 
 def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
-    """Geometry of a robot file in a folder. Raises RobotFileError."""
+    """Geometry of a robot file in a folder. Raises RobotFileError or ParameterError."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -294,23 +297,23 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    """Faults and their places in one line. A fault of several legs is stated once."""
-    legs: dict[str, list[str]] = {}
+    """Faults and their keys in one line. A fault of several legs is stated once."""
+    owners: dict[str, list[str]] = {}
     faults = error.errors()
     for item in faults[:MOST_FAULTS]:
-        place = list(item["loc"])
+        location = list(item["loc"])
         who = ""
-        if len(place) > 1 and place[0] == "legs":
-            who = f"leg {int(place[1]) + 1}"
+        if len(location) > 1 and location[0] == "legs":
+            who = f"leg {int(location[1]) + 1}"
             # the type of the leg is after its number
-            place = place[3:]
-        last = str(place[-1]) if place else ""
-        if last.startswith("list[" if not isinstance(item["input"], list) else "function-"):
+            location = location[3:]
+        last_part = str(location[-1]) if location else ""
+        if last_part.startswith("list[" if not isinstance(item["input"], list) else "function-"):
             continue  # pydantic also reports the alternative that the value was not meant for
-        place = [part for part in place if not str(part).startswith(("list[", "function-"))]
-        parts = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
+        location = [part for part in location if not str(part).startswith(("list[", "function-"))]
+        parts = [".".join(map(str, location)), item["msg"].removeprefix("Value error, ")]
         got = "" if item["type"] in ("value_error", "missing") else f", got {shown(item['input'])}"
-        legs.setdefault(": ".join(filter(None, parts)) + got, []).append(who)
-    lines = [": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items()]
+        owners.setdefault(": ".join(filter(None, parts)) + got, []).append(who)
+    fault_lines = [": ".join(filter(None, [", ".join(who), text])) for text, who in owners.items()]
     more = len(faults) - MOST_FAULTS
-    return "; ".join(lines + ([f"and {more} more"] if more > 0 else []))
+    return "; ".join(fault_lines + ([f"and {more} more"] if more > 0 else []))

@@ -67,15 +67,15 @@ def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[st
     """Compiled functions of a geometry near a nominal one. Their machine code is shared."""
     deviations = geometry.deviations_from(nominal)
     return {
-        name: replace(one, constants=deviations)
-        for name, one in _movable_functions(nominal).items()
+        name: replace(compiled, constants=deviations)
+        for name, compiled in _movable_functions(nominal).items()
     }
 
 
 @lru_cache(maxsize=4)
 def _functions_by_name(geometry: RobotGeometry) -> dict[str, ca.Function]:
     """CasADi functions of a geometry. They are built together, which takes a second or two."""
-    return {one.name(): one for one in robot_functions(geometry)}
+    return {function.name(): function for function in robot_functions(geometry)}
 
 
 @lru_cache(maxsize=64)
@@ -83,5 +83,5 @@ def casadi_function(geometry: RobotGeometry, name: str) -> ca.Function:
     """CasADi function of a geometry, with named inputs and outputs as in `CASADI`."""
     function = _functions_by_name(geometry)[name]
     inputs, outputs = (names.split() for names in CASADI[name])
-    symbols = [ca.SX.sym(one, function.size1_in(k)) for k, one in enumerate(inputs)]
+    symbols = [ca.SX.sym(symbol_name, function.size1_in(k)) for k, symbol_name in enumerate(inputs)]
     return ca.Function(name, symbols, function.call(symbols), inputs, outputs)

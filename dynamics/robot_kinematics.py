@@ -84,7 +84,7 @@ class RobotKinematics(RobotPlatform):
         Returns
         -------
         ForwardSolution
-            Pose (6,), number of iterations and residual (n,), rad or m.
+            Pose, number of iterations, and residual of the joint coordinates, rad or m.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class RobotKinematics(RobotPlatform):
         Returns
         -------
         ndarray, shape (k, 6)
-            Poses, of which the first is nearest to home.
+            Poses, of which the position of the first is nearest to home. k is 0 if none is found.
 
         Raises
         ------
@@ -143,8 +143,8 @@ class RobotKinematics(RobotPlatform):
         geometry = self.geometry
         # radius of the search about the centre of the base joints
         centre = geometry.base_joints.mean(axis=0)
-        legs = geometry.joints_at(self.home_pose) - geometry.base_joints
-        reach = np.linalg.norm(legs, axis=1).max()
+        spans = geometry.joints_at(self.home_pose) - geometry.base_joints
+        reach = np.linalg.norm(spans, axis=1).max()
         radius = float(np.linalg.norm(geometry.base_joints - centre, axis=1).max() + reach)
         return forward_kinematics.assembly_modes(
             self.functions, geometry.chart, joints, centre, radius, count, seed

@@ -47,7 +47,7 @@ VERTICAL_TOLERANCE = 1e-9  # largest difference from 1 of the vertical component
 
 
 def lengths_of(geometry: RobotGeometry) -> dict[str, float]:
-    """Lengths of a robot, m, by name. All its legs must have the same lengths."""
+    """Lengths of a robot, m, by name. They are those of its first leg, because all must agree."""
     leg = geometry.legs[0]
     radii = [np.hypot(*joint[:2]) for joint in (leg.base_joint, leg.platform_joint)]
     lengths = dict(zip(RADII, map(float, radii), strict=True))
@@ -63,9 +63,9 @@ def robot_of_lengths(
     """Robot with other lengths, m, than `like`, and comments for its file. See the module.
 
     Lengths that are not given are those of `like`. The gains of the drives are designed so that the
-    servo of each loop is stable. Raises RobotFileError for a length that `like` does not have, and
-    for lengths with which the legs do not reach. Raises SimulationError if no gains make the loops
-    stable.
+    servo of each loop is stable. Raises RobotFileError for a length that `like` does not have or
+    that is out of range, and for lengths with which the legs do not reach, or with which the robot
+    comes near a singularity. Raises SimulationError if no gains make the loops stable.
     """
     old = lengths_of(like.geometry)
     for length, value in lengths.items():
@@ -155,7 +155,7 @@ def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
     """Direction (3,) of a horizontal crank that, seen from above, is at right angles to its link.
 
     `span` is the vector from the crank's axis to the platform joint. `side` is 1 for a crank on the
-    left of `span`, and -1 on the right.
+    left of `span`, and -1 on the right. Raises RobotFileError if the crank is too long for this.
     """
     distance = float(np.hypot(*span[:2]))
     if not crank < distance:
@@ -170,7 +170,10 @@ def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
 
 
 def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> np.ndarray:
-    """Base joint of a planar leg whose crank is at right angles to its link at home."""
+    """Base joint of a planar leg whose crank is at right angles to its link at home.
+
+    Raises RobotFileError if there is none on the circle of the base joints.
+    """
     base_radius, platform_radius = (new[name] for name in RADII)
     span = np.hypot(new["crank"], new["link"])
     nearest, farthest = abs(base_radius - platform_radius), base_radius + platform_radius
@@ -186,12 +189,12 @@ def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> 
     )
     turn = np.sign(np.sin(base_angle - platform_angle)) * np.arccos(cosine)
     angle = np.arctan2(platform[1], platform[0]) + turn
-    place = base_radius * np.array([np.cos(angle), np.sin(angle)])
-    return _shortened(np.append(place, leg.base_joint[2]), base_radius)
+    plan = base_radius * np.array([np.cos(angle), np.sin(angle)])
+    return _shortened(np.append(plan, leg.base_joint[2]), base_radius)
 
 
 def _height(leg: Leg, new: Mapping[str, float]) -> float:
-    """Height of the platform, m, at which the coordinate of a leg is zero."""
+    """Height of the platform, m, at which a leg's coordinate is zero. Raises RobotFileError."""
     name = "leg" if "leg" in new else "link"
     begin = leg.base_joint
     if "crank" in new:
@@ -208,7 +211,7 @@ def _height(leg: Leg, new: Mapping[str, float]) -> float:
 
 
 def _travel(geometry: RobotGeometry, old: RobotGeometry, ratios: Mapping[str, float]) -> float:
-    """Travel limit, m, in proportion to the lengths of the legs. A limit in rad is kept."""
+    """Travel limit, m, in proportion to the link or to `_home_to_end`. A limit in rad is kept."""
     if not geometry.prismatic:
         return old.travel_limit
     if "leg" not in ratios:
@@ -236,7 +239,10 @@ def _check_stroke(leg: Leg) -> None:
 
 
 def _within_limits(robot: Robot) -> Robot:
-    """Robot with a travel limit so small that no sampled pose is near a singularity."""
+    """Robot with a travel limit so small that no sampled pose is near a singularity.
+
+    Raises RobotFileError if the limit would be below `LEAST_TRAVEL` times the original one.
+    """
     limit = robot.travel_limit
     while True:
         geometry = replace(robot.geometry, travel_limit=limit)
@@ -260,27 +266,27 @@ def _far_from_limits(measures: workspace.WorkspaceMeasures) -> bool:
 def _near_singularity(robot: Robot, measures: workspace.WorkspaceMeasures) -> str:
     """Message about limits that are exceeded even within the travel limit of a robot."""
     home = _at_home(robot)
-    said = [f"{SAMPLES - len(measures.theta)} of {SAMPLES} positions of the joints have no pose"]
+    texts = [f"{SAMPLES - len(measures.theta)} of {SAMPLES} positions of the joints have no pose"]
     if len(measures.theta):
         reach = measures.reach_margin.min()
         leverage, condition = measures.leverage.min(), measures.platform_condition.max()
         if reach <= 0:
-            said.append(
+            texts.append(
                 f"reach margin {reach:.3g}, must be > 0, {home.reach_margin.min():.3g} at home"
             )
         if leverage < workspace.LEAST_LEVERAGE:
-            said.append(
+            texts.append(
                 f"leverage {leverage:.3g}, must be >= {workspace.LEAST_LEVERAGE:g}, "
                 f"{home.leverage.min():.3g} at home"
             )
         if condition > workspace.MOST_CONDITION:
-            said.append(
+            texts.append(
                 f"condition of the platform side {condition:.3g}, must be <= "
                 f"{workspace.MOST_CONDITION:g}, {home.platform_condition[0]:.3g} at home"
             )
     return (
         f"{robot.name} comes near a singularity within a travel of only {robot.travel_limit:.3g} "
-        f"{robot.layout.joint_unit} about home: {'; '.join(said)}; choose other lengths"
+        f"{robot.layout.joint_unit} about home: {'; '.join(texts)}; choose other lengths"
     )
 
 

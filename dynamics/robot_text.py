@@ -24,7 +24,7 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
     """
     geometry = robot.geometry
     layout = robot.geometry.layout
-    turning = "m and N" if layout.prismatic else "rad and N m"
+    units = "m and N" if layout.prismatic else "rad and N m"
     lines = [
         line
         for comment in comments
@@ -33,12 +33,12 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
         )
     ]
     lines += [
-        f"# Lengths in m, angles in rad, masses in kg, inertias in kg m^2; joints in {turning}.",
+        f"# Lengths in m, angles in rad, masses in kg, inertias in kg m^2; joints in {units}.",
         "",
     ]
     kinds = [type(leg).model_fields["type"].default for leg in geometry.legs]
-    platform_form = (kinds[0], len(kinds), geometry.chart.name) if len(set(kinds)) == 1 else None
-    family = next((name for name, form in FAMILIES.items() if form == platform_form), None)
+    own_form = (kinds[0], len(kinds), geometry.chart.name) if len(set(kinds)) == 1 else None
+    family = next((name for name, form in FAMILIES.items() if form == own_form), None)
     lines.append(f"name = {json.dumps(robot.name)}")
     lines.append(
         f"family = {json.dumps(family)}" if family else f"chart = {json.dumps(geometry.chart.name)}"

@@ -25,7 +25,7 @@ def impossible_kinds(layout: ParameterLayout, bodies: np.ndarray) -> set[str]:
     """
     moments = bodies[:, [FULL_INERTIAL.index(name) for name in MOMENTS]]
     impossible = 2 * moments.max(axis=1) > moments.sum(axis=1)
-    kinds = {kind.name for kind, no_body in zip(layout.kinds, impossible, strict=True) if no_body}
+    kinds = {kind.name for kind, broken in zip(layout.kinds, impossible, strict=True) if broken}
     return kinds & MOMENT_ABOUT_LENGTH.keys()
 
 
@@ -46,9 +46,10 @@ def scaled_bodies(
     ratios: Mapping[str, float],
     rods: Mapping[str, float],
 ) -> np.ndarray:
-    """Dynamic parameters of the scaled bodies, all of which can exist.
+    """Dynamic parameters (p,) with scaled bodies, all of which can exist. Friction is kept.
 
-    `rods` has the kinds of bodies that become rods, with their lengths, m.
+    `ratios` has the ratio of each new length to the old one. `rods` has the kinds of bodies that
+    become rods, with their lengths, m.
     """
     values = dynamic.copy()
     bodies = layout.bodies_of(values)

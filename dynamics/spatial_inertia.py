@@ -68,7 +68,7 @@ class SpatialInertia:
 
         The first is that of the forces, and the second that of the moments. M_dot - 2 C is
         skew-symmetric. `maps` are the two maps (3, n) of `mass_matrix`, and `map_rates` their time
-        derivatives.
+        derivatives. `velocity` and `spin` (3,) are v and omega.
         """
         centre_map, spin_map = maps
         centre_rate, spin_rate = map_rates

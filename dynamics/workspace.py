@@ -8,9 +8,9 @@
   crank w with the axis s and the link l, it is |(w x l) . s| / (|w| |l|). If it is zero, the
   actuator does not move the platform. For a crank, it is zero if the reach margin is zero.
 - On the platform side (J_a2), the measure is the condition number of J_a2 for the motions that the
-  platform can make. The rows of J_a2 are unit vectors along the forces of the legs. Its angular
-  columns are divided by the characteristic length, so that all entries have no unit. If the
-  condition number is infinite, the platform can move although all actuators are locked.
+  platform can make. A row of J_a2 has the unit vector along the force of a leg, and its moment
+  about the platform origin, divided by the characteristic length. All entries thus have no unit. If
+  the condition number is infinite, the platform can move although all actuators are locked.
 
 The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m
 for rss6). `rigid_body.jacobians.singularity_measures` has the measures as CasADi expressions.
@@ -122,7 +122,7 @@ class MotionExtremes:
 def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     """Measures of poses (N, 6), or of one pose (6,) as N = 1.
 
-    Raises ShapeError.
+    Raises ShapeError, ChartError, or DynamicsError if `robot` is not a Robot.
     """
     check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(robot.charted(pose))
@@ -139,8 +139,8 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
     """Measures of poses for random joint coordinates within the travel limit.
 
-    The search for each pose begins at home. If none is found, the joint coordinates are omitted, so
-    that there can be fewer rows than samples.
+    The search for each pose begins at home. Joint coordinates without a pose are omitted, so that
+    there can be fewer rows than samples.
     """
     limit = robot.travel_limit
     # the seed is fixed, because a report of a robot must not change from run to run
@@ -165,7 +165,8 @@ def check_motion(
     leg, the value and the limit. Raises UnreachablePoseError out of reach, and TravelError beyond
     the travel limit minus `travel_margin` (rad or m). Raises SingularPoseError for a leverage
     (J_a1) below `least_leverage`, or a condition number of the scaled J_a2 above `most_condition`.
-    Raises ShapeError for a wrong shape, or for times that do not increase.
+    Raises ChartError for a pose that the platform cannot have. Raises ShapeError for a wrong shape,
+    or for times that do not increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):

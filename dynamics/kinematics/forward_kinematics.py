@@ -16,12 +16,12 @@ from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
 from dynamics.kinematics.platform import Chart
 
-# A step below the first tolerance ends the iteration. A residual below the second, rad or m, counts
-# as solved.
+# Largest entry of a step, m or rad, at which the iteration ends.
 STEP_TOLERANCE = 1e-12
+# Residual of a joint coordinate, rad or m, below which a pose counts as a solution.
 ANGLE_TOLERANCE = 1e-12
-MAX_ITERATIONS = 50
-HALVINGS = 20
+MAX_ITERATIONS = 50  # largest number of steps
+HALVINGS = 20  # largest number of lengths of a step that are tried, each half the one before
 
 # Gap, m^2, below which a loop is closed up to rounding errors.
 CLOSED = 1e-14
@@ -43,8 +43,8 @@ class ForwardSolution:
     """Result of a search.
 
     `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) of Newton's method.
-    `residual` (n,) or (N, n) is the difference between the given joint coordinates and those of the
-    pose, rad or m. It is NaN if a leg cannot reach the pose.
+    `residual` (n,) or (N, n) is the magnitude of the difference between the given joint coordinates
+    and those of the pose, rad or m. It is NaN if a leg cannot reach the pose.
     """
 
     pose: np.ndarray
@@ -62,7 +62,8 @@ def solve(
 ) -> ForwardSolution:
     """Poses with joint coordinates theta (n,) or (N, n), found from a start (6,) or (N, 6).
 
-    Raises ConvergenceError, with row, leg and residual, if no pose is found.
+    Raises ConvergenceError, with row, leg and residual, if no pose is found. Raises ShapeError if
+    the starts do not match the rows of theta.
     """
     angles = np.atleast_2d(theta)
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
@@ -91,8 +92,9 @@ def assembly_modes(
 ) -> np.ndarray:
     """Distinct poses (k, 6) with joint coordinates theta (n,), found from random starts.
 
-    The starts are within `radius`, m, of `centre` (3,), with any orientation that the chart allows.
-    Each pose is checked by the inverse kinematics. The pose nearest to home is the first.
+    The starts are in a cube about `centre` (3,), which reaches `radius`, m, in each direction, with
+    any orientation that the chart allows. Each pose is checked by the inverse kinematics. The
+    position of the first pose is nearest to home.
     """
     rng = np.random.default_rng(seed)
     turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")
@@ -110,8 +112,8 @@ def assembly_modes(
     poses = poses[order]
     matrices = rotations.as_matrix()[order].reshape(-1, 9)
     kept: list[int] = []
-    for row, (place, matrix) in enumerate(zip(poses[:, :3], matrices, strict=True)):
-        near = np.abs(poses[kept, :3] - place).max(axis=1, initial=0.0) < SAME * radius
+    for row, (position, matrix) in enumerate(zip(poses[:, :3], matrices, strict=True)):
+        near = np.abs(poses[kept, :3] - position).max(axis=1, initial=0.0) < SAME * radius
         if not (near & (np.abs(matrices[kept] - matrix).max(axis=1, initial=0.0) < SAME)).any():
             kept.append(row)
     return poses[kept]
@@ -132,7 +134,7 @@ def close_loops(
     """Poses (N, 6) that best close the loops for joint coordinates (N, n), and step counts (N,).
 
     Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
-    negligible or reduces its gaps no further.
+    negligible or reduces its gaps no further, or after `MAX_ITERATIONS` steps.
     """
     poses = np.array(start)
     active = np.arange(len(theta))
@@ -158,10 +160,10 @@ def close_loops(
 def _damped(
     closure: Closure, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, gaps and Jacobians after a damped step, and the rows for which a step was found.
+    """Poses, gaps and Jacobians after a damped step, and a mask (N,) of the rows with such a step.
 
     The step is halved until it reduces the gaps. A negligible step is accepted even if rounding
-    keeps it from reducing the gaps.
+    keeps it from reducing the gaps. A row whose step never reduces them keeps its pose.
     """
     before = np.linalg.norm(gaps[..., 0], axis=1)
     scale = np.ones(len(poses))

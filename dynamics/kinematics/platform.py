@@ -220,7 +220,7 @@ class Chart:
         return np.moveaxis(lifted, -1, axis)
 
     def forbidden(self, pose: ArrayLike) -> np.ndarray:
-        """Deviations (N, 6) of poses from the poses that the platform can have, m and rad."""
+        """Deviations of poses (6,) or (N, 6) from those that the platform can have, m and rad."""
         values = np.asarray(pose, dtype=float)
         if len(self.freedoms) == len(POSE_NAMES):
             return np.zeros(values.shape)

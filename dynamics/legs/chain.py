@@ -1,4 +1,4 @@
-"""Leg found from its chain of joints at home, as files of other programs describe it."""
+"""Leg from its chain of joints at home, as files of other programs describe it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,12 +23,12 @@ class Chain(NamedTuple):
     """Joints of a leg at home, in order from the base. Vectors are in the axes of the base, m.
 
     `joints` are the kinds of the k joints: "hinge", "slide", "universal" or "ball", with * for the
-    actuated one. `points` (k, 3) are their positions. The last is the platform joint A, or the
-    middle between two parallel bars. `axes` (k, 2, 3) are the axis of each joint, and the second
-    axis of a universal joint. `coordinate` is that of the actuated joint. `platform_joint` is A in
-    the axes of the platform. `across` (3,) is the vector from the first of two bars to the second,
-    or zero. `centres` (k - 1, 3) are the centres of mass of the bodies. `rods` are the lengths and
-    radii of the drawn rods of the bodies, or None.
+    actuated one. `points` (k, 3) are their positions, midway between the bars if there are two. The
+    last is the platform joint A. `axes` (k, 2, 3) are the axis of each joint, and the second axis
+    of a universal joint. `coordinate` is that of the actuated joint at home, rad or m.
+    `platform_joint` (3,) is A in the axes of the platform. `across` (3,) is the vector from the
+    first of two bars to the second, or zero. `centres` (k - 1, 3) are the centres of mass of the
+    bodies. `rods` has the length and radius of the drawn rod of each body, None if it has no rod.
     """
 
     joints: tuple[str, ...]
@@ -153,7 +153,8 @@ def _sliding(chain: Chain) -> dict[str, Any]:
 def _telescopic(chain: Chain) -> dict[str, Any]:
     """Fields of a cylinder and its rod.
 
-    If the file has no lengths, both get the same length, such that home is at mid-stroke.
+    A length that the file does not have is 2/3 of the distance from B to A at home. If both are
+    missing, home is thus at mid-stroke.
     """
     base, _, end = chain.points
     length = float(np.linalg.norm(end - base))
@@ -198,7 +199,7 @@ def _second_axis_across(chain: Chain, joint: int) -> None:
 
 
 def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
-    """Raise RobotFileError unless two directions are parallel."""
+    """Raise RobotFileError unless two directions, named `what` and `of`, are parallel."""
     sine = float(
         np.linalg.norm(np.cross(direction, other))
         / np.linalg.norm(direction)

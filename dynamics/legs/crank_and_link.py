@@ -1,7 +1,7 @@
 """Force and mass matrix of a crank and a link with ten inertial parameters each (CasADi).
 
 The crank only rotates about its axis z. Let r be its length, theta its angle, x the axis along it,
-y = z x x, and g gravity. The first moments m_x and m_y of the crank add to the torque about z
+y = z x x, and g gravity. To the torque about z, the first moments m_x and m_y of the crank add
 
     m_x (r theta_ddot - y . g) + m_y x . g
 

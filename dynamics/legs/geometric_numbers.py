@@ -2,9 +2,9 @@
 
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
 its joints, m, its lengths, m, and small rotations of its axis, rad. Rotations are relative to the
-present axis, and thus zero unless the leg is moved. The rotations `u` and `v` are about axes
-perpendicular to that of the leg. On a crank, `u` is about its zero direction, and `crank_zero` is
-about the crank axis.
+present axis. Their values are thus zero, and only their deviations can differ from zero. The
+rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank, `u` is about the
+zero direction, and `crank_zero` is about the crank axis.
 
 A leg can be described by another leg and a vector of deviations of the geometric numbers. If the
 deviations are symbols, expressions of the leg can be differentiated with respect to them.

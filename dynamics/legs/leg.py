@@ -83,9 +83,10 @@ class Body:
 
 
 class Placement(NamedTuple):
-    """Placement of a body: its centre of mass (3,), and its axes (3, 3) as columns.
+    """Placement of a body: its reference point `centre` (3,), m, and its axes (3, 3) as columns.
 
-    The moments of inertia are in these axes.
+    The inertial parameters are about this point and in these axes. The reference point of a centred
+    body is its centre of mass.
     """
 
     centre: ca.SX
@@ -97,11 +98,11 @@ class Segment(NamedTuple):
 
     `joint` connects it with the body before it, or with the base. It is "hinge" about `axis`,
     "slide" along `axis`, "universal" about `axis` and then about x of this body, or "ball". `axis`
-    (3,) is in the axes of the body before. `origin` (3,) is the vector from the joint of the body
-    before to this joint, in the same axes.
+    (3,) is in the axes of the body before. `origin` (3,) is the vector, m, from the joint of the
+    body before to this joint, in the same axes. For a slide, it is the vector at coordinate zero.
 
-    The frame of the body is at its joint, with the axes of its `Placement`. Three places are in
-    this frame, m: `centre` (3,) is the centre of mass, `rod` (2, 3) are the ends of the drawn rod,
+    The frame of the body is at its joint, with the axes of its `Placement`. Three positions are in
+    this frame, m: `centre` (3,) is the reference point, `rod` (2, 3) are the ends of the drawn rod,
     which has the radius `radius`, and `end` (3,) is A on the last body.
 
     `actuated` is True if the coordinate of this joint is the coordinate of the leg. `copies` are
@@ -186,15 +187,16 @@ class Leg(BaseModel, ABC):
 
     def _turning(self, joint: np.ndarray) -> np.ndarray:
         """Rotation of each body per motion of A, rad/m. NaN for bodies whose axes are undefined."""
-        at = ca.SX.sym("position", 3)
-        moving = ca.SX.sym("velocity", 3)
+        point = ca.SX.sym("position", 3)
+        point_rate = ca.SX.sym("velocity", 3)
         turns = [
-            ca.norm_fro(ca.jacobian(spin, moving)) for spin in self.angular_velocities(at, moving)
+            ca.norm_fro(ca.jacobian(spin, point_rate))
+            for spin in self.angular_velocities(point, point_rate)
         ]
-        axes = [ca.sum1(ca.vec(place.axes)) for place in self.placements(at)]
-        turning, axis_sums = ca.Function("turning", [at], [ca.vertcat(*turns), ca.vertcat(*axes)])(
-            joint
-        )
+        axes = [ca.sum1(ca.vec(placement.axes)) for placement in self.placements(point)]
+        turning, axis_sums = ca.Function(
+            "turning", [point], [ca.vertcat(*turns), ca.vertcat(*axes)]
+        )(joint)
         # undefined axes are NaN, and make the sum NaN
         return np.array(turning).ravel() + 0 * np.array(axis_sums).ravel()
 
@@ -245,7 +247,7 @@ class Leg(BaseModel, ABC):
         """Angular velocities (3,) of the bodies, linear in the velocity (3,) of A."""
 
     def driven_inertia(self, body: np.ndarray) -> float:
-        """Inertia of the driven body at its actuator. NaN if no body is driven alone.
+        """Inertia of the driven body at its actuator, kg or kg m^2. NaN if no body is driven alone.
 
         `body` (10,) has the inertial parameters of a full body.
         """
@@ -260,8 +262,8 @@ class Leg(BaseModel, ABC):
 
         It is also the force at A due to a unit torque or force of the actuator (eq. 8).
         """
-        at = ca.SX.sym("position", 3)
-        return ca.substitute(ca.jacobian(self.coordinate(at), at).T, at, position)
+        point = ca.SX.sym("position", 3)
+        return ca.substitute(ca.jacobian(self.coordinate(point), point).T, point, position)
 
     def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Vector (3,) and divisor (terms of eq. 7) whose ratio is the gradient (eq. 8)."""
@@ -269,10 +271,10 @@ class Leg(BaseModel, ABC):
 
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
         """Second time derivative of the coordinate."""
-        at = ca.SX.sym("position", 3)
-        moving = ca.SX.sym("velocity", 3)
-        bias = ca.jtimes(ca.dot(self.gradient(at), moving), at, moving)
-        bias = ca.substitute(bias, ca.vertcat(at, moving), ca.vertcat(position, velocity))
+        point = ca.SX.sym("position", 3)
+        point_rate = ca.SX.sym("velocity", 3)
+        bias = ca.jtimes(ca.dot(self.gradient(point), point_rate), point, point_rate)
+        bias = ca.substitute(bias, ca.vertcat(point, point_rate), ca.vertcat(position, velocity))
         return ca.dot(self.gradient(position), acceleration) + bias
 
     def force(
@@ -288,51 +290,51 @@ class Leg(BaseModel, ABC):
         `bodies` has the inertial parameters of each body, 4 if it is centred or 10 if it is full.
         """
         # symbols, with respect to which the maps can be differentiated
-        at, moving, accelerating = (ca.SX.sym(name, 3) for name in "pva")
+        point, point_rate, point_acceleration = (ca.SX.sym(name, 3) for name in "pva")
         parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3)
-        for inertia, centre_map, spin_map, spin in self._maps(at, moving, parameters):
-            centre_acceleration = centre_map @ accelerating + ca.jtimes(
-                centre_map @ moving, at, moving
+        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, parameters):
+            centre_acceleration = centre_map @ point_acceleration + ca.jtimes(
+                centre_map @ point_rate, point, point_rate
             )
-            spin_acceleration = spin_map @ accelerating + ca.jtimes(spin, at, moving)
+            spin_acceleration = spin_map @ point_acceleration + ca.jtimes(spin, point, point_rate)
             push, moment = inertia.load(centre_acceleration - gravity, spin, spin_acceleration)
             total += centre_map.T @ push
             total += spin_map.T @ moment
         return _replaced(
             total,
-            (at, moving, accelerating, *parameters),
+            (point, point_rate, point_acceleration, *parameters),
             (position, velocity, acceleration, *bodies),
         )
 
     def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
         """Mass matrix (3, 3) of the leg at A. For `bodies` see `force`."""
-        at = ca.SX.sym("p", 3)
-        moving = ca.SX.sym("v", 3)
+        point = ca.SX.sym("p", 3)
+        point_rate = ca.SX.sym("v", 3)
         parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, _ in self._maps(at, moving, parameters):
+        for inertia, centre_map, spin_map, _ in self._maps(point, point_rate, parameters):
             total += inertia.mass_matrix(centre_map, spin_map)
-        return symmetric_from_lower(_replaced(total, (at, *parameters), (position, *bodies)))
+        return symmetric_from_lower(_replaced(total, (point, *parameters), (position, *bodies)))
 
     def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
         """Matrix C (3, 3). C times the velocity is the Coriolis and centrifugal force at A.
 
         It is the sum of J^T (M_body J_dot + C_body J) over the bodies (eq. 21, 22).
         """
-        at = ca.SX.sym("p", 3)
-        moving = ca.SX.sym("v", 3)
+        point = ca.SX.sym("p", 3)
+        point_rate = ca.SX.sym("v", 3)
         parameters = _symbols_for(bodies)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, spin in self._maps(at, moving, parameters):
+        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, parameters):
             map_rates = [
-                ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), at, moving), 3, 3)
+                ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), point, point_rate), 3, 3)
                 for m in (centre_map, spin_map)
             ]
             maps = (centre_map, spin_map)
-            for part in inertia.coriolis_parts(maps, map_rates, centre_map @ moving, spin):
+            for part in inertia.coriolis_parts(maps, map_rates, centre_map @ point_rate, spin):
                 total += part
-        return _replaced(total, (at, moving, *parameters), (position, velocity, *bodies))
+        return _replaced(total, (point, point_rate, *parameters), (position, velocity, *bodies))
 
     def _maps(
         self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]
@@ -344,12 +346,12 @@ class Leg(BaseModel, ABC):
         """
         maps_of_bodies = []
         spins = self.angular_velocities(position, velocity)
-        for kind, parameters, place, spin in zip(
+        for kind, parameters, placement, spin in zip(
             self.bodies, bodies, self.placements(position), spins, strict=True
         ):
-            maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
+            maps = ca.jacobian(placement.centre, position), ca.jacobian(spin, velocity)
             maps_of_bodies.append(
-                (spatial_inertia(parameters, place.axes, kind.moments), *maps, spin)
+                (spatial_inertia(parameters, placement.axes, kind.moments), *maps, spin)
             )
         return maps_of_bodies
 

@@ -5,7 +5,7 @@ Rates of Jacobians (Appendix A of the paper) are computed by automatic different
 A5 and A6 are misprinted. The vector a from the platform origin to joint A is in the axes of the
 base: eq. 3 and 5 need R a, although the paper defines a in platform axes. Centres of mass are at
 mid-length, unless a body has ten inertial parameters. Forces follow by virtual work, as for any
-`Leg`, but are here in closed form, which is faster.
+`Leg`. For a link that does not spin, they are here in closed form, which is faster.
 
 The link of a RUS leg has a universal joint (U) at the tip of the crank. The first axis of this
 joint is parallel to the crank axis, so that its direction is fixed in the axes of the base. The
@@ -115,7 +115,7 @@ class RssLeg(Leg):
 
     @model_validator(mode="after")
     def _normal(self) -> Self:
-        """Make the zero direction exactly perpendicular to the axis."""
+        """Make the zero direction exactly perpendicular to the axis, or raise ValueError."""
         zero = self.crank_zero_direction
         axis = self.crank_axis
         product = float(axis @ zero)

@@ -1,8 +1,8 @@
 """UPS leg of Gough-Stewart platforms: universal joint (U) at B, cylinder and rod (P), joint A (S).
 
 The first axis of the universal joint is fixed on the base. The leg rotates about this axis and
-about its own x. Cylinder and rod have the same rotation. Hence only the sums of their moments of
-inertia do work, about all three axes.
+about its own x. Cylinder and rod have the same rotation. Hence the motion depends only on the sums
+of their moments of inertia, about all three axes.
 """
 
 from __future__ import annotations
