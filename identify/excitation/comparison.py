@@ -119,7 +119,7 @@ def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progr
 
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
-POINTS = 1000
+POINTS = 1000  # number of instants that are drawn
 
 
 def comparison_figure(robot: Robot, settings: Excitation, comparison: Comparison) -> Figure:

@@ -1,7 +1,7 @@
 """Constraints on an exciting trajectory, as CasADi expressions of pose and pose rate.
 
-Every constraint is expressed as a used share of its limit. A trajectory is admissible if all shares
-lie between -1 and 1.
+Every constraint is expressed as the used share (fraction) of its limit. A trajectory is admissible
+if all shares lie between -1 and 1.
 
     box           distance from home over the amplitude that the scenario allows, by coordinate
     travel        joint coordinate over the travel limit minus the margin, by leg
@@ -10,11 +10,11 @@ lie between -1 and 1.
                   `dynamics.workspace`)
     conditioning  2-norm condition number of the scaled J_a2 over its limit; the expressions use
                   the condition number in a Schatten norm, which is smooth and 0 to 3 % larger
-    visibility    angle of incidence, and place in the image, of four stickers per plane for both
+    visibility    angle of incidence, and position in the image, of four stickers per plane for both
                   cameras; omitted if the stickers are proved visible in the whole box
 
-The form of the trajectory ensures that it starts at home and at rest. It also ends there, because
-the run lasts a whole number of periods.
+The form of the trajectory ensures that it starts at home and at rest. If the run lasts a whole
+number of periods (`check_periods`), it also ends there.
 """
 
 from collections.abc import Collection
@@ -48,7 +48,9 @@ CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
-    """Return the stickers that must stay visible: in each plane those farthest from their limits.
+    """Return the indices of the stickers that must stay visible.
+
+    In each plane, they are the stickers that are farthest from the limits of visibility at home.
 
     Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
     plane.
@@ -77,18 +79,20 @@ def visibility_shares(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca
     """Return the used shares of the limits of visibility for stickers at a pose.
 
     Each sticker has six rows, three for each camera: angle of incidence, and the horizontal and
-    vertical place in the image. Beyond +-1 the sticker is not visible to the camera. Lens
+    vertical position in the image. Beyond +-1 the sticker is not visible to the camera. Lens
     distortion is neglected.
     """
     platform = sight.platform
     rows = []
     rotation = rotation_matrix(pose[3:6])
     for k in stickers:
-        place = rotation @ platform.nominal[k] + pose[0:3]
+        position = rotation @ platform.nominal[k] + pose[0:3]
         normal = rotation @ platform.sticker_normals[k]
-        for camera, move in zip(sight.rig.cameras, sight.cameras_from_base, strict=True):
-            seen = move[:3, :3] @ place + move[:3, 3]
-            facing = -ca.dot(seen, move[:3, :3] @ normal) / ca.norm_2(seen)
+        for camera, camera_from_base in zip(
+            sight.rig.cameras, sight.cameras_from_base, strict=True
+        ):
+            seen = camera_from_base[:3, :3] @ position + camera_from_base[:3, 3]
+            facing = -ca.dot(seen, camera_from_base[:3, :3] @ normal) / ca.norm_2(seen)
             pixel = seen[0:2] / seen[2] * camera.focal_lengths + camera.centre
             half = np.array([camera.width - 1, camera.height - 1]) / 2
             rows += [(1 - facing) / (1 - GRAZING), (pixel - half) / (half - EDGE_PX)]
@@ -103,14 +107,14 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
     """
     turn = float(box[3:].sum())
     shares = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
-    places = apply(pose_to_transform(home), sight.platform.nominal[stickers])
+    positions = apply(pose_to_transform(home), sight.platform.nominal[stickers])
     shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(
         sight.platform.nominal[stickers], axis=1
     )
-    for camera, move, use in zip(
+    for camera, camera_from_base, used in zip(
         sight.rig.cameras, sight.cameras_from_base, shares.swapaxes(0, 1), strict=True
     ):
-        seen = apply(move, places)
+        seen = apply(camera_from_base, positions)
         # Smallest possible depth of the sticker, at which a shift moves its image most.
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():
@@ -118,7 +122,7 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
         # A shift changes the direction of sight as a rotation of the sticker would.
         turned = turn + np.arcsin(np.minimum(1.0, shifts / np.linalg.norm(seen, axis=1)))
         # Angle of incidence at home, from the used share of its limit.
-        angle = np.arccos(1 - use[:, 0] * (1 - GRAZING)) + turned
+        angle = np.arccos(1 - used[:, 0] * (1 - GRAZING)) + turned
         image_shift = (
             (shifts / nearest)[:, None]
             * (1 + np.abs(seen[:, :2] / seen[:, 2:]))
@@ -126,7 +130,7 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
         )
         half = np.array([camera.width - 1, camera.height - 1]) / 2 - EDGE_PX
         if (angle >= np.arccos(GRAZING)).any() or (
-            np.abs(use[:, 1:]) + image_shift / half >= 1
+            np.abs(used[:, 1:]) + image_shift / half >= 1
         ).any():
             return False
     return True
@@ -191,8 +195,8 @@ class Limit:
 class WorstCase:
     """Instant at which a trajectory comes nearest to a limit.
 
-    Value and limit are in ``unit``. ``share`` is the used share of the limit, ``who`` the leg,
-    coordinate or sticker, and ``time_s`` the time [s].
+    Value and limit are in ``unit``. ``share`` is the used share of the limit, or NaN if a leg is
+    out of reach. ``who`` is the leg, coordinate or sticker, and ``time_s`` the time [s].
     """
 
     name: str
@@ -218,8 +222,9 @@ class WorstCase:
 class MotionConstraints:
     """Constraints on the motion of a robot.
 
-    Raises TrajectoryError, with value, limit and leg, if the home pose violates a limit. Raises
-    ScenarioError for settings of another kind of actuators.
+    Raises TrajectoryError, with the values, if the margin leaves no travel, if the home pose
+    violates a limit, or if too few stickers are visible there. Raises ScenarioError for settings of
+    another kind of actuators.
     """
 
     def __init__(self, robot: Robot, settings: Excitation, sight: SightLines) -> None:
@@ -298,10 +303,10 @@ class MotionConstraints:
         rates = trajectory.pose_rate(times)
         used = np.array(self.shares(poses.T, rates.T)).T
         condition = measure(self._robot, poses).platform_condition
-        found = []
-        first = 0
+        worst_cases = []
+        first_column = 0
         for limit in self.limits:
-            block = np.abs(used[:, first : first + len(limit.who)])
+            block = np.abs(used[:, first_column : first_column + len(limit.who)])
             if limit.name == CONDITIONING:
                 # The check uses the exact 2-norm in place of the smooth norm of the search.
                 block = condition[:, None] / limit.limit[0]
@@ -311,27 +316,27 @@ class MotionConstraints:
             bound = limit.limit[who]
             value = bound / share if limit.lower else bound * share
             unit = f" {self._box_units[who]}" if limit.name == "box" else limit.unit
-            found.append(
+            worst_cases.append(
                 WorstCase(limit.name, value, bound, unit, share, limit.who[who], float(times[row]))
             )
-            first += len(limit.who)
-        return found
+            first_column += len(limit.who)
+        return worst_cases
 
     def check(
         self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9
     ) -> list[WorstCase]:
         """Return `worst` of an admissible trajectory.
 
-        Raises TrajectoryError for other trajectories. The message names constraint, leg, value,
-        limit and time of the worst violation.
+        Shares may exceed 1 by `tolerance`. Raises TrajectoryError for other trajectories. The
+        message names constraint, leg, value, limit and time of the worst violation.
         """
-        found = self.worst(trajectory, times)
-        broken = [w for w in found if not w.share <= 1 + tolerance]
+        worst_cases = self.worst(trajectory, times)
+        broken = [w for w in worst_cases if not w.share <= 1 + tolerance]
         if broken:
             raise TrajectoryError(
                 f"the trajectory is not admissible: {max(broken, key=WorstCase.excess)}"
             )
-        return found
+        return worst_cases
 
 
 def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:

@@ -5,9 +5,9 @@ A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, nam
 excites all parameters. It can be used to scale the criterion.
 
 Let H be the stacked regressor of N samples, with one column for each of the p parameters. The
-observability index is the geometric mean of the singular values of H over sqrt(N). Only the columns
-of the base parameters are linearly independent: H = H_1 C with the pivot columns H_1 and the base
-combinations C (rank, p). The product of the nonzero singular values is therefore
+observability index is the geometric mean of the nonzero singular values of H, divided by sqrt(N).
+Only the columns of the base parameters are linearly independent: H = H_1 C with the pivot columns
+H_1 and the base combinations C (rank, p). The product of the nonzero singular values is therefore
 sqrt(det(H_1^T H_1) det(C C^T)), for any choice of pivots, and
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(N) / 2.
@@ -18,8 +18,9 @@ joint controller are not included.
 
 H_1 is divided by a triangular matrix R, the factor of the QR factorisation of H_1 for the
 trajectory `typical`. This removes the units of the parameters and makes H_1^T H_1 well conditioned.
-The inverse of R is rounded to numbers on which all processors agree. The logarithm of the
-determinant of this rounded inverse is then subtracted, so that the index does not change.
+The inverse of R is rounded to numbers on which all processors agree. Twice the logarithm of the
+determinant of this rounded inverse is then subtracted from ln det, so that the index does not
+change.
 
 A run of whole periods is sampled over one period, because the index does not depend on the number
 of periods. Any other run is sampled from start to end.
@@ -48,9 +49,9 @@ from identify.own_parts import CRITERIA, PluginFunction, chosen, is_plugin_name
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
-SMOOTHING_RAD_S = 0.02
 # Velocity v_s in tanh(theta_dot / v_s), a differentiable replacement of the sign. A velocity
 # changes by about this amount between two samples.
+SMOOTHING_RAD_S = 0.02
 SMOOTHING_M_S = 0.002
 
 
@@ -66,7 +67,8 @@ class Criterion:
     value   Function z -> logarithm of the criterion.
     smooth  Differentiable approximation of `value`.
     judge   More accurate measure by which the results of a gradient search are ranked; larger is
-            better. It raises TrajectoryError for a trajectory that cannot be judged.
+            better. It raises TrajectoryError for a trajectory that cannot be judged. If None,
+            `value` ranks them.
     """
 
     value: ca.Function
@@ -77,7 +79,8 @@ class Criterion:
 def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
     """Return the scenario's criterion.
 
-    Raises ScenarioError, with the valid names, if there is no criterion of this name.
+    Raises ScenarioError, with the valid names, if there is no criterion of this name, and for a
+    user's own function that makes no valid criterion.
     """
     name = scenario.excitation.criterion
     make = chosen(name, "excitation.criterion", CRITERIA)
@@ -106,8 +109,8 @@ def _check_criterion(part: str, made: object, *given: Any) -> None:
         wanted = f"{part} must have a CasADi function {name} of z ({unknowns.size},) to one number"
         if not isinstance(function, ca.Function):
             raise ScenarioError(f"{wanted}, has {type(function).__name__}")
-        sizes = (function.n_in(), function.n_out())
-        if sizes != (1, 1) or function.numel_in(0) != unknowns.size or function.numel_out(0) != 1:
+        counts = (function.n_in(), function.n_out())
+        if counts != (1, 1) or function.numel_in(0) != unknowns.size or function.numel_out(0) != 1:
             raise ScenarioError(f"{wanted}, has {function}")
         if np.isnan(float(function(typical))):
             raise ScenarioError(f"{wanted}, but its value is NaN at an admissible trajectory")
@@ -166,9 +169,9 @@ def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int)
     """
     rank = len(combinations)
     # Powers of two scale without rounding.
-    lengths = 2.0 ** np.rint(np.log2(np.linalg.norm(typical, axis=1)))
-    factor = qr((typical / lengths[:, None]).T, mode="r")[0][:rank]
-    inverse = _rounded_triangle(solve_triangular(factor, np.eye(rank))) / lengths[:, None]
+    scales = 2.0 ** np.rint(np.log2(np.linalg.norm(typical, axis=1)))
+    factor = qr((typical / scales[:, None]).T, mode="r")[0][:rank]
+    inverse = _rounded_triangle(solve_triangular(factor, np.eye(rank))) / scales[:, None]
     scaled = ca.DM(inverse.T) @ columns
     constant = np.linalg.slogdet(combinations @ combinations.T)[1]
     constant -= 2 * np.log(np.abs(np.diag(inverse))).sum()

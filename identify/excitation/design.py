@@ -46,8 +46,8 @@ def admissible_trajectories(
 ) -> list[FourierTrajectory]:
     """Draw random trajectories that pass `check`, within the travel and without singularities.
 
-    The travel is the robot's travel minus the scenario's margin. Raises TrajectoryError, with the
-    last reason, if too few trajectories are admissible.
+    The travel is the robot's travel limit minus the scenario's margin. Raises TrajectoryError, with
+    the reason why the last one was refused, if too few trajectories are admissible.
     """
     rng = np.random.default_rng(seed)
     # The samples are denser than in a search, because limits can be violated between them.
@@ -75,8 +75,8 @@ def admissible_trajectories(
     )
 
 
-# Share by which random trajectories are allowed to exceed a limit. They are scaled to the box at
-# sampled times, and can exceed it slightly between these times.
+# Fraction by which random trajectories may exceed a limit. They are scaled to the box at sampled
+# times, and can exceed it slightly between these times.
 RANDOM_TOLERANCE = 1e-3
 
 
@@ -103,7 +103,7 @@ class Design:
         self.limits.check(trajectory, times, RANDOM_TOLERANCE)
 
     def candidates(self, count: int, seed: int) -> list[FourierTrajectory]:
-        """Draw the random candidates of a search."""
+        """Draw the random candidates of a search. Raises TrajectoryError if there are too few."""
         settings = self.settings
         return admissible_trajectories(
             self.robot, settings, settings.duration_s, count, child(seed, EXCITATION), self.check
@@ -114,7 +114,7 @@ class Design:
     ) -> SearchProblem:
         """Set up the search with admissible random trajectories.
 
-        Raises ScenarioError if there is no such criterion. Raises TrajectoryError if the method
+        Raises ScenarioError if the criterion is not valid. Raises TrajectoryError if the method
         needs a whole number of periods but the duration of the run is not one.
         """
         if self.settings.method != "random":
@@ -138,9 +138,9 @@ def design_trajectories(
 
     Excitation and validation have separate random streams.
 
-    Raises ScenarioError if there is no such criterion. Raises TrajectoryError if no random
-    trajectory of this amplitude is within the limits, if a search needs a whole number of periods
-    but the duration of the run is not one, or if a search finds nothing.
+    Raises ScenarioError if the criterion is not valid. Raises TrajectoryError if too few random
+    trajectories of this amplitude are within the limits, if a search needs a whole number of
+    periods but the duration of the run is not one, or if a search finds nothing.
     """
     progress = progress or SilentProgress()
     settings = design.settings

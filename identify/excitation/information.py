@@ -116,10 +116,10 @@ def knowledge(
     prior = np.eye(len(layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURING:
-        place = layout.names.index(measured_parameter(anchor, layout))
+        index = layout.names.index(measured_parameter(anchor, layout))
         std = settings.anchor_std or default_std(anchor, layout)
         # The matrix is in units of the prior standard deviations.
-        prior[place, place] += (guess.std[place] / std) ** 2
+        prior[index, index] += (guess.std[index] / std) ** 2
     start = side.model.start_parameters
     return Knowledge(start, guess, side.settings, times, covariance, prior)
 
@@ -168,13 +168,13 @@ def torque_response(
     """
     home = robot.home_pose
     xi = parameters[robot.layout.dynamic]
-    free = robot.geometry.chart.basis
-    to_twist = robot.twist(np.tile(home, (len(free.T), 1)), free.T).T
+    basis = robot.geometry.chart.basis
+    to_twist = robot.twist(np.tile(home, (len(basis.T), 1)), basis.T).T
     joint_rates = robot.coordinate_jacobian(home)
     inertia = np.linalg.solve(
-        (robot.joint_jacobian(home) @ free).T, free.T @ robot.mass_matrix(home, xi) @ to_twist
+        (robot.joint_jacobian(home) @ basis).T, basis.T @ robot.mass_matrix(home, xi) @ to_twist
     )
-    steps = STEP * free.T
+    steps = STEP * basis.T
     stiffness = (
         robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)
     ).T / (2 * STEP)
@@ -217,8 +217,8 @@ def log_linear_information(
     z = ca.MX.sym("z", unknowns.size)
     rows = sensitivity_spectrum(robot, unknowns, known.settings, known.guess.values, z, smoothing)
     count = len(known.guess.std)
-    free = unknowns.chart.basis
-    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance)) @ free
+    basis = unknowns.chart.basis
+    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance)) @ basis
     rows = rows @ ca.DM(
         np.kron(np.eye(2 * len(harmonics(unknowns))), agreed(whitener.T, RESPONSE_BITS))
     )
@@ -244,7 +244,8 @@ def sensitivity_spectrum(
 ) -> ca.MX:
     """Return the Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K).
 
-    Each harmonic has m real and m imaginary parts. A coefficient x_k means Re(x_k exp(s_k t)).
+    Each harmonic has m real and m imaginary parts. A coefficient x_k stands for the motion
+    Re(x_k exp(s_k t)).
     """
     times = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
     s = harmonics(unknowns)

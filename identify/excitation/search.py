@@ -29,8 +29,8 @@ from identify.trajectory import FourierTrajectory
 
 # Factor by which constraints are sampled more finely in the final check than during a search.
 CHECK_REFINEMENT = 8
-# Share of every limit that remains unused. The highest harmonic can rise by this share between the
-# instants of the check.
+# Fraction of every limit that remains unused. The highest harmonic can rise by this fraction
+# between the instants of the check.
 CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
 
 
@@ -72,8 +72,9 @@ class SearchProblem:
     def shrunk_inside(self, z: Array) -> Array:
         """Return the largest admissible multiple of z with a factor of at most one.
 
-        A smaller factor shrinks the motion towards the home pose, which is admissible. Raises
-        TrajectoryError if a thousandth of z is not admissible. The message names the constraint.
+        A smaller factor shrinks the motion towards the home pose, which is admissible. The factor
+        is found by bisection to 1e-6. Raises TrajectoryError if a thousandth of z is not
+        admissible. The message names the constraint.
         """
         if self.is_admissible(z):
             return z
@@ -131,7 +132,7 @@ STALLED = 1e-10
 # Smallest size of the population, because differential evolution combines several members.
 FEWEST_MEMBERS = 5
 MOST_MEMBERS = 32  # largest size of the population. Larger populations converge too slowly.
-# Share of the unknowns that a trial takes from its mutant. It is the best of several values that
+# Fraction of the unknowns that a trial takes from its mutant. It is the best of several values that
 # were tried with MOST_MEMBERS.
 RECOMBINATION = 0.9
 NOT_ADMISSIBLE = 1e6  # cost of a member that violates a limit, larger than any value of a criterion
@@ -219,7 +220,7 @@ MOST_ITERATIONS = 150  # largest number of iterations of IPOPT
 # Relative tolerance of IPOPT. A more accurate optimum does not excite noticeably more.
 TOLERANCE = 1e-4
 INTERIOR = 0.98  # factor that moves a start inside the limits, which an interior-point method needs
-FAR = 0.5  # used share of a limit below which the limit is ignored at first
+FAR = 0.5  # used share of a limit up to which the limit is ignored at first
 ALWAYS = "box"  # limit that is always included, because a criterion is unbounded without it
 STARTS = 3  # number of candidates from which IPOPT starts
 
@@ -241,7 +242,8 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
     Starts and problem are rounded to numbers on which all processors agree, and IPOPT's linear
     algebra is the same on all processors. The result is therefore the same, too.
 
-    Raises TrajectoryError if no start is admissible, or with IPOPT's reasons if it finds nothing.
+    Raises TrajectoryError if a start is not admissible even close to home, or, with IPOPT's
+    reasons, if IPOPT finds nothing from any start.
     """
     starts = problem.candidates[:STARTS]
     found = []

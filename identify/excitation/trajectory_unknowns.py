@@ -206,9 +206,9 @@ def regressor(
     jacobian = joint_jacobian(robot.geometry, pose)
     velocity = jacobian @ twist
     sign = ca.sign(velocity) if smoothing is None else ca.tanh(velocity / smoothing)
-    free = pose_basis(robot.geometry)
-    rigid = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
-    along = jacobian @ free
+    basis = pose_basis(robot.geometry)
+    rigid = basis.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
+    along = jacobian @ basis
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
     if of == "torque":
         columns = ca.horzcat(ca.solve(along.T, rigid), friction)
@@ -221,7 +221,8 @@ def regressor(
 def log_determinant(size: int) -> ca.Function:
     """Return the function of a matrix (size, size) -> ln det, by LDL^T.
 
-    Only the upper triangle is read. The value is NaN if the matrix is not positive definite.
+    Only the upper triangle is read. The value is NaN or -inf if the matrix is not positive
+    definite.
     """
     matrix = ca.SX.sym("matrix", size, size)
     upper = ca.triu(matrix)

@@ -50,9 +50,9 @@ def run_motion(run: "LoopModel", found: ClosedLoopRun) -> RunMotion:
     poses = chart.pose(chart.coordinates(found.pose))
     rates = chart.lifted(chart.coordinates(found.pose_rate))
     accelerations = make_interp_spline(found.time, rates, k=SPLINE_DEGREE).derivative()(found.time)
-    free = chart.basis
-    jacobians = robot.joint_jacobian(poses) @ free
-    maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ free.T
+    basis = chart.basis
+    jacobians = robot.joint_jacobian(poses) @ basis
+    maps = np.linalg.inv(jacobians).transpose(0, 2, 1) @ basis.T
     return RunMotion(
         poses=poses,
         twists=robot.twist(poses, rates),
@@ -68,9 +68,9 @@ def joint_rates(run: "LoopModel", found: ClosedLoopRun) -> Array:
 
 
 def by_the_joints(motion: RunMotion, wrenches: Array) -> Array:
-    """Return torques (N, n) of the joints for wrenches (N, 6), less those before the motion.
+    """Return torques (N, n) of the joints for wrenches (N, 6), less those at the first frame.
 
-    Before a motion begins, the drives hold the robot in equilibrium.
+    The drives already hold the robot in equilibrium before a motion begins.
     """
     torques = np.einsum("kij,kj->ki", motion.torque_maps, wrenches)
     return np.asarray(torques - torques[0])
@@ -83,14 +83,14 @@ Together = tuple[tuple[str, ...], ...]
 @lru_cache(maxsize=8)
 def _body_function(geometry: RobotGeometry, together: Together) -> ca.Function:
     """Return the wrenches (6, k) of `body_wrenches` for given weights, as a CasADi function."""
-    given = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
+    state = [ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot")]
     full = replace(geometry, full_bodies=("all",))
-    regressor = rigid_body_regressor(full, *given)
-    places = [[full.layout.rigid_names.index(name) for name in names] for names in together]
-    weights = ca.SX.sym("weights", sum(map(len, places)))
-    parts = ca.vertsplit(weights, [0, *np.cumsum([len(own) for own in places]).tolist()])
-    columns = [regressor[:, own] @ part for own, part in zip(places, parts, strict=True)]
-    return function("body_wrenches", [*given, weights], [ca.horzcat(*columns)])
+    regressor = rigid_body_regressor(full, *state)
+    indices = [[full.layout.rigid_names.index(name) for name in names] for names in together]
+    weights = ca.SX.sym("weights", sum(map(len, indices)))
+    parts = ca.vertsplit(weights, [0, *np.cumsum([len(own) for own in indices]).tolist()])
+    columns = [regressor[:, own] @ part for own, part in zip(indices, parts, strict=True)]
+    return function("body_wrenches", [*state, weights], [ca.horzcat(*columns)])
 
 
 def body_wrenches(
@@ -102,21 +102,21 @@ def body_wrenches(
     """
     if not together:
         return np.zeros((len(motion.poses), 6, 0))
-    given = motion.poses.T, motion.twists.T, motion.twist_dots.T
+    state = motion.poses.T, motion.twists.T, motion.twist_dots.T
     values = np.tile(np.concatenate(weights)[:, None], len(motion.poses))
-    found = _body_function(geometry, together)(*given, values).full()
-    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+    wrenches = _body_function(geometry, together)(*state, values).full()
+    return np.asarray(wrenches.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
 def passive_columns(geometry: RobotGeometry, motion: RunMotion) -> Array:
-    """Return the wrenches (N, 6, k) of all parameters of passive friction along a motion."""
-    found = _passive_function(geometry)(motion.poses.T, motion.twists.T).full()
-    return np.asarray(found.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
+    """Return the wrenches (N, 6, k) for a unit of each `passive_parameters` along a motion."""
+    wrenches = _passive_function(geometry)(motion.poses.T, motion.twists.T).full()
+    return np.asarray(wrenches.reshape(6, len(motion.poses), -1).transpose(1, 0, 2))
 
 
 @lru_cache(maxsize=8)
 def _passive_function(geometry: RobotGeometry) -> ca.Function:
-    """Return the wrenches (6, k) of all passive friction of a geometry, as a CasADi function."""
-    given = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
-    whole = replace(geometry, passive_friction=passive_parameters(geometry.legs))
-    return function("passive_friction", given, [passive_friction_columns(whole, *given)])
+    """Return the wrenches (6, k) of `passive_columns` for one pose, as a CasADi function."""
+    state = [ca.SX.sym(name, 6) for name in ("pose", "twist")]
+    full = replace(geometry, passive_friction=passive_parameters(geometry.legs))
+    return function("passive_friction", state, [passive_friction_columns(full, *state)])

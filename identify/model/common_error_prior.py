@@ -1,8 +1,8 @@
 """Prior of the common errors that are estimated with the parameters, and their effect on a loop.
 
-Errors of the poses and of the geometry come from the record. Errors of the latency, of the zeros
-and of the scale of commands, of the constants of the law of friction, and of the bodies have
-standard deviations in the model's side of a scenario. All of them are the same for all poses of a
+The record states the covariance of the errors of the poses and of the geometry. Standard deviations
+of the errors of the latency, of the zeros and the scale of commands, of the constants of friction,
+and of the bodies are in the model's side of a scenario. All errors are the same for all poses of a
 record.
 """
 
@@ -41,7 +41,9 @@ if TYPE_CHECKING:
 
 Run = TypeVar("Run", bound="LoopModel")
 
-LEAST_SCALE = 0.1  # smallest scale of the commands that a model can contain
+# Smallest scale of the commands, and smallest ratio of the Stribeck velocity to its stated value,
+# that a model can contain.
+LEAST_SCALE = 0.1
 
 
 def with_recorded_errors(
@@ -57,11 +59,12 @@ def with_recorded_errors(
     record         Record of the run, with the errors of its poses and of the geometry.
     side           Kinds of errors, and the standard deviations of the errors of the loop and of
                    bodies.
-    motion (N, 6)  Poses of the run, which show the errors of the geometry.
+    motion (N, 6)  Poses of the run, at which the effect of errors of the geometry is evaluated.
     own            Standard deviations of further errors in the loop, by name.
 
     Raises RecordError if the record states errors that are not valid. Raises EstimationError if
-    constants of friction are to be estimated under torques.
+    constants of friction are to be estimated under torques. Raises the ScenarioErrors of
+    `loop_error_stds` and `body_error_stds`.
     """
     kinds = side.nuisances
     geometry = None
@@ -91,17 +94,17 @@ def with_recorded_errors(
 def loop_error_stds(
     robot: Robot, model: Model, latency_std_s: float, kinds: tuple[str, ...]
 ) -> dict[str, float]:
-    """Return, by name, the standard deviations of the errors in the loop of some kinds.
+    """Return, by name, the standard deviations of some kinds of errors in the loop.
 
     Errors that are assumed to be zero are left out. latency_std_s: standard deviation of the mean
     latency. Raises ScenarioError if a standard deviation belongs to another kind of actuators or
-    another law of friction, or if it belongs to friction and `kinds` leaves friction out.
+    another law of friction or drives, or if it belongs to friction and `kinds` leaves friction out.
     """
-    found = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
-    zero = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
+    stds = {LATENCY: latency_std_s if "latency" in kinds else 0.0}
+    zero_std = of_actuators(robot, model, "joint_zero_std") if "zeros" in kinds else 0.0
     layout = robot.layout
-    found |= {zero_name(joint, layout.joint_unit): zero for joint in range(layout.joints)}
-    found[SCALE] = model.command_scale_std if "scale" in kinds else 0.0
+    stds |= {zero_name(joint, layout.joint_unit): zero_std for joint in range(layout.joints)}
+    stds[SCALE] = model.command_scale_std if "scale" in kinds else 0.0
     friction = _friction_stds(robot, model)
     stated = ", ".join(name for name, std in friction.items() if std)
     if stated and FRICTION not in kinds:
@@ -109,8 +112,8 @@ def loop_error_stds(
             f"the model states how well {stated} are known, but identification.nuisances leaves "
             "'friction' out"
         )
-    found |= friction
-    return {name: std for name, std in found.items() if std}
+    stds |= friction
+    return {name: std for name, std in stds.items() if std}
 
 
 def zero_name(joint: int, unit: str) -> str:
@@ -150,8 +153,8 @@ def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
 def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: FrictionLaw) -> Array:
     """Return the smallest errors (k,) that a loop can contain, in their standard deviations.
 
-    No latency is negative, static friction is not below Coulomb friction, and scale and velocities
-    stay above zero.
+    The mean latency is not negative, static friction is not below Coulomb friction, and scale and
+    Stribeck velocity stay above zero. The limit of all other errors is -inf.
     """
     least = {LATENCY: -mean_latency, SCALE: LEAST_SCALE - 1.0}
     if friction.static_ratio is not None and friction.stribeck_velocity is not None:
@@ -163,7 +166,7 @@ def lowest_errors(stds: Mapping[str, float], mean_latency: float, friction: Fric
 
 
 def settings_with_errors(settings: LoopSettings, errors: Mapping[str, float]) -> LoopSettings:
-    """Return the settings of a loop with errors of zeros, scale and friction."""
+    """Return the settings of a loop with errors, in their units, of zeros, scale and friction."""
     if any(name.startswith(FRICTION) for name in errors):
         offsets = tuple(value for name, value in errors.items() if name.startswith(FRICTION_OFFSET))
         settings = replace(

@@ -33,33 +33,32 @@ def error_modes(
     """Return the changes (N, 6, k) of a run's poses by one standard deviation of each error.
 
     They are central differences about the common errors that the model contains, at parameters
-    (p,). shown: function that returns the poses (N, 6) of a simulated run. known: changes (N, 6)
-    that need no simulation, by the place of their error. The model's `derived_modes` are added.
+    (p,). Errors of the geometry are the last. shown: function that returns the poses (N, 6) of a
+    simulated run. known: changes (N, 6) that need no simulation, by the index of their error. The
+    model's `derived_modes` are added to these.
 
     Raises LoopFailure if the model is unstable.
     """
-    drawn = run.errors_had
-    modes = np.zeros((*run.measured.shape, len(drawn)))
+    had = run.errors_had
+    modes = np.zeros((*run.measured.shape, len(had)))
     known = {**known, **run.derived_modes(parameters)}
-    for place, change in known.items():
-        modes[:, :, place] = change
+    for index, change in known.items():
+        modes[:, :, index] = change
     # Errors of poses in unnoticed directions count as without effect.
     unnoticed = range(run.common.noticed, len(run.common.names))
-    moving = [k for k in range(len(drawn)) if k not in known and k not in unnoticed]
+    moving = [k for k in range(len(had)) if k not in known and k not in unnoticed]
     inside = (*run.common.names, *run.common.loop_std, *run.common.body_std)
     steps = np.diag([FRICTION_STEP if kind_of(name) == FRICTION else 1.0 for name in inside])
     ends = [
-        np.maximum(drawn + sign * steps[k], run.lowest_drawn)
-        for k in moving
-        for sign in (1.0, -1.0)
+        np.maximum(had + sign * steps[k], run.lowest_drawn) for k in moving for sign in (1.0, -1.0)
     ]
-    # Errors of poses come first, because their runs differ only in what the servo measures.
+    # Errors of poses come first. Their runs differ only in what the servo measures.
     measured = 2 * sum(k < len(run.common.names) for k in moving)
-    found = _measuring(run, parameters, shown, ends[:measured])
-    found += in_threads(lambda end: shown(run.having(end).simulate(parameters)), ends[measured:])
-    for place, k in enumerate(moving):
-        more, less = found[2 * place : 2 * place + 2]
-        high, low = ends[2 * place : 2 * place + 2]
+    poses = _measuring(run, parameters, shown, ends[:measured])
+    poses += in_threads(lambda end: shown(run.having(end).simulate(parameters)), ends[measured:])
+    for index, k in enumerate(moving):
+        more, less = poses[2 * index : 2 * index + 2]
+        high, low = ends[2 * index : 2 * index + 2]
         # The distance is less than two steps if the loop cannot contain the lower end.
         modes[:, :, k] = (more - less) / (high[k] - low[k])
     if (geometry := run.common.geometry) is None:
@@ -74,9 +73,9 @@ def _measuring(
     shown: Callable[[ClosedLoopRun], Array],
     ends: Sequence[Array],
 ) -> list[Array]:
-    """Return the poses (N, 6) of a run whose servo measures with each of some common errors (k,).
+    """Return, for each of `ends` (k,), the poses (N, 6) of a run that measures with these errors.
 
-    The errors differ from those of the model only in errors of poses, so that several runs are
+    The ends differ from the errors of the model only in errors of poses, so that several runs are
     simulated together. Raises LoopFailure if the model is unstable.
     """
     if not ends:
@@ -85,25 +84,26 @@ def _measuring(
     changes = (np.array(ends) - run.errors_had)[:, :count]
     noises = np.tensordot(changes, run.common.modes, (1, 2))
     groups = np.split(noises, range(LANES, len(noises), LANES))
-    made = in_threads(lambda group: run.simulate_repeats(parameters, group), groups)
-    found = []
-    for one in chain.from_iterable(made):
-        if isinstance(one, LoopFailure):
-            raise one
-        found.append(shown(one))
-    return found
+    runs_by_group = in_threads(lambda group: run.simulate_repeats(parameters, group), groups)
+    poses = []
+    for made_run in chain.from_iterable(runs_by_group):
+        if isinstance(made_run, LoopFailure):
+            raise made_run
+        poses.append(shown(made_run))
+    return poses
 
 
 def differentiated(
     run: "LoopModel", parameters: Array, directions: Array
 ) -> tuple[ClosedLoopRun, Array]:
-    """Return a run of the model with sensitivities, and the derivatives (N, 6, k) of its poses.
+    """Return a run of the model with sensitivities, and derivatives (N, 6, k) along directions.
 
-    directions (N, n, k): directions of the commands, see `LoopModel.along`.
+    directions (N, n, k): directions of the commands, see `LoopModel.along`. The model is simulated
+    several times if one run has no room for all of them.
     """
-    room = most_directions(run.moving(parameters, run.robot)[0], run.groups)
-    parts = np.split(directions, range(room, directions.shape[2], room), axis=2)
+    most = most_directions(run.moving(parameters, run.robot)[0], run.groups)
+    parts = np.split(directions, range(most, directions.shape[2], most), axis=2)
     runs = [run.along(parameters, part) for part in parts]
-    found = [one.command_sensitivity for one in runs if one.command_sensitivity is not None]
-    none = np.zeros((*run.measured.shape, 0))
-    return runs[0], np.concatenate([none, *found], axis=2)
+    slopes = [made.command_sensitivity for made in runs if made.command_sensitivity is not None]
+    empty = np.zeros((*run.measured.shape, 0))
+    return runs[0], np.concatenate([empty, *slopes], axis=2)

@@ -1,6 +1,6 @@
 """Model of a recorded run, from the record and the model's side of a scenario.
 
-A record that is not suitable for an identification is refused, see `identify.record.checks`.
+A record that is not suitable for an identification is refused (see `identify.record.checks`).
 """
 
 from dataclasses import replace
@@ -43,7 +43,8 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
 
     Raises the errors of `predicting_model`. In addition, raises EstimationError if the record is
     too short, if a channel is constant, if the reference does not move, is too fast for the frame
-    rate, or does not begin at rest, or if units or frames differ from those of the robot.
+    rate, or does not begin at rest, if units or frames differ from those of the robot, or if joints
+    have gains of their own but the commands are torques.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
     # Checked before the model is made, because a short record cannot be filtered.
@@ -70,7 +71,8 @@ def predicting_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     Raises RecordError if something is missing, has a wrong shape or is not finite, or the payload
     is not valid. Raises TooFewFramesError if too many frames were lost. Raises EstimationError if
     the record is of another robot, timing or servo, or the covariance of its poses is not symmetric
-    and positive definite.
+    and positive definite. Raises also the errors of `with_recorded_errors` and, for a timed record,
+    those of `timed_model`.
     """
     check_origin(record, side.robot, side.timing, side.settings.servo)
     return timed_model(record, side) if is_timed(record) else _model(record, side)
@@ -155,9 +157,9 @@ def _settings(settings: LoopSettings, acting: Array) -> LoopSettings:
     The rate of commands is the frame rate, unless the times show another one.
     """
     rate_hz = settings.timing.frame_rate_hz
-    found = mean_rate(acting)
-    if abs(rate_hz / found - 1) > SAME_RATE:
-        rate_hz = found
+    shown_hz = mean_rate(acting)
+    if abs(rate_hz / shown_hz - 1) > SAME_RATE:
+        rate_hz = shown_hz
     steps = ceil(settings.steps_per_frame * settings.timing.frame_rate_hz / rate_hz - 1e-9)
     timing = FrameTiming(rate_hz, 0.0, settings.timing.hold)
     return replace(settings, timing=timing, steps_per_frame=max(1, steps))
@@ -171,10 +173,10 @@ def _filtered_motion(
     grid = grid_times(times, timing.frame_rate_hz)
     coordinates = chart.coordinates(interpolated(grid, times, measured))
     low_pass = side.low_pass
-    place, rate, _ = filtered_derivatives(
+    filtered, rate, _ = filtered_derivatives(
         coordinates, timing.frame_rate_hz, low_pass.cutoff_hz, low_pass.order
     )
-    return Reference(chart.pose(place), chart.lifted(rate))
+    return Reference(chart.pose(filtered), chart.lifted(rate))
 
 
 def _stretches(
@@ -190,14 +192,14 @@ def _stretches(
     acting = record["acting"].values
     logged = record["command"].values
     numbers = record[STRETCH].values
-    found = []
-    for place, number in enumerate(np.unique(numbers), start=1):
-        rows = np.flatnonzero(numbers == number)
+    stretches = []
+    for number, label in enumerate(np.unique(numbers), start=1):
+        rows = np.flatnonzero(numbers == label)
         good = rows[ok[rows]]
         newest = np.maximum(np.searchsorted(acting, times[good], side="right") - 1, 0)
-        begun = begun_stretch(
+        stretch = begun_stretch(
             robot,
-            place,
+            number,
             slice(int(rows[0]), int(rows[-1]) + 1),
             times[good],
             measured[good],
@@ -205,8 +207,8 @@ def _stretches(
             logged[newest],
             law,
         )
-        found.append(begun)
-    return tuple(found)
+        stretches.append(stretch)
+    return tuple(stretches)
 
 
 def _own_errors(run: TimedModel, side: ModelSide) -> dict[str, float]:
@@ -225,8 +227,9 @@ def _own_errors(run: TimedModel, side: ModelSide) -> dict[str, float]:
 def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
     """Return the model with the clock offset at which its motion is most like the measured one.
 
-    The motion of the model with the initial guess is correlated with the measured motion. The
-    search for the parameters, which is linear in the offset, begins there.
+    The motion of the model with the initial guess is compared with the measured motion. The search
+    for the parameters, which is linear in the offset, begins at this offset. The model is returned
+    as it is if it has no clock offset, or if it is unstable.
     """
     stds = run.common.loop_std
     if CLOCK_OFFSET not in stds:
@@ -248,20 +251,20 @@ def _at_likely_offset(run: TimedModel, side: ModelSide) -> TimedModel:
 def _likely_delay(times: Array, model: Array, measured: Array, farthest: float) -> float:
     """Return the delay, s, of measured poses (k, 6) behind those of a model at times (k,).
 
-    It is the delay up to `farthest` with the smallest squared difference, each component in units
-    of its spread.
+    It is the delay of at most `farthest`, of either sign, with the smallest squared difference.
+    Each component is divided by its standard deviation over time.
     """
-    spread = measured.std(axis=0)
-    moving = spread > 0
-    scaled = [one[:, moving] / spread[moving] for one in (model, measured)]
+    stds = measured.std(axis=0)
+    moving = stds > 0
+    scaled = [poses[:, moving] / stds[moving] for poses in (model, measured)]
     inner = (times > times[0] + farthest) & (times < times[-1] - farthest)
 
-    def apart(delay: float) -> float:
+    def misfit(delay: float) -> float:
         moved = interpolated(times[inner] - delay, times, scaled[0])
         return float(np.mean((moved - scaled[1][inner]) ** 2))
 
     coarse = np.linspace(-farthest, farthest, 2 * DELAYS + 1)
-    best = coarse[int(np.argmin([apart(delay) for delay in coarse]))]
+    best = coarse[int(np.argmin([misfit(delay) for delay in coarse]))]
     step = coarse[1] - coarse[0]
-    found = minimize_scalar(apart, bounds=(best - step, best + step), method="bounded")
-    return float(found.x)
+    refined = minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded")
+    return float(refined.x)

@@ -28,18 +28,18 @@ from identify.arrays import Array
 def equivalent_commands(
     torques: Array, latencies: Array, law: JointLaw, timing: FrameTiming
 ) -> Array:
-    """Return the changes (N, ..., n), rad or m, of commands for which drives add torques.
+    """Return the changes (N, ..., n), rad or m, of commands with which drives add given torques.
 
     The torques (N, ..., n), N m or N, are those at the frames. latencies (N,): time, s, from each
-    frame to the start of the action of its command. Before the first command there is no torque.
+    frame until its command begins to act. Before the first command there is no torque.
     """
     period = 1.0 / timing.frame_rate_hz
     by_rate = law.ld * law.rate_weight / period
-    half = law.li * period / 2
+    by_integral = law.li * period / 2
     needed = _while_commands_act(torques, latencies, timing)
     commands = np.zeros_like(torques)
-    for joint, (lp, b, h) in enumerate(zip(law.lp, by_rate, half, strict=True)):
-        weights = [lp + b + h, h - lp - 2 * b, b]
+    for joint, (lp, b, i) in enumerate(zip(law.lp, by_rate, by_integral, strict=True)):
+        weights = [lp + b + i, i - lp - 2 * b, b]
         commands[..., joint] = scipy.signal.lfilter(
             [1.0, -1.0], weights, needed[..., joint], axis=0
         )
@@ -49,7 +49,7 @@ def equivalent_commands(
 def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
     """Return values (N, ...) of the frames for the time in which the command of each frame acts.
 
-    It is their mean for a held command, and the value at the end of a ramp.
+    For a held command, it is the mean of the values, and for a ramp, the value at its end.
     """
     period = 1.0 / timing.frame_rate_hz
     times = np.arange(len(values)) * period
@@ -60,7 +60,7 @@ def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) ->
     if timing.hold == "linear":
         return np.asarray(spline(end))
     so_far = spline.antiderivative()
-    lasting = (end - begin).reshape(-1, *(1 for _ in values.shape[1:]))
+    duration = (end - begin).reshape(-1, *(1 for _ in values.shape[1:]))
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (so_far(end) - so_far(begin)) / lasting
-    return np.where(lasting > 0, mean, spline(end))
+        mean = (so_far(end) - so_far(begin)) / duration
+    return np.where(duration > 0, mean, spline(end))

@@ -11,7 +11,7 @@ Simulate = Callable[[Array, bool], ClosedLoopRun]
 MOST = 4
 """Number of runs without sensitivities that are kept.
 
-A search compares its starts twice, and there are up to three of them.
+A search compares its starts twice, and has up to three starts.
 """
 
 
@@ -28,7 +28,8 @@ class KnownRuns:
     def latest(self, parameters: Array, sensitivities: bool, simulate: Simulate) -> ClosedLoopRun:
         """Return the run with some parameters. If it is not known, it is simulated.
 
-        A run with sensitivities has the same poses as a run without.
+        A known run with sensitivities is also returned if none are asked for, because its poses
+        are the same.
         """
         given = parameters.tobytes()
         if self._differentiated is not None and self._differentiated[0] == given:

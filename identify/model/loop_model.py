@@ -36,8 +36,10 @@ from identify.record.stored_common_errors import LATENCY, NONE, CommonErrors, Ma
 class LoopModel(Residuals):
     """Model of one run of a robot, for the output error of its parameters (p,).
 
-    measured, ok (N, 6) and (N,)    Measured poses, NaN where lost, and marks of the measured
-                                    frames.
+    robot, settings, reference      Robot and loop as the estimator knows them, and the motion that
+                                    the servo follows.
+    measured, ok (N, 6) and (N,)    Measured poses, NaN where lost, and True for each frame that was
+                                    measured.
     covariance (6, 6)               Covariance of one measured pose.
     logged (N, n)                   Logged commands of the joints.
     payload, payload_errors (p,) and (p, 7)
@@ -92,7 +94,7 @@ class LoopModel(Residuals):
         return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return a copy with common errors (k,), in standard deviations, not below their limits."""
+        """Return a copy with common errors (k,), in standard deviations, raised to their limits."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         other = replace(self, drawn=contained, marginal=None)
         if not other.errors_had[other.contained].size:
@@ -103,14 +105,15 @@ class LoopModel(Residuals):
         """Return a copy of the model with residuals that are also whitened for common errors.
 
         The modes are evaluated at these parameters (p,), about the errors that the model contains.
-        Raises LoopFailure if the model is unstable.
+        A model without common errors is returned as it is. Raises LoopFailure if the model is
+        unstable.
         """
         if not self.common.all_names:
             return self
         bodies = body_errors(self, parameters)
         run = self if bodies is None else replace(self, bodies=bodies)
-        seen = run.modes(parameters)[self.ok]
-        modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
+        good_modes = run.modes(parameters)[self.ok]
+        modes = np.asarray(self.whitener @ good_modes).reshape(-1, good_modes.shape[2])
         had = modes[:, self.contained] @ self.errors_had[self.contained]
         whitened = replace(run, marginal=Marginal.of(modes, had))
         whitened.known_runs.update(run.known_runs)  # whitening changes no run
@@ -136,7 +139,7 @@ class LoopModel(Residuals):
         return error_modes(self, parameters, lambda run: run.pose, given)
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own."""
+        """Return, by index of the error, shifts (N, 6) by errors that need no runs of their own."""
         return body_modes(self, parameters)
 
     @property
@@ -175,26 +178,26 @@ class LoopModel(Residuals):
 
     @property
     def errors_had(self) -> Array:
-        """Common errors (k,) that the model contains: of the poses, the loop and the bodies."""
+        """Common errors (k,) of poses, loop and bodies in the model, in standard deviations."""
         common = self.common
         count = len(common.names) + len(common.loop_std) + len(common.body_std)
         return np.zeros(count) if self.drawn is None else self.drawn
 
     @property
     def contained(self) -> slice:
-        """Places of the common errors that move the model. Errors of poses need a servo for it."""
+        """Indices of the common errors that move the model. Those of poses move it by its servo."""
         return slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
 
     def in_deciding_stds(self, change: Array) -> Array:
-        """Return a change (k,) of the common errors in prior standard deviations."""
+        """Return a change (k,) of the common errors as it is, in prior standard deviations."""
         return change
 
     def beginning(self, window_s: float) -> "LoopModel":
-        """Return a copy with the residuals of a first window, s, of each start in motion."""
+        """Return the model, which begins at rest. See `TimedModel` for a model that does not."""
         return self
 
     def on_grid(self) -> "LoopModel":
-        """Return this run, approximately, with frames one period apart, for linear fits."""
+        """Return the model, whose frames are one period apart. See `TimedModel` for other times."""
         return self
 
     def simulate(
@@ -207,26 +210,29 @@ class LoopModel(Residuals):
 
         parameters (p,)  Parameters without the known load. The load is added.
         sensitivities    True to compute derivatives with respect to the parameters as well.
-        robot            Robot that moves, without sensitivities. The default is the robot that the
-                         servo knows.
+        robot            Robot that moves. The default is the robot that the servo knows. It is not
+                         used with sensitivities.
 
         Raises LoopFailure if the run is unstable.
         """
         if sensitivities:
             return self.along(parameters)
         given = *self.moving(parameters, robot or self.robot), self.reference, self._loop
-        late = self.latencies
+        latencies = self.latencies
         if self.driven:
             known = *given, self._commands(parameters), self._sensor
-            return simulate_commands(*known, latencies=late)
+            return simulate_commands(*known, latencies=latencies)
         fed = fed_forward(self, *given)
         # The servo always uses the robot that it knows, even if another robot moves.
-        return simulate_servo(*given, self._sensor, servo_robot=self.robot, latencies=late, **fed)
+        return simulate_servo(
+            *given, self._sensor, servo_robot=self.robot, latencies=latencies, **fed
+        )
 
     def along(self, parameters: Array, directions: Array | None = None) -> ClosedLoopRun:
         """Simulate the model with sensitivities, also along directions (N, n, k) of its commands.
 
-        With a servo, they are directions of the feedforward that is added to its commands.
+        With a servo, they are directions of the feedforward that is added to its commands. Raises
+        LoopFailure if the run is unstable.
         """
         given = *self.moving(parameters, self.robot), self.reference, self._loop
         more: dict[str, Any] = {"latencies": self.latencies, "groups": self.groups}
@@ -266,9 +272,9 @@ class LoopModel(Residuals):
         return commands if change is None else commands + change
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
-        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n)."""
-        late = self.stated_latencies if self.latencies is None else self.latencies
-        return equivalent_commands(torques, late, law, self.settings.timing)
+        """Return changes (N, ..., n) of commands with which drives of a law add torques."""
+        latencies = self.stated_latencies if self.latencies is None else self.latencies
+        return equivalent_commands(torques, latencies, law, self.settings.timing)
 
     @property
     def body_commands(self) -> Array | None:
@@ -283,7 +289,7 @@ class LoopModel(Residuals):
 
     @property
     def _loop(self) -> LoopSettings:
-        """Settings of the loop with the errors of zeros and scale that the model contains."""
+        """Settings of the loop with the errors of zeros, scale and friction in the model."""
         return settings_with_errors(self.settings, self._loop_errors)
 
     @property
@@ -292,7 +298,7 @@ class LoopModel(Residuals):
         return IdealSensor(None if self.driven else ~self.ok, self._sensed())
 
     def _sensed(self, noise: Array | None = None) -> Array | None:
-        """Return the errors and the noise (..., N, 6) of the poses that the servo measures."""
+        """Return errors plus noise (..., N, 6) of the poses that the servo measures, or None."""
         if self.drawn is None or not self.common.names or self.driven:
             return noise
         error: Array = self.common.modes @ self.drawn[: len(self.common.names)]

@@ -20,8 +20,8 @@ class ModelSide:
     robot          Robot with its known geometry.
     settings       Settings of the loop around the model. Its mean latency is used if a record does
                    not state when commands acted.
-    model          Parameter set of the initial guess, and the law of the drives, which can be left
-                   open.
+    model          Parameter set of the initial guess, standard deviations of errors, and the law of
+                   the drives, which can be left open.
     timing         Timing of the frames. In addition to the timing in `settings`, it has the
                    standard deviation of the latency.
     low_pass       Filter of the measured poses in all linear fits.

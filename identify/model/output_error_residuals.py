@@ -63,41 +63,44 @@ class Residuals:
         return KnownRuns()
 
     def white_residuals(self, parameters: Array, rng: np.random.Generator) -> Array:
-        """Return `residuals` (n, 6) of a model driven by commands. If it is right, they are white.
+        """Return `residuals` (n, 6) of a model driven by commands, white if the model is right.
 
         rng: generator for a subclass that fits states to the poses. Raises LoopFailure.
         """
         return self.residuals(parameters)
 
     def linearised(self, parameters: Array) -> tuple[Array, Array]:
-        """Return `residuals` (n, 6), and their derivatives (n, 6, k) before `of_all`."""
-        residual, shown = self._noise_linearised(parameters)
-        return self.without_common(residual), self.without_common(shown)
+        """Return the `residuals` (n, 6), and their derivatives (n, 6, k) for `of_all`."""
+        residual, jacobian = self._noise_linearised(parameters)
+        return self.without_common(residual), self.without_common(jacobian)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters, from those by pivots and the ungrouped."""
+        """Return derivatives (..., p) by all parameters, from those by pivots and ungrouped ones.
+
+        Derivatives by all parameters are returned as they are.
+        """
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)
 
     def noise_linearised(self, parameters: Array) -> tuple[Array, Array]:
         """Return residuals (n, 6) and their Jacobian (n, 6, p), whitened by the noise alone."""
-        residual, shown = self._noise_linearised(parameters)
-        return residual, self.of_all(shown)
+        residual, jacobian = self._noise_linearised(parameters)
+        return residual, self.of_all(jacobian)
 
     def _noise_linearised(self, parameters: Array) -> tuple[Array, Array]:
         run = self._latest_run(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
-        shown = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self.run_residuals(run), shown
+        jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
+        return self.run_residuals(run), jacobian
 
     def run_residuals(self, run: ClosedLoopRun) -> Array:
         """Return the residuals (n, 6) of a run of the model, whitened by the noise alone.
 
         The part due to the common errors in the model is subtracted.
         """
-        seen = run.pose if self.driven or self.drawn is None else run.measured
-        residual = self.whiten(seen - self.measured)
+        modelled = run.pose if self.driven or self.drawn is None else run.measured
+        residual = self.whiten(modelled - self.measured)
         if self.marginal is None:
             return residual
         return residual - self.marginal.had.reshape(residual.shape)
@@ -123,5 +126,5 @@ class Residuals:
 
     @cached_property
     def whitener(self) -> Array:
-        """Matrix (6, 6) that scales pose differences to standard deviations of the sensor."""
+        """Matrix W (6, 6) that whitens pose differences: W covariance W^T is the identity."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)), dtype=float)

@@ -1,9 +1,9 @@
 """Stretch of a record that begins in motion, and the state in which it begins.
 
 The first poses of a stretch determine its pose and pose rate at the start, by a polynomial in time.
-The integrals of the drives follow from the torque that holds the robot there, and from the error of
-the drives. Each of these numbers has an error with a wide prior, because the whole stretch
-determines it much better.
+The integrals of the drives follow from the torque that holds the robot there, and from the
+difference between commands and joints there. Each of these numbers has an error with a wide prior,
+because the whole stretch determines the number much better.
 """
 
 from collections.abc import Mapping
@@ -84,10 +84,10 @@ class Stretch:
                                         at which they began, relative to the start, s.
         """
         chart = robot.geometry.chart
-        off = np.array([errors.get(name, 0.0) for name in self.error_names])
+        offsets = np.array([errors.get(name, 0.0) for name in self.error_names])
         count = len(self.coordinates)
-        place, rate, integral = np.split(off, [count, 2 * count])
-        pose = chart.pose(self.coordinates + place)
+        offset, rate, integral = np.split(offsets, [count, 2 * count])
+        pose = chart.pose(self.coordinates + offset)
         # The integrals have errors of their own, which do not depend on that of the pose.
         held = chart.pose(self.coordinates)
         rest = equilibrium(robot, parameters, held, settings.servo, drives=settings.drives)
@@ -127,13 +127,13 @@ def begun_stretch(
     """
     chart = robot.geometry.chart
     since = times - times[0]
-    near = max(int(np.searchsorted(since, FIRST_S)), min(FEWEST, len(since)))
-    powers = np.vander(since[:near], min(DEGREE, near - 1) + 1, increasing=True)
-    solver = np.linalg.pinv(powers)
-    fit = solver @ chart.coordinates(measured[:near])
+    count = max(int(np.searchsorted(since, FIRST_S)), min(FEWEST, len(since)))
+    powers = np.vander(since[:count], min(DEGREE, count - 1) + 1, increasing=True)
+    inverse = np.linalg.pinv(powers)
+    fit = inverse @ chart.coordinates(measured[:count])
     free = chart.basis.T @ covariance @ chart.basis
     noise = np.sqrt(np.diag(free))
-    spread = np.linalg.norm(solver, axis=1)
+    norms = np.linalg.norm(inverse, axis=1)
     joints = robot.inverse_kinematics(chart.pose(chart.coordinates(measured)))
     error = commands - joints
     # A law without an integral has no error of an integral.
@@ -148,6 +148,6 @@ def begun_stretch(
         rates=fit[1] if len(fit) > 1 else np.zeros(fit.shape[1]),
         integral=-law.lp * per_torque * error[0],
         std=np.concatenate(
-            [WIDE * spread[0] * noise, WIDE * spread[1] * noise, WIDE * per_torque * lag]
+            [WIDE * norms[0] * noise, WIDE * norms[1] * noise, WIDE * per_torque * lag]
         ),
     )

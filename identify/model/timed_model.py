@@ -7,9 +7,9 @@ poses were seen and those at which commands began to act. A model of this kind n
 grid nor a reference.
 
 It does not need a start at rest, either. Pose and pose rate at the start, and the integrals of the
-drives, are common errors of the record with wide priors, about values from the first poses. After a
-gap in which commands are missing, the model starts anew in the same way. Each part of a record
-between such gaps is a stretch.
+drives, have values from the first poses. The errors of these values are common errors of the record
+with wide priors. After a gap in which commands are missing, the model starts anew in the same way.
+Each part of a record between such gaps is a stretch.
 
 The clock of the commands can differ from that of the poses by an offset and a drift. A command with
 the stated time t acts at t + offset + drift (t - t0), where t0 is the time of the first pose.
@@ -40,8 +40,8 @@ from identify.model.stretch import Stretch
 from identify.record.stored_common_errors import CLOCK_DRIFT, CLOCK_OFFSET, LATENCY, NONE
 from identify.runtime import in_threads
 
-# Steps of the clock's errors, s and s/s, for difference quotients of the poses. At these steps, a
-# quotient differs from the derivative by about 2e-4 of it.
+# Steps of the clock's errors, s and s/s, for difference quotients of the poses. With these steps,
+# the relative error of a quotient is about 2e-4.
 CLOCK_STEPS = {CLOCK_OFFSET: 1e-4, CLOCK_DRIFT: 5e-6}
 # Decimals of the times of events, s. A command and a pose of the same rounded time are one event.
 ROUNDING = 9
@@ -114,7 +114,7 @@ class TimedModel(LoopModel):
         return _joined(self._simulated(parameters, True, directions=directions))
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own.
+        """Return, by index of the error, shifts (N, 6) by errors that need no runs of their own.
 
         These are errors of the starts, of the clock and of bodies.
         """
@@ -132,19 +132,19 @@ class TimedModel(LoopModel):
         return np.asarray(np.linalg.qr(np.vstack([np.eye(len(change)), modes]), mode="r") @ change)
 
     def commands_for(self, torques: Array, law: JointLaw) -> Array:
-        """Return changes (M, ..., n) of commands for which drives add torques (N, ..., n).
+        """Return changes (M, ..., n) of commands with which drives add torques (N, ..., n).
 
         The torques are those at the times of the poses. The changes are interpolated between
         commands one period apart.
         """
         timing = self.settings.timing
         grid = grid_times(self.times, timing.frame_rate_hz)
-        along = interpolated(grid, self.times, torques)
-        needed = equivalent_commands(along, np.zeros(len(grid)), law, timing)
+        on_grid = interpolated(grid, self.times, torques)
+        needed = equivalent_commands(on_grid, np.zeros(len(grid)), law, timing)
         return interpolated(self.acting_now, grid, needed)
 
     def on_grid(self) -> LoopModel:
-        """Return this run, approximately, on a grid of one period, for linear fits."""
+        """Return the model, approximately, with frames one period apart, for linear fits only."""
         grid = grid_times(self.times[self.ok], self.settings.timing.frame_rate_hz)
         measured = interpolated(grid, self.times[self.ok], self.measured[self.ok])
         taken = {one.name: getattr(self, one.name) for one in fields(LoopModel)}
@@ -210,8 +210,8 @@ class TimedModel(LoopModel):
             more: dict[str, Any] = {"start": start, "times": events}
             if directions is not None:
                 # each event has the direction of the command that was written last
-                last = np.maximum(np.searchsorted(acting, events, side="right") - 1, newest - 1)
-                more |= {"directions": directions[last], "start_directions": directions[newest - 1]}
+                rows = np.maximum(np.searchsorted(acting, events, side="right") - 1, newest - 1)
+                more |= {"directions": directions[rows], "start_directions": directions[newest - 1]}
             run = (
                 differentiate_commands(*given, by_start=by_start, groups=self.groups, **more)
                 if sensitivities
@@ -221,41 +221,41 @@ class TimedModel(LoopModel):
         return runs
 
     def _shown_starts(self, parameters: Array) -> dict[int, Array]:
-        """Return, by place of the error, the changes (N, 6) of the poses by errors of a start."""
+        """Return, by index of the error, the changes (N, 6) of the poses by errors of a start."""
         runs = self._simulated(parameters, sensitivities=True, by_start=True)
-        # The search linearises at the same parameters next.
+        # The run is kept, because the search linearises at the same parameters next.
         self.known_runs.add(parameters, _joined(runs))
         stds = self.common.loop_std
-        places = {name: len(self.common.names) + k for k, name in enumerate(stds)}
-        found = {}
+        indices = {name: len(self.common.names) + k for k, name in enumerate(stds)}
+        changes = {}
         for stretch, run in zip(self.stretches, runs, strict=True):
             assert run.start_sensitivity is not None
             for column, name in enumerate(stretch.error_names):
                 if name in stds:
-                    found[places[name]] = np.zeros(self.measured.shape)
-                    found[places[name]][stretch.rows] = (
+                    changes[indices[name]] = np.zeros(self.measured.shape)
+                    changes[indices[name]][stretch.rows] = (
                         stds[name] * run.start_sensitivity[:, :, column]
                     )
-        return found
+        return changes
 
     def _shown_clock(self, parameters: Array) -> dict[int, Array]:
-        """Return, by place of the error, the changes (N, 6) of the poses by errors of the clock.
+        """Return, by index of the error, the changes (N, 6) of the poses by errors of the clock.
 
         The run at the parameters (p,) without a step is cached already.
         """
         before = self._latest_run(parameters, sensitivities=True).pose
         stds = self.common.loop_std
-        places = [len(self.common.names) + k for k, name in enumerate(stds) if name in CLOCK_STEPS]
+        indices = [len(self.common.names) + k for k, name in enumerate(stds) if name in CLOCK_STEPS]
         steps = [CLOCK_STEPS[name] / stds[name] for name in stds if name in CLOCK_STEPS]
 
         def moved(change: tuple[int, float]) -> Array:
-            place, step = change
+            index, step = change
             drawn = self.errors_had.copy()
-            drawn[place] += step
+            drawn[index] += step
             return (self.having(drawn).simulate(parameters).pose - before) / step
 
-        changes = [*zip(places, steps, strict=True)]
-        return dict(zip(places, in_threads(moved, changes), strict=True))
+        changes = [*zip(indices, steps, strict=True)]
+        return dict(zip(indices, in_threads(moved, changes), strict=True))
 
 
 # Fields of a run with one row per frame.

@@ -1,8 +1,9 @@
 """Model of a record with torque commands, simulated in short spans.
 
 Under logged torques the model has no feedback, and a deviation from the robot grows by a factor of
-about e^7 per second. Over a span of half a second it stays small. For every set of parameters, the
-coordinates and rates at the start of each span are fitted to its measured poses by Gauss-Newton.
+about e^7 per second. Over a span of half a second, this factor is small. For every set of
+parameters, the coordinates and rates at the start of each span are fitted to the measured poses of
+the span by Gauss-Newton.
 The poses of a run are the poses of the fitted spans. Their derivatives with respect to the
 parameters account for the fit of the starts (variable projection in Kaufman's form; BIT 15, 1975).
 Prior knowledge of a start is negligible. For m coordinates of the platform, the fit of a start
@@ -35,10 +36,10 @@ STEPS = 8
 """Largest number of Gauss-Newton steps of a start."""
 
 HALVINGS = 8
-"""Largest number of halvings of a step."""
+"""Largest number of lengths of a step that are tried, each half the one before."""
 
 STEP_TOLERANCE = 1e-3
-"""Largest change of a pose, in standard deviations, at which the steps end."""
+"""Change of all poses, in standard deviations, below which the steps end."""
 
 SHORTEST = 4
 """Length in frames up to which a span is not halved for the search of its start."""
@@ -87,8 +88,9 @@ class TorqueModel(LoopModel):
     ) -> ClosedLoopRun:
         """Simulate the model in fitted spans, with derivatives of its poses.
 
-        All other data of the returned run are from the first span. Raises LoopFailure if a span
-        leaves the reach of the robot.
+        The derivatives are computed even if `sensitivities` is False. All other data of the
+        returned run are from the first span. Raises LoopFailure if a span leaves the reach of the
+        robot.
         """
         fits = self._fits(parameters, robot)
         pose = np.concatenate([fit.run.pose for fit in fits])
@@ -139,7 +141,7 @@ class TorqueModel(LoopModel):
         values = parameters + self.payload
         moved = robot or self.robot
         spans = zip(self._spans, self.starts, before, strict=True)
-        fits = [self._fitted(values, moved, span, start, near) for span, start, near in spans]
+        fits = [self._fitted(values, moved, span, start, old) for span, start, old in spans]
         if robot is None:
             # Only one set of fits is cached, because each holds the sensitivities of all frames.
             self._latest.clear()
@@ -160,7 +162,7 @@ class TorqueModel(LoopModel):
         simulated from it. Otherwise it begins at the best start of half of the span, or at the
         filtered start. Raises LoopFailure.
         """
-        near = np.diag(1 / self._width)
+        weights = np.diag(1 / self._width)
         first, last = span
         fit = None
         if before is not None:
@@ -170,22 +172,22 @@ class TorqueModel(LoopModel):
             fit = self._tried(parameters, robot, span, half.start, filtered)
         fit = fit or self._from(parameters, robot, span, filtered, filtered)
         for _ in range(STEPS):
-            step = np.linalg.lstsq(np.vstack([fit.jacobian, near]), fit.residuals, rcond=None)[0]
+            step = np.linalg.lstsq(np.vstack([fit.jacobian, weights]), fit.residuals, rcond=None)[0]
             if np.abs(fit.jacobian @ step).max(initial=0.0) < STEP_TOLERANCE:
                 break
             # A full step can be too large, and even leave the reach of the robot.
             for halving in range(HALVINGS):
                 start = fit.start - 0.5**halving * step
-                lower = self._tried(parameters, robot, span, start, filtered)
+                trial = self._tried(parameters, robot, span, start, filtered)
                 if (
-                    lower is not None
-                    and lower.residuals @ lower.residuals < fit.residuals @ fit.residuals
+                    trial is not None
+                    and trial.residuals @ trial.residuals < fit.residuals @ fit.residuals
                 ):
                     break
             else:
                 break
-            assert lower is not None
-            fit = lower
+            assert trial is not None
+            fit = trial
         return fit
 
     def _tried(
@@ -236,16 +238,16 @@ class TorqueModel(LoopModel):
         )
 
     def _slopes(self, fit: Fit, ok: np.ndarray) -> Array:
-        """Return derivatives (n, 6, p) of a span's poses with respect to the parameters.
+        """Return derivatives (frames, 6, p) of all poses of a span with respect to the parameters.
 
         They include the change of the fitted start.
         """
         states = fit.jacobian.shape[1]
-        near = np.diag(1 / self._width)
+        weights = np.diag(1 / self._width)
         by_parameters = np.asarray(fit.run.pose_sensitivity)
         columns = (self.whitener @ by_parameters[ok]).reshape(len(fit.jacobian), -1)
         columns = np.vstack([columns, np.zeros((states, columns.shape[1]))])
-        moving = np.linalg.lstsq(np.vstack([fit.jacobian, near]), columns, rcond=None)[0]
+        moving = np.linalg.lstsq(np.vstack([fit.jacobian, weights]), columns, rcond=None)[0]
         return np.asarray(
             by_parameters - np.asarray(fit.run.start_sensitivity)[:, :, :states] @ moving
         )
@@ -263,22 +265,22 @@ def commands_before(run: LoopModel, frame: int) -> tuple[Array, Array | None]:
 
 
 def torque_model(run: LoopModel, low_pass: Filter) -> TorqueModel:
-    """Return the model of a recorded run with torque commands that begins at rest."""
+    """Return the model of a recorded run that begins at rest and has torque commands."""
     drives = Drives(torques=True, torque_limit=run.settings.drives.torque_limit)
     chart = run.robot.geometry.chart
     rate_hz = run.settings.timing.frame_rate_hz
     measured = chart.coordinates(run.without_gaps())
-    place, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
+    filtered, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
     rate[0] = 0.0  # the run begins at rest, but the filter is inaccurate at the ends
-    starts = np.hstack([place, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
-    parts = {one.name: getattr(run, one.name) for one in fields(LoopModel)}
+    starts = np.hstack([filtered, rate])[span_edges(len(run.ok), rate_hz)[:-1]]
+    parts = {each.name: getattr(run, each.name) for each in fields(LoopModel)}
     return TorqueModel(
         **parts | {"settings": replace(run.settings, drives=drives), "driven": True}, starts=starts
     )
 
 
 def span_edges(frames: int, rate_hz: float) -> list[int]:
-    """Return the first frame of each span of a run, followed by its number of frames.
+    """Return the first frame of each span of a run, followed by the number of frames of the run.
 
     All spans have about the same length.
     """

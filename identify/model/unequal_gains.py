@@ -36,11 +36,11 @@ class UnequalGains(LoopModel):
         return self.robot.layout.split(parameters)[3] + self.differences
 
     def derived_modes(self, parameters: Array) -> dict[int, Array | float]:
-        """Return, by place of the error, shifts (N, 6) by errors that need no runs of their own."""
-        found = super().derived_modes(parameters)
+        """Return, by index of the error, shifts (N, 6) by errors that need no runs of their own."""
+        modes = super().derived_modes(parameters)
         # the cached run has sensitivities by the gains of each joint, not by the shared gains
         self.known_runs.clear()
-        return found
+        return modes
 
     def simulate(
         self, parameters: Array, sensitivities: bool = False, robot: Robot | None = None
@@ -55,7 +55,8 @@ class UnequalGains(LoopModel):
     def by_gains(self, sensitivity: Array) -> tuple[Array, Array]:
         """Return the derivatives by parameters with shared gains, and by the gains of each joint.
 
-        They are (N, 6, k) and (N, 6, n, 3). sensitivity: by the gains of each joint.
+        They are (N, 6, k) and (N, 6, n, 3). sensitivity (N, 6, ...): derivatives of the poses by
+        the dynamic parameters, then by the gains lp, li, ld of each joint.
         """
         gains = self.robot.layout.joints * len(JOINT_PID)
         rows = sensitivity.shape[:2]
