@@ -27,6 +27,6 @@ class BodyMesh(Strict):
     scale: Length = Field(1.0, description="length of one unit of the mesh, m: 0.001 for mm")
     pose: Pose = Field(
         ORIGIN,
-        description="pose of the mesh in the axes of the body, whose origin is its joint with the "
-        "body before, m and rad",
+        description="pose of the mesh in the frame of the body, m and rad; the origin of the frame "
+        "is the joint with the body before",
     )

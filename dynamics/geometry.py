@@ -279,7 +279,7 @@ class RobotGeometry:
         if self.chart.name not in FREEDOMS:
             raise RobotFileError(f"unknown chart `{self.chart.name}`; valid: {', '.join(FREEDOMS)}")
         if not self.legs:
-            raise RobotFileError("a robot needs legs, it has none")
+            raise RobotFileError("a robot needs legs, but has none")
         freedoms = len(self.chart.freedoms)
         counts = Counter(leg.chart for leg in self.legs)
         charts = ", ".join(f"{count} of `{chart}`" for chart, count in counts.items())

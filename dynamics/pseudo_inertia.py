@@ -122,7 +122,7 @@ def body_fault(body: np.ndarray, smallest: float = 0.0) -> str:
     The mass must be above `smallest`, kg, and the principal moments at least `smallest`, kg m^2.
     """
     if not body[0] > smallest:
-        return f"mass = {body[0]:g} is below {smallest:g}"
+        return f"mass = {body[0]:g} is not above {smallest:g}"
     if is_centred(body):
         for name, value in zip(MOMENTS, body[4:7], strict=True):
             if value < smallest:

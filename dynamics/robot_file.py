@@ -52,7 +52,7 @@ class RobotFile(Strict):
         None, description=f"one of {', '.join(FAMILIES)}; determines the kind of legs and the chart"
     )
     chart: str | None = Field(
-        None, description=f"freedoms of the platform, without a family: {', '.join(FREEDOMS)}"
+        None, description=f"freedoms of the platform, if there is no family: {', '.join(FREEDOMS)}"
     )
     home_pose: list[Place] = Field(
         min_length=6, max_length=6, description="pose of the platform at home, m and rad"
@@ -68,17 +68,17 @@ class RobotFile(Strict):
     )
     unstated: Unstated = Field(
         Unstated(),
-        description="standard deviations of the centred bodies from bodies with ten parameters, "
-        "and of passive joints from joints without friction; 0 if they are exact",
+        description="standard deviations of the differences between the model and real bodies and "
+        "passive joints; 0 if they are exact",
     )
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
-        description="a table for each leg; with a family also a single table, in which each key "
-        "has one value, or a list with one value per leg"
+        description="a table for each leg or, with a family, a single table in which each key has "
+        "one value or a list with one value per leg"
     )
     meshes: list[BodyMesh] = Field(
         [],
         max_length=MOST_MESHES,
-        description="meshes that draw bodies of the legs, and hide stickers, in place of rods",
+        description="meshes in place of the drawn rods of bodies of the legs; they hide stickers",
     )
     parameters: dict[str, Parameters] = Field(
         description="named sets: `guess` is the initial guess of an identification, and `truth` "

@@ -234,7 +234,7 @@ def _check_stroke(leg: Leg) -> None:
     if not shortest < leg.zero_length < longest:  # type: ignore[attr-defined]
         raise RobotFileError(
             f"leg is {leg.zero_length:g} m, must be between {shortest:g} m, the longer of cylinder "  # type: ignore[attr-defined]
-            f"and rod, and {longest:g} m, both together; state cylinder and rod, too"
+            f"and rod, and {longest:g} m, their sum; state cylinder and rod, too"
         )
 
 

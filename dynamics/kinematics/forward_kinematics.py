@@ -178,19 +178,19 @@ def _damped(
     return np.where(better[:, None], trials, poses), new_gaps, jacobians, better
 
 
-def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve_each(matrices: np.ndarray, right_sides: np.ndarray) -> np.ndarray:
     """Solutions (N, m, 1) of linear systems.
 
     For a singular matrix, the result is the least-squares solution of minimum norm. For a matrix
     that has overflowed, it is NaN.
     """
     try:
-        return np.linalg.solve(matrices, right)
+        return np.linalg.solve(matrices, right_sides)
     except np.linalg.LinAlgError:
         # NumPy refuses all matrices if one of them is singular
         finite = np.isfinite(matrices).all(axis=(1, 2))
-        solutions = np.full(right.shape, np.nan)
-        solutions[finite] = np.linalg.pinv(matrices[finite]) @ right[finite]
+        solutions = np.full(right_sides.shape, np.nan)
+        solutions[finite] = np.linalg.pinv(matrices[finite]) @ right_sides[finite]
         return solutions
 
 
@@ -204,14 +204,13 @@ def _check(functions: Functions, theta: np.ndarray, solution: ForwardSolution) -
     gap = np.abs(
         functions["loop_closure"](solution.pose[row : row + 1], theta[row : row + 1])[0]
     ).max()
-    loop_text = f"its loops have a gap of {gap:.3g} m^2 in squared length"
+    loop_text = f"leaves a gap of {gap:.3g} m^2 in squared length"
     if gap < CLOSED:
-        loop_text = f"it closes the loops, but leg {leg + 1} is folded the other way than at home"
+        loop_text = f"closes the loops, but leg {leg + 1} is folded the other way than at home"
     joint_text = f"joint {leg + 1} is off by {difference:.3g}, limit {ANGLE_TOLERANCE:.0e}"
     if np.isnan(difference):
-        joint_text = f"leg {leg + 1} cannot reach it"
+        joint_text = f"leg {leg + 1} cannot reach this pose"
     raise ConvergenceError(
         f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row "
-        f"{row}) in {solution.iterations[row]} steps: of the nearest pose, {loop_text}; "
-        f"{joint_text}"
+        f"{row}) in {solution.iterations[row]} steps: the last pose {loop_text}; {joint_text}"
     )

@@ -108,16 +108,16 @@ def _cranked(chain: Chain) -> dict[str, Any]:
 
 def _with_universal_joint(chain: Chain) -> dict[str, Any]:
     """Fields of a crank, and of a link on a universal joint."""
-    _same_line(
+    _check_parallel(
         "the first axis of its universal joint", chain.axes[1, 0], "the crank's", chain.axes[0, 0]
     )
-    _second_axis_across(chain, 1)
+    _check_second_axis(chain, 1)
     return _cranked(chain)
 
 
 def _parallelogram(chain: Chain) -> dict[str, Any]:
     """Fields of a crank, and of a link of two bars."""
-    _same_line("the line from bar to bar", chain.across, "the crank's axis", chain.axes[0, 0])
+    _check_parallel("the line from bar to bar", chain.across, "the crank's axis", chain.axes[0, 0])
     return _cranked(chain) | {"bar_distance": float(np.linalg.norm(chain.across))}
 
 
@@ -126,7 +126,7 @@ def _planar(chain: Chain) -> dict[str, Any]:
     axis = chain.axes[0, 0]
     for joint, name in enumerate(chain.joints):
         if name == "hinge":
-            _same_line(
+            _check_parallel(
                 f"the axis of its joint {joint + 1}", chain.axes[joint, 0], "the crank's axis", axis
             )
     flat = chain.points - np.outer((chain.points - chain.points[-1]) @ axis, axis)
@@ -145,7 +145,7 @@ def _sliding(chain: Chain) -> dict[str, Any]:
     if chain.rods[0] is not None:
         fields["slider_length"] = chain.rods[0][0]
     if chain.joints[1] == "universal":
-        _second_axis_across(chain, 1)
+        _check_second_axis(chain, 1)
         fields["joint_axis"] = chain.axes[1, 0]
     return fields
 
@@ -158,11 +158,11 @@ def _telescopic(chain: Chain) -> dict[str, Any]:
     """
     base, _, end = chain.points
     length = float(np.linalg.norm(end - base))
-    _same_line("its slide", chain.axes[1, 0], "the line through its ends", end - base)
-    _second_axis_across(chain, 0)
+    _check_parallel("its slide", chain.axes[1, 0], "the line through its ends", end - base)
+    _check_second_axis(chain, 0)
     if chain.axes[1, 0] @ (end - base) < 0:
         raise RobotFileError(
-            "its coordinate grows as it gets shorter: reverse the axis of its slide"
+            "its coordinate grows as the leg gets shorter: reverse the axis of its slide"
         )
     lengths = [length / 1.5 if rod is None else rod[0] for rod in chain.rods]
     along = (end - base) / length
@@ -187,7 +187,7 @@ def _drawn(chain: Chain, *names: str) -> dict[str, float]:
     }
 
 
-def _second_axis_across(chain: Chain, joint: int) -> None:
+def _check_second_axis(chain: Chain, joint: int) -> None:
     """Raise RobotFileError unless the second axis of a joint is perpendicular to its body."""
     along = chain.points[-1] - chain.points[joint]
     angle = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
@@ -198,7 +198,7 @@ def _second_axis_across(chain: Chain, joint: int) -> None:
         )
 
 
-def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
+def _check_parallel(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
     """Raise RobotFileError unless two directions, named `what` and `of`, are parallel."""
     sine = float(
         np.linalg.norm(np.cross(direction, other))

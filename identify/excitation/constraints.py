@@ -55,9 +55,9 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
     Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
     plane.
     """
-    shares = np.array(_functions(sight, range(len(sight.platform.sticker_ids)))(home)).reshape(
-        -1, 2, 3
-    )
+    shares = np.array(
+        _shares_function(sight, range(len(sight.platform.sticker_ids)))(home)
+    ).reshape(-1, 2, 3)
     worst = np.abs(shares).max(axis=(1, 2))
     visible = sight.visible(home)
     chosen: list[int] = []
@@ -68,7 +68,7 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
         if len(seen) < needed:
             raise TrajectoryError(
                 f"visibility: {len(seen)} stickers of plane {plane} are visible to both cameras at "
-                f"the home pose, {needed} are needed"
+                f"the home pose, but {needed} are needed"
             )
         # With a stable sort, the choice among equally good stickers is the same on all machines.
         chosen += seen[np.argsort(worst[seen], kind="stable")][:needed].tolist()
@@ -106,7 +106,7 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
     bounds do not suffice, and not that a sticker is invisible.
     """
     turn = float(box[3:].sum())
-    shares = np.array(_functions(sight, stickers)(home)).reshape(-1, 2, 3)
+    shares = np.array(_shares_function(sight, stickers)(home)).reshape(-1, 2, 3)
     positions = apply(pose_to_transform(home), sight.platform.nominal[stickers])
     shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(
         sight.platform.nominal[stickers], axis=1
@@ -136,7 +136,8 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
     return True
 
 
-def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
+def _shares_function(sight: SightLines, stickers: range | list[int]) -> ca.Function:
+    """Return `visibility_shares` as a function of the pose (6,)."""
     pose = ca.SX.sym("pose", 6)
     return ca.Function(
         "visibility_shares", [pose], [visibility_shares(sight, list(stickers), pose)]

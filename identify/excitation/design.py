@@ -71,7 +71,7 @@ def admissible_trajectories(
         f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of "
         f"±{settings.position_amplitude_m:g} m and "
         f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other "
-        f"limits, {count} are needed; the last: {reason}"
+        f"limits, but {count} are needed; the last one does not: {reason}"
     )
 
 

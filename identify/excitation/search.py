@@ -172,7 +172,7 @@ def evolve(
             callback=lambda intermediate_result: advance(),
         )
     z = problem.shrunk_inside(population.fill(found.x))
-    reason = "values no longer spread" if found.success else f"{found.nit} generations"
+    reason = "population converged" if found.success else f"{found.nit} generations"
     return SearchResult(z, problem.value(z), found.nfev, 0, found.nit, reason)
 
 
