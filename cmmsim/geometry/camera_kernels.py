@@ -81,8 +81,7 @@ def point_derivatives(
 
     ``move`` (4, 4) transforms the point into camera axes. ``by_u`` and ``by_v`` are the derivatives
     of the pixel coordinate with respect to the ideal pixel. ``f_x`` and ``f_y`` are the focal
-    lengths divided by the depth, and ``t_x`` and ``t_y`` are the normalised image coordinates of
-    the point.
+    lengths divided by the depth, and ``t_x`` and ``t_y`` the normalised image coordinates.
     """
     in_x = by_u * f_x
     in_y = by_v * f_y

@@ -173,7 +173,6 @@ def inverse_shape(shape: Array) -> Array:
 REACH = 5.5
 # Rim points per standard deviation of the point spread.
 POINTS_PER_SIGMA = 1.1
-# Smallest number of rim points.
 FEWEST_POINTS = 24
 SQRT_HALF = math.sqrt(0.5)
 SQRT_TWO_PI = math.sqrt(2.0 * math.pi)

@@ -14,7 +14,6 @@ from cmmsim.compilation import Array, compiled
 # Newton's method has converged if the distortion maps its result to within this of the given point,
 # in each normalised coordinate.
 CONVERGED = 1e-12
-# Largest number of Newton steps for a point.
 MOST_STEPS = 60
 
 
@@ -62,9 +61,9 @@ def undistort_points(
 ) -> None:
     """Fill the undistorted points (n, 2) of distorted ``points`` (n, 2) by Newton's method.
 
-    ``found`` (n,) is filled with True if the method converged within the radius ``reach`` to a
-    point where the image is not mirrored. Other points are finite but meaningless. ``lens`` (5,) is
-    that of ``distort_points``.
+    ``found`` (n,) is True if the method converged within the radius ``reach`` to a point where the
+    image is not mirrored. Other points are finite but meaningless. ``lens`` (5,) is k1, k2, p1, p2,
+    k3.
     """
     for n in range(len(points)):
         x = points[n, 0]

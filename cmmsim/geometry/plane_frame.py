@@ -16,7 +16,6 @@ from cmmsim.geometry.pose import Array, rigid
 from cmmsim.geometry.registration import SMALLEST_SPREAD
 
 PLANE_NAMES = ("A", "B", "C")
-# Smallest number of stickers to which a plane is fitted.
 FEWEST_STICKERS = 3
 
 
@@ -40,10 +39,9 @@ def fit_plane(
 ) -> FittedPlane:
     """Fit a weighted least-squares plane to points (n, 3) with covariances (n, 3, 3).
 
-    For sets of points (..., n, 3) the result is one plane per set. Each normal gets the sign with
-    which it points to the side of ``rough_normals`` (..., 3). Raises LostError, which names the
-    plane ``name``, for fewer than three points, or if the points of a set lie on one line to within
-    SMALLEST_SPREAD.
+    For sets of points (..., n, 3) the result is one plane per set. Each normal points to the side
+    of ``rough_normals`` (..., 3). Raises LostError, which names the plane ``name``, for fewer than
+    three points, or if the points of a set lie on one line (SMALLEST_SPREAD).
     """
     count = points.shape[-2]
     if count < FEWEST_STICKERS:
@@ -104,8 +102,7 @@ def frame_of_points(
     The frame is that of ``frame_from_planes``, and the covariance that of its small error
     [dt, dphi]. Stickers are points (n, 3) m with covariances (n, 3, 3). ``plane_index`` (n,) is 0,
     1 or 2 for a sticker on plane A, B or C. ``rough_normals`` (3, 3) has one row per plane. Raises
-    LostError, which names the plane, if a plane has too few stickers or all of them lie on one
-    line.
+    the LostError of ``fit_plane``.
     """
     frame, planes = frames_of_points(points, covariances, plane_index, rough_normals)
     sensitivity = _frame_sensitivity(
@@ -119,8 +116,7 @@ def frames_of_points(
 ) -> tuple[Array, list[FittedPlane]]:
     """Return the frames (..., 4, 4) of sets of points (..., n, 3), and the planes A, B and C.
 
-    The parameters and the LostError are those of ``frame_of_points``. All sets have the same
-    ``plane_index`` (n,).
+    The parameters are those of ``frame_of_points``. All sets have the same ``plane_index`` (n,).
     """
     planes = []
     for k, name in enumerate(PLANE_NAMES):

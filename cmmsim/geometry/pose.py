@@ -17,8 +17,7 @@ from cmmsim.errors import ShapeError
 
 Array = NDArray[np.float64]
 
-# Largest accepted deviation of a transform from a rigid one. Transforms that were stored in single
-# precision are accepted.
+# Largest accepted deviation of a transform from a rigid one. Single precision is accepted.
 RIGID_TOLERANCE = 1e-6
 
 
@@ -233,8 +232,8 @@ def euler_rates_matrix(pose: Array) -> Array:
 def pose_jacobian(poses: Array) -> Array:
     """Return the derivatives (..., 6, 6) of poses (..., 6) with respect to small errors [dt, dphi].
 
-    The small errors are those of the poses' transforms. The derivatives are singular at beta = pi/2
-    and -pi/2.
+    The small errors are those of the poses' transforms. At beta = ±pi/2 the derivatives are
+    singular.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import all_angle_rates

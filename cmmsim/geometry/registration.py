@@ -19,8 +19,7 @@ class Registration:
     """Transform (4, 4) with the covariance (6, 6) of its small error [dt, dphi].
 
     ``misfit`` (n,) is the squared residual of each point in units of its noise. The expected sum
-    over the points is 3 n - 6, because six parameters are fitted. For the registrations of several
-    sets, see ``register_sets``.
+    over the points is 3 n - 6, because six parameters are fitted.
     """
 
     transform: Array
@@ -31,9 +30,8 @@ class Registration:
 def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     """Return rigid transforms (c, 4, 4) from ``source`` to ``targets`` (c, n, 3).
 
-    They minimise the weighted sum of squared distances, and follow from a singular value
-    decomposition. The source is (n, 3), or (c, n, 3) with one source per target. Weights are
-    (c, n).
+    They minimise the sum of squared distances with ``weights`` (c, n), by a singular value
+    decomposition. The source is (n, 3), or (c, n, 3) with one source per target.
     """
     fractions = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means = (fractions * source).sum(axis=1)

@@ -14,8 +14,7 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Up to this tangent of half an arc's angle, eleven terms of the arctangent's series give full
-# precision.
+# Up to this tangent of half an arc's angle, eleven terms of the series give full precision.
 SHORT_ARC = 0.2
 
 

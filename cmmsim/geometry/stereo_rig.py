@@ -126,9 +126,8 @@ class StereoRig:
     def derivatives(self, points: Array) -> tuple[Array, Array]:
         """Return the derivatives of the pixels of points (n, 3) in both images.
 
-        The first result (2, n, 2, 3) is with respect to the points, and the second (2, n, 2, 24)
-        with respect to the rig's parameters in the order of PARAMETER_NAMES. The points are in the
-        camera frame C.
+        The first result (2, n, 2, 3) is with respect to the points, in the camera frame C, and the
+        second (2, n, 2, 24) with respect to the rig's parameters in the order of PARAMETER_NAMES.
         """
         by_points = np.empty((2, len(points), 2, 3))
         by_rig = np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))

@@ -137,8 +137,7 @@ class SeenStickers:
     def shifts_of_kind(self, sizes: PrintSizes) -> Array:
         """Return the shifts (k, 2, 2) px of the centres due to thickness and retro-reflection.
 
-        The last axis has the cause, thickness first. All stickers of a kind have the same shift in
-        the same view.
+        The last axis has the cause, thickness first. The same view shifts all stickers alike.
         """
         rims = self.rims_of_growth(sizes.thickness * sizes.rim * self.rim_growth)
         retro = sizes.retro_shift * np.einsum("kij,kj->ki", self.to_image, self.retro_shifts)

@@ -14,8 +14,7 @@ from cmmsim.errors import ShapeError
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# A triangulation ends with a step shorter than this, m, or with the last one of
-# TRIANGULATION_STEPS.
+# m: a triangulation ends with a shorter step, or after TRIANGULATION_STEPS.
 STEP_TOLERANCE = 1e-8
 
 

@@ -306,8 +306,7 @@ def _distorted(
 ) -> NDArray[np.float32]:
     """Return distorted fine windows (k, fine_size, fine_size) from drawn windows.
 
-    ``nodes`` (k, 3, 3, 2) are those of ``resample``. For a lens without distortion, the windows are
-    only cut out.
+    ``nodes`` (k, 3, 3, 2) are those of ``resample``. Without distortion, windows are only cut out.
     """
     if not side.camera.distortion.is_zero:
         return resample(drawn, nodes, fine_size)

@@ -31,8 +31,7 @@ class Discs(NamedTuple):
     """Discs in the order in which they are drawn.
 
     Their ellipses have centres (m, 2), shapes (m, 2, 2) and half extents (m, 2), px. ``levels``
-    (m,) are their radiances. ``behind`` (m, slots) is True if a disc lies behind the solid of a
-    slot.
+    (m,) are radiances. ``behind`` (m, slots) is True if a disc lies behind the solid of a slot.
     """
 
     centres: Array
@@ -218,8 +217,7 @@ def occluded_points(
 ) -> None:
     """Fill ``hidden`` (n,) with whether a convex solid stands between the camera and each point.
 
-    The points (n, 3) are in camera axes. The solid is normal . x + offset <= 0 in its own axes. See
-    ``occludes`` for ``touching``.
+    The points (n, 3) are in camera axes. The solid is normal . x + offset <= 0 in its own axes.
     """
     eye = np.empty(3)
     point = np.empty(3)

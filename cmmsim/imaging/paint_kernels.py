@@ -76,7 +76,7 @@ def outline_at(outlines: Array, u: float, v: float) -> float:
 def covered(u: float, v: float, radius: float, to_places: Array) -> float:
     """Return the fraction of a pixel at (u, v) that a disc of the given radius covers.
 
-    Within the pixel, the rim is taken as straight. ``to_places`` (2, 2) is the derivative d(u, v) /
+    Inside the pixel, the rim counts as straight. ``to_places`` (2, 2) is the derivative d(u, v) /
     d(pixels).
     """
     size = math.sqrt(u * u + v * v)
@@ -124,8 +124,7 @@ def paint_window(image: Array, shown: Array, corner: Array, n: int, painted: Pai
                 face = painted.faces[n] * max(print_at(painted.prints[n], u, v), 0.0)
                 level += own * (face - painted.ring)
                 if squared > 0.0 and own < 1.0:
-                    # Depth of the part of the rim's side that this pixel shows best, in
-                    # thicknesses.
+                    # Depth of the rim's part that this pixel shows best, in thicknesses.
                     depth = (u * slope[0] + v * slope[1]) / squared
                     depth = min(max(depth, 0.0), 1.0)
                     low_u = u - depth * slope[0]

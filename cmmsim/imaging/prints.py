@@ -2,8 +2,7 @@
 
 A perfect lens images a plane by a homography. The point of the print that a sample of a pixel shows
 is therefore exact. The renderer of prints draws nothing else, so `ImageFormation` adds distortion,
-point spread and pixels as it does for stickers. Only the tiles of an image that show a plate are
-drawn.
+point spread and pixels as it does for stickers. Only tiles of an image that show a plate are drawn.
 """
 
 from __future__ import annotations

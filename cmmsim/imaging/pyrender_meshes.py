@@ -43,17 +43,16 @@ CLEARANCE = 1e-6
 FLATTEST = 1e-6
 # Smallest slope between a ray and a disc's plane. Flatter rays count as parallel to the plane.
 SMALLEST_SLOPE = 1e-3
-# Signs that enlarge a window (lowest x, y, highest x, y).
+# Signs that enlarge bounds (lowest x, y, highest x, y), and indices of the corners into bounds.
 OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
-CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # indices into (lowest x, y, highest x, y)
+CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]
 
 
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
     """Return the triangles of a stack of discs for drawing with samples ``sample`` m apart.
 
-    The triangles are in the order of drawing with a depth test, from front to back. The uppermost
-    disc has a soft rim if another disc lies below it. The lower discs are polygons with few sides
-    and sharp rims.
+    The upper discs come first. The uppermost disc has a soft rim if another disc lies below it. The
+    lower discs are polygons with few sides and sharp rims.
     """
     *grounds, top = stack.discs
     uppermost = (

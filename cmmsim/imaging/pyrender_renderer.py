@@ -10,8 +10,7 @@ In a cell, only patches whose bounding box reaches into it are drawn. Projection
 camera_from_body are multiplied in double precision, so that the shader gets one well-scaled matrix.
 Depth tests are used only where they are needed. If a solid or the dark ring of a sticker fills a
 cell, the cell is cleared to the level of the solid or ring, see ``PaintedSolids``. Each piece of
-the atlas is sent to OpenGL as soon as it is ready. OpenGL draws it while the next piece is
-prepared.
+the atlas is sent to OpenGL as soon as it is ready, and drawn while the next one is prepared.
 """
 
 import ctypes
@@ -43,8 +42,7 @@ def render_windows(
 ) -> NDArray[np.float32]:
     """Draw the radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises
-    OpenGLMissingError.
+    Each pixel is the mean of ``supersampling``² drawn pixels. Raises OpenGLMissingError.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.imaging.window_kernels import mean_of_cells
@@ -171,8 +169,7 @@ class _Atlas:
     ) -> NDArray[np.uint8]:
         """Draw the atlas (rows * cell_h, columns * cell_w) uint8, with cells in reading order.
 
-        The result is valid until the next call. Discs are triangulated for the focal length of the
-        first camera.
+        The result is valid until the next call. Discs are triangulated for the first camera.
         """
         self.platform.make_current()
         # Drawn pixels per radian.

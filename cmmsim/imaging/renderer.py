@@ -232,8 +232,7 @@ class DrawWindows(Protocol):
 class Renderer:
     """Renderer with its name and its drawing function.
 
-    ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9, from which
-    ``centre_error_px`` extrapolates.
+    ``sampling_error_px`` is the rms error of a sticker's centre at supersampling 9.
     """
 
     name: str

@@ -149,8 +149,7 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
 def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: str) -> None:
     """Raise SensorFileError if a sticker lies in a hollow of a body.
 
-    The message names the ``renderer``, which draws the body's convex hull, so that the hull would
-    hide the sticker.
+    The ``renderer``, named in the message, draws the body's convex hull, which hides the sticker.
     """
     normals, offsets = ConvexSolid(body.solid.vertices).faces
     heights = (body.sticker_places @ normals.T + offsets).max(axis=1)
@@ -281,8 +280,7 @@ class PlacedBodies(Mapping[str, Array]):
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
     """Return the convex solid that a body's planes and cuts enclose.
 
-    The planes are the sticker planes, lowered by SUNK. Raises SensorFileError if they enclose no
-    solid.
+    Sticker planes are lowered by SUNK. Raises SensorFileError if the sides enclose no solid.
     """
     normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
     points = [

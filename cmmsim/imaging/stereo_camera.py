@@ -98,8 +98,7 @@ class VirtualStereoCamera:
         """Take one exposure of the platform, and of obstacles at base_from_body (4, 4) by name.
 
         ``pose`` (6,) is the pose in the middle of the left camera's exposure, and ``pose_rate``
-        (6,) its time derivative, None at rest. Obstacles stand still, and those that are not named
-        are absent.
+        (6,) its time derivative, None at rest. Obstacles stand still, or are absent if not named.
         """
         rates = None if pose_rate is None else pose_rate[None]
         moments = self._moments(pose[None], rates, obstacles or {})[0]
@@ -209,8 +208,8 @@ class VirtualStereoCamera:
     ) -> NDArray[np.float32]:
         """Return the mean radiance (height, width) of one whole image over all moments.
 
-        ``side`` is 0 for the left and 1 for the right camera. ``moments`` are camera_from_body
-        (b, 4, 4) for this camera. ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this
+        ``side`` is 0 for the left and 1 for the right camera. Each moment has the camera_from_body
+        (b, 4, 4) of this camera. ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this
         exposure.
         """
         own = None if sweep is None else sweep[side]
@@ -238,10 +237,7 @@ class VirtualStereoCamera:
         ]
 
     def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        """Return the fixed pattern in windows of one size, or None if pixels do not differ.
-
-        The windows have first pixels ``corners`` (2, n, 2).
-        """
+        """Return the fixed pattern in windows of one size at ``corners`` (2, n, 2), or None."""
         cut = [
             p.windows(at, size)
             for p, at in zip(self.patterns, corners, strict=True)

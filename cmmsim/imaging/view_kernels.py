@@ -148,8 +148,8 @@ def visible_discs(
 
     The results are the indices (m,) of the discs, the centres (m, 2), shapes (m, 2, 2) and half
     extents (m, 2) of their ellipses in px, and the ``probes`` (m, k, 3), points on the discs that
-    are tested for occlusion, in camera axes, m. Discs that may be partly nearer than ``near`` m are
-    left out.
+    are tested for occlusion, in camera axes, m. Discs that may reach nearer than ``near`` m are
+    omitted.
     """
     total = len(scene.radii)
     places = np.empty((total, 3))

@@ -115,8 +115,7 @@ def _coarse(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the mean radiance (height, width), drawn with COARSE samples per pixel and axis.
 
-    It has no vignetting. The second result is a mask of the pixels that are bright at one moment at
-    least.
+    It has no vignetting. The second result is a mask of pixels that are bright at any moment.
     """
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))

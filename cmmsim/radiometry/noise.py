@@ -2,8 +2,7 @@
 
 Radiance (0 to 1) is converted to electrons. Shot noise, dark noise and the fixed pattern of the
 pixels are added. The gain K converts electrons to grey values above the black level, which are
-clipped and rounded. Shot noise is drawn from a normal distribution with the variance of the Poisson
-distribution.
+clipped and rounded. Shot noise is normal, with the variance of the Poisson distribution.
 """
 
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ BIT_DEPTHS = (8, 10, 12, 14, 16)
 # Number of terms of the series in rounding_excess. Without noise, the series is 1/6, and the terms
 # that are left out add up to 0.002.
 ROUNDING_TERMS = 50
-# Variance, grey values squared, above which rounding_excess is taken as 1; the error is below
-# 1e-11.
+# Variance, grey values squared, above which rounding_excess is 1 to within 1e-11.
 NO_SWING = 1.5
 # Smallest number of exposures whose mean is drawn directly. Fewer exposures are drawn one by one.
 MANY_EXPOSURES = 30

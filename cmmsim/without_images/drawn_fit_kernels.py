@@ -1,7 +1,6 @@
 """Compiled kernels that simulate the results of the ellipse fit without rendering images.
 
-They compute the covariance of an ellipse's centre, and draw random results of fits in windows of
-both images.
+They compute the covariance of an ellipse's centre, and draw random results of fits in windows.
 """
 
 from __future__ import annotations

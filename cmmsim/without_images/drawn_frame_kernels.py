@@ -130,8 +130,7 @@ def image_stickers(
     ``side`` is 0 for the left and 1 for the right image. ``camera_from_bodies`` (b, 4, 4) belong to
     all solids, the platform first. If the platform is ``moving``, ``ends`` (2, 4, 4) are its
     camera_from_body at the beginning and the end of the exposure. ``noise`` (n, 3) are standard
-    normal numbers: two for the centre, and one for the limit of thin ellipses. The longest path in
-    ``frame`` is updated.
+    normal numbers: two for the centre, and one for the limit of thin ellipses.
     """
     count = len(frame.variances)
     used = frame.stickers.used

@@ -160,9 +160,8 @@ class StatisticalStereoCamera:
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
-        The third result is the mask (m,) of stickers that face the camera and are not hidden. It
-        does not exclude stickers outside the image. The ellipse of a sticker that does not face the
-        camera is meaningless.
+        The third result is the mask (m,) of stickers that face the camera and are not hidden, in
+        the image or outside. The ellipse of a sticker that faces away is meaningless.
         """
         places, normals = self.scene.placed(camera_from_bodies)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)

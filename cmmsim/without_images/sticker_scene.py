@@ -107,7 +107,6 @@ class StickerScene:
         return Solids(starts, normals, offsets, middles, np.array(radii))
 
 
-# Random stream of the constant errors of centres.
 PRINT_STREAM = 2
 
 
@@ -116,8 +115,8 @@ class CentreErrors:
     """Errors of sticker centres due to uneven print and outlines that are not round.
 
     ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
-    ``changing_px`` is the standard deviation, per coordinate, of the errors that change from
-    exposure to exposure.
+    ``changing_px`` is the standard deviation per coordinate of errors that are new in each
+    exposure.
     """
 
     constant: Array
