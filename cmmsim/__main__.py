@@ -23,14 +23,14 @@ def foreign_identify() -> str:
     The line is empty if our `identify` is found.
     """
     spec = find_spec("identify")
-    found = Path(spec.origin) if spec and spec.origin else None
-    if found and found.is_file() and OURS in found.read_text(encoding="utf-8", errors="replace"):
+    path = Path(spec.origin) if spec and spec.origin else None
+    if path and path.is_file() and OURS in path.read_text(encoding="utf-8", errors="replace"):
         beside = _installed_beside()
         if not beside:
             return ""
         where = f"identify {beside} of PyPI is installed beside cmmsim, which replaced its files"
-    elif found:
-        where = f"another package is imported instead of cmmsim's `identify`: {found.parent}"
+    elif path:
+        where = f"another package is imported instead of cmmsim's `identify`: {path.parent}"
     else:
         where = "no `identify`"
     return (
@@ -50,16 +50,16 @@ def _installed_beside() -> str:
 @cache
 def warn_of_foreign_identify() -> None:
     """Warn once if another package is imported as `identify`."""
-    said = foreign_identify()
-    if said:
-        warnings.warn(said, stacklevel=4)
+    warning = foreign_identify()
+    if warning:
+        warnings.warn(warning, stacklevel=4)
 
 
 def main() -> None:
-    """Run the command, or exit with status 1 and one line if `identify` is another package."""
-    said = foreign_identify()
-    if said:
-        sys.exit(f"error: {said}")
+    """Run the command. Exit with status 1 and one line if our `identify` is not found."""
+    refusal = foreign_identify()
+    if refusal:
+        sys.exit(f"error: {refusal}")
     # The import is by name, because this package must not depend on identify elsewhere.
     import_module("identify.__main__").main()
 

@@ -70,21 +70,21 @@ def allow_plugin(*modules: str) -> None:
 
 
 def allowed_plugins() -> tuple[str, ...]:
-    """Names of the modules whose code is allowed to run."""
+    """Return the names of the modules whose code is allowed to run."""
     names = os.environ.get(ALLOWED, "").split(",")
     return tuple(name.strip() for name in names if name.strip())
 
 
 def is_plugin_name(name: str) -> bool:
-    """Tell whether a name has the form ``module:name``, which names a user's own code."""
+    """Return True if a name has the form ``module:name``, which names a user's own code."""
     return ":" in name
 
 
 def import_plugin(option: str, name: str) -> Any:
     """Import an object of the user by its name ``module:name``.
 
-    ``option`` states in messages what it is, such as "detector". Raises CmmError if the module is
-    not allowed to run, cannot be imported, or has no such object.
+    ``option`` is the kind of the object in messages, such as "detector". Raises CmmError if the
+    module is not allowed to run, cannot be imported, or has no such object.
     """
     module, _, attribute = name.partition(":")
     if not (_is_module(module) and attribute.isidentifier()):
@@ -99,7 +99,7 @@ def import_plugin(option: str, name: str) -> Any:
             f"cmmsim.allow_plugin({module!r}) in Python"
         )
     try:
-        found = importlib.import_module(module)
+        imported = importlib.import_module(module)
     except (Exception, SystemExit) as error:
         # A module that exists can itself import another one that is missing.
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(
@@ -107,19 +107,19 @@ def import_plugin(option: str, name: str) -> Any:
         )
         advice = "; the folder of the module must be on PYTHONPATH" if missing else ""
         raise CmmError(f"{option} {name!r} cannot be imported: {error}{advice}") from error
-    if not hasattr(found, attribute):
-        names = ", ".join(one for one in vars(found) if not one.startswith("_"))
-        place = getattr(found, "__file__", None)
+    if not hasattr(imported, attribute):
+        names = ", ".join(one for one in vars(imported) if not one.startswith("_"))
+        place = getattr(imported, "__file__", None)
         raise CmmError(
             f"{option} {name!r}: the module {place or module} has no {attribute}; it has "
             f"{names[:200] or 'nothing'}"
         )
-    return getattr(found, attribute)
+    return getattr(imported, attribute)
 
 
 @dataclass(frozen=True)
 class PluginFunction:
-    """Function of a plugin. Its exceptions are reported in one line with file and line number.
+    """Function of a plugin. Its exceptions are reported with file and line number.
 
     ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged,
     and any other exception becomes an ``error_class``. ``check`` is called with ``part``, the
@@ -135,16 +135,16 @@ class PluginFunction:
     def __call__(self, *given: Any) -> Any:
         """Return the function's result. Raises `error_class`, or an exception of a known class."""
         try:
-            found = self.function(*given)
+            result = self.function(*given)
             if self.check is not None:
-                self.check(self.part, found, *given)
-            return found
+                self.check(self.part, result, *given)
+            return result
         except self.known:
             raise
         except (Exception, SystemExit) as error:  # the user's function must not end the program
             # The first entry is the call above; the second, if it exists, is in the user's file.
-            at = traceback.extract_tb(error.__traceback__)[:2][-1]
-            place = f"{Path(at.filename).name}, line {at.lineno}"
+            call = traceback.extract_tb(error.__traceback__)[:2][-1]
+            place = f"{Path(call.filename).name}, line {call.lineno}"
             said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
             raise self.error_class(said) from error
 
@@ -188,16 +188,16 @@ def find(
         module, _, attribute = built_in[name].partition(":")
         return getattr(importlib.import_module(module), attribute)
     part = import_plugin(option, name)
-    said = f"{option} {name!r}"
-    found = PluginFunction(said, part, CmmError)() if isinstance(part, type) else part
+    label = f"{option} {name!r}"
+    own = PluginFunction(label, part, CmmError)() if isinstance(part, type) else part
     # The fields of a kind are its name, its function, and numbers with defaults.
-    _, does, *figures = fields(kind)
-    function = getattr(found, does.name) if isinstance(found, kind) else found
+    _, function_field, *number_fields = fields(kind)
+    function = getattr(own, function_field.name) if isinstance(own, kind) else own
     if not callable(function):
-        raise CmmError(f"{said} is of type {type(function).__name__}, which cannot be called")
-    carried = [field for field in figures if hasattr(found, field.name)]
-    values = {field.name: _figure(said, found, field) for field in carried}
-    return kind(name, PluginFunction(said, function, CmmError, (CmmError,), check), **values)
+        raise CmmError(f"{label} is of type {type(function).__name__}, which cannot be called")
+    carried = [field for field in number_fields if hasattr(own, field.name)]
+    values = {field.name: _figure(label, own, field) for field in carried}
+    return kind(name, PluginFunction(label, function, CmmError, (CmmError,), check), **values)
 
 
 def _figure(part: str, owner: Any, field: Any) -> Any:

@@ -31,6 +31,7 @@ NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
 # Largest number of problems of one file in a message.
 MOST_COMPLAINTS = 8
+# Control characters other than tab and newline.
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 # Pattern of strings and comments of TOML. It never backtracks, so a search takes linear time.
 _TEXTS = re.compile(
@@ -102,10 +103,10 @@ def read_text(path: str | Path, source: str, error_class: type[CmmError]) -> str
     file cannot be read, or has more than `LARGEST` bytes.
     """
     try:
-        place = Path(path)
-        if place.exists() and not (place.is_file() or place.is_dir()):
+        location = Path(path)
+        if location.exists() and not (location.is_file() or location.is_dir()):
             raise error_class(f"cannot read {source}: it is not a regular file")
-        with place.open("rb") as file:
+        with location.open("rb") as file:
             content = file.read(LARGEST + 1)
         if len(content) > LARGEST:
             raise error_class(f"{source} has more than {LARGEST:,} bytes, which is the limit")
@@ -120,7 +121,7 @@ def parsed(text: str, source: str, error_class: type[CmmError]) -> dict[str, Any
     """Return the content of a TOML text as a new dictionary, which the caller is free to change.
 
     Raises ``error_class`` if the text is not TOML, nests tables deeper than `DEEPEST`, or contains
-    integers beyond 64 bits or control characters.
+    integers beyond 64 bits, dates, times or control characters.
     """
     try:
         return deepcopy(_parsed(text))
@@ -135,7 +136,8 @@ def parsed(text: str, source: str, error_class: type[CmmError]) -> dict[str, Any
 def checked(model: type[M], content: dict[str, Any], source: str, error_class: type[CmmError]) -> M:
     """Return the content of a file as an instance of ``model``.
 
-    Raises ``error_class``, which lists what is wrong and, for an unknown key, the valid keys.
+    Raises ``error_class`` for content that does not match. The message lists what is wrong and, for
+    an unknown key, the valid keys.
     """
     try:
         return model.model_validate(content)
@@ -151,8 +153,8 @@ def checked(model: type[M], content: dict[str, Any], source: str, error_class: t
 def _parsed(text: str) -> dict[str, Any]:
     """Parse a TOML text. Raises ValueError, which names the content that is refused.
 
-    The result is cached: a study reads the same sensor file for every row, and parsing would take
-    an eighth of the computing time per row.
+    The result is cached, because a study reads the same sensor file for every row. Otherwise,
+    parsing would take an eighth of the computing time per row.
     """
     bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
     # The time that tomllib takes grows with the square of the number of parts of a dotted key, so
@@ -171,17 +173,17 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Describe the first value that no file may contain. The text is empty if there is none."""
-    left: list[tuple[Any, int]] = [(content, 0)]
-    while left:
-        value, depth = left.pop()
+    """Return a text about a value that no file may contain, or an empty text if there is none."""
+    unvisited: list[tuple[Any, int]] = [(content, 0)]
+    while unvisited:
+        value, depth = unvisited.pop()
         if depth > DEEPEST:
             return TOO_DEEP
         if isinstance(value, dict):
-            left += [(key, depth) for key in value]
-            left += [(one, depth + 1) for one in value.values()]
+            unvisited += [(key, depth) for key in value]
+            unvisited += [(one, depth + 1) for one in value.values()]
         elif isinstance(value, list):
-            left += [(one, depth + 1) for one in value]
+            unvisited += [(one, depth + 1) for one in value]
         elif isinstance(value, str) and _UNWANTED.search(value):
             return f"a control character in {value[:60]!r}"
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:

@@ -36,7 +36,7 @@ class CompilationWarning(UserWarning):
 
 
 def compiled(function: F) -> Dispatcher[F]:
-    """Compile a kernel on its first call, or load it from the cache.
+    """Return a kernel that is compiled on its first call, or loaded from the cache.
 
     The cache is a folder beside the source. If that folder is not writable, the cache is in the
     user's cache folder. Cached code is not loaded if an untrusted user could have written it.
@@ -85,7 +85,7 @@ def _save_closed(save: Callable[..., None], folder: str, *what: object) -> None:
 
 @lru_cache
 def _ours_alone(folder: Path, source: Path) -> bool:
-    """Tell whether only trusted users can have written into a folder of compiled code.
+    """Return True if only trusted users can have written into a folder of compiled code.
 
     The user and root are trusted, and so are users who can change the source. First, write
     permission for others is removed from the user's own folders, and the user's own files that
@@ -123,7 +123,7 @@ def _ours_alone(folder: Path, source: Path) -> bool:
 
 
 def _is_open(path: Path) -> bool:
-    """Tell whether users other than the owner have permission to write a file or a folder."""
+    """Return True if users other than the owner have permission to write a file or a folder."""
     return bool(path.stat(follow_symlinks=path.is_dir()).st_mode & OTHERS)
 
 

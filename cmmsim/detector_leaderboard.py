@@ -1,7 +1,7 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
 The discs are drawn exactly, at known random positions within a pixel, and the camera's noise is
-added. An error is the distance between the detected centre and the centre of the ellipse. The
+added. An error is the difference between the detected centre and the centre of the ellipse. The
 eccentricity, the distance from there to the image of the disc's centre, is not part of the error.
 Two methods of OpenCV are compared as well.
 """
@@ -50,11 +50,13 @@ LIMITS = FitLimits(largest_misfit=np.inf)
 class Condition:
     """Conditions under which a disc is seen.
 
-    radius_px  long half axis of the disc's image
+    radius_px  semi-major axis of the disc's image
     tilt       angle between the disc's normal and the line of sight, rad
-    noise      standard deviation of a grey value midway between disc and ground, as a share of
-               their contrast
+    noise      standard deviation of a grey value midway between disc and background, as a fraction
+               of their contrast
     psf_px     sigma of the Gaussian point spread
+
+    Raises CmmError for a disc that cannot be drawn.
     """
 
     radius_px: float
@@ -94,8 +96,8 @@ class Condition:
 class Scene:
     """Properties that all conditions share.
 
-    They are the camera's noise, the radiances 0 to 1 of disc and ground, and the focal length in
-    px.
+    They are the camera's noise, the radiances 0 to 1 of disc and background, and the focal length
+    in px.
     """
 
     noise: CameraNoise
@@ -110,12 +112,12 @@ class Scene:
 
     @property
     def contrast(self) -> float:
-        """Step in grey values from the ground to the disc."""
+        """Step in grey values from the background to the disc."""
         return float(self.noise.mean_grey(np.array(self.bright))) - self.ground
 
     @property
     def edge_noise(self) -> float:
-        """Noise as in ``Condition``: standard deviation midway between disc and ground."""
+        """Noise as in ``Condition``: standard deviation midway between disc and background."""
         return (
             float(np.sqrt(self.noise.variance(np.array(self.ground + 0.5 * self.contrast))))
             / self.contrast
@@ -164,14 +166,14 @@ def scene_of(file: SensorFile) -> Scene:
 def working_point(file: SensorFile) -> Condition:
     """Return the condition under which a sensor file's left camera sees the stickers at home.
 
-    Radius and tilt are the medians of the stickers that face the camera; the noise is the camera's
-    own.
+    Radius and tilt are the medians over the stickers that face the camera. The noise is the
+    camera's own.
     """
     rig, camera_from_base = rig_from_file(file.rig)
     body = marked_body("platform", file.platform)
-    move = camera_from_base @ pose_to_transform(file.platform.home)
-    centres = apply(move, body.nominal)
-    normals = body.sticker_normals @ move[:3, :3].T
+    camera_from_platform = camera_from_base @ pose_to_transform(file.platform.home)
+    centres = apply(camera_from_platform, body.nominal)
+    normals = body.sticker_normals @ camera_from_platform[:3, :3].T
     cosine = -np.einsum("ni,ni->n", centres, normals) / np.linalg.norm(centres, axis=1)
     facing = cosine > 0.0
     shapes = project_discs(rig.left, centres, normals, np.full(len(centres), file.stickers.radius))[
@@ -190,8 +192,8 @@ def random_ellipses(
 ) -> tuple[Array, Array]:
     """Return the ellipses of discs that are tilted towards random directions.
 
-    The ellipses have centres (count, 2) at random places in the middle pixel of a window, and
-    shapes (count, 2, 2), both in px.
+    The ellipses have random centres (count, 2) within half a pixel of the middle of a window of
+    ``size`` px, and shapes (count, 2, 2), both in px.
     """
     middle = 0.5 * (size - 1)
     camera = PinholeCamera(focal_px, middle, middle, size, size)
@@ -201,16 +203,18 @@ def random_ellipses(
     cosine = np.cos(condition.tilt)
     normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
     # The discs lie at depth 1, because only ratios of lengths matter.
-    places = np.column_stack([away / focal_px, np.ones(count)])
-    return project_discs(camera, places, normals, np.full(count, condition.radius_px / focal_px))
+    disc_centres = np.column_stack([away / focal_px, np.ones(count)])
+    return project_discs(
+        camera, disc_centres, normals, np.full(count, condition.radius_px / focal_px)
+    )
 
 
 def draw_discs(
     scene: Scene, centres: Array, shapes: Array, size: int, psf_px: float
 ) -> NDArray[np.float32]:
-    """Draw the radiance (n, size, size) of bright discs on dark ground."""
-    shares = [coverage(*part, size, psf_px)[0] for part in _parts(centres, shapes)]
-    return (scene.dark + (scene.bright - scene.dark) * np.concatenate(shares)).astype(np.float32)
+    """Return the radiance (n, size, size) of bright discs on dark background."""
+    fractions = [coverage(*part, size, psf_px)[0] for part in _parts(centres, shapes)]
+    return (scene.dark + (scene.bright - scene.dark) * np.concatenate(fractions)).astype(np.float32)
 
 
 def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
@@ -223,14 +227,14 @@ def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
 
 @dataclass(frozen=True)
 class Score:
-    """Score of one detector under one condition, in px and per axis.
+    """Score of one detector under one condition; errors are per axis.
 
     bound_px               Cramer-Rao bound over all windows
-    rms_px                 rms error over the windows in which the detector found a disc
+    rms_px                 rms error over the windows with a detected disc; inf if there are none
     ratio                  ``rms_px`` divided by the Cramer-Rao bound of these windows
     ratio_low, ratio_high  ends of the 95 % interval of ``ratio``
     bias_px                rms error without noise
-    lost                   share of windows without a found disc
+    lost                   fraction of windows without a detected disc
     """
 
     detector: str
@@ -255,8 +259,8 @@ def compete(
     """Return the scores of all detectors under all conditions, with ``draws`` discs each.
 
     Without ``detectors``, the built-in detectors and two methods of OpenCV compete.
-    ``report(done, total)`` is called after each condition. Raises CmmError for impossible
-    conditions, before any computation.
+    ``report(done, total)`` is called after each condition. Raises CmmError for fewer than two
+    draws, and for impossible conditions, before any disc is drawn.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
@@ -276,6 +280,7 @@ def _round(
     rng: np.random.Generator,
     detectors: Sequence[Detector],
 ) -> list[Score]:
+    """Return the scores of all detectors under one condition."""
     fit_size = 2 * int(np.ceil(condition.radius_px + FREE_PX))
     centres, shapes = random_ellipses(condition, scene.focal_px, fit_size + 2, draws, rng)
     radiance = draw_discs(scene, centres, shapes, fit_size + 2, condition.psf_px)
@@ -337,28 +342,29 @@ def _ratio_interval(
 
 
 def _root_mean(squared: Array) -> float:
-    """Return the square root of the mean; infinite without values."""
+    """Return the square root of the mean; inf without values."""
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
 def _by_window(
     find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
 ) -> DetectedCentres:
-    """Return the centres that ``find`` finds, which is called with each window as an 8-bit image.
+    """Return the centres that ``find`` returns for each window, given as an 8-bit image.
 
-    OpenCV states no covariance, so the covariances are zero.
+    A window for which it returns None is not good. OpenCV states no covariance, so the covariances
+    are zero.
     """
     grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
-    found = [find(window) for window in grey]
-    good = np.array([centre is not None for centre in found], dtype=bool)
-    centres = np.array([centre or (0.0, 0.0) for centre in found]).reshape(-1, 2)
-    return DetectedCentres(centres + given.corners, np.zeros((len(found), 2, 2)), good)
+    results = [find(window) for window in grey]
+    good = np.array([centre is not None for centre in results], dtype=bool)
+    centres = np.array([centre or (0.0, 0.0) for centre in results]).reshape(-1, 2)
+    return DetectedCentres(centres + given.corners, np.zeros((len(results), 2, 2)), good)
 
 
 def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
-    """Return the centre of the largest bright blob that ``cv2.SimpleBlobDetector`` finds.
+    """Return the centres of the largest bright blobs that ``cv2.SimpleBlobDetector`` finds.
 
-    Its shape filters are off.
+    The shape filters of this detector are off.
     """
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
@@ -375,7 +381,7 @@ def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
 
 
 def detect_by_contour(given: SpotWindows) -> DetectedCentres:
-    """Return the centre of ``cv2.fitEllipse`` for the longest contour at Otsu's threshold."""
+    """Return the centres of ``cv2.fitEllipse`` for the longest contours at Otsu's threshold."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
         mask = cv2.threshold(window, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[1]

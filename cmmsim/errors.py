@@ -1,6 +1,6 @@
 """Exceptions of the sensor package.
 
-Each message carries the evidence: the value, the limit, the valid names.
+Each message states the evidence, such as the value, the limit or the valid names.
 """
 
 from collections.abc import Iterable
@@ -108,4 +108,4 @@ class PhotographError(CmmError):
 
 
 class AcceptanceError(CmmError):
-    """A volume is not visible, measuring lines break a rule, or an artefact is not measured."""
+    """A volume is too small or not visible, lines break a rule, or an artefact is not measured."""

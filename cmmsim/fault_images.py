@@ -1,9 +1,9 @@
 """Images with a fault laid over them: marks painted into their grey values, or both images swapped.
 
 Marks are opaque discs and plates, added light, and whole images of one radiance. They lie over
-grey values that already contain noise. If a mark hides the share s of a pixel, the pixel's new
-light is (1 - s) of its old light plus s of the mark's light. Noise is then added until the pixel's
-variance equals the camera's variance at the new mean.
+grey values that already contain noise. If a mark hides the fraction s of a pixel, the pixel's new
+light is (1 - s) of its old light plus s of the mark's light. Noise is then added such that the
+pixel's variance equals the camera's variance at the new mean.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Mark(Protocol):
         """Return the smallest x, y and the largest x, y that the mark reaches, px of the image."""
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
-        """Return the hidden share (h, w), 0 to 1, and the added radiance (h, w) of each pixel.
+        """Return the hidden fraction (h, w) and the added radiance (h, w) of each pixel.
 
         The pixels are the part of the image that begins at pixel ``corner`` (x, y) and has the
         given shape.
@@ -192,7 +192,7 @@ def _box(centre: Array, reach: Array | float) -> tuple[float, float, float, floa
 def _offsets(
     centre: Array, corner: NDArray[np.int_], shape: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Return the distances in x (1, w) and in y (h, 1) of a part's pixels from a centre, px."""
+    """Return the offsets in x (1, w) and in y (h, 1) of a part's pixels from a centre, px."""
     x = corner[0] + np.arange(shape[1]) - centre[0]
     y = corner[1] + np.arange(shape[0]) - centre[1]
     return x[None, :], y[:, None]
@@ -202,8 +202,8 @@ def _offsets(
 class Fault:
     """Fault of a stereo frame.
 
-    ``marks`` are laid over the images. If ``swapped`` is True, the left and the right image are
-    exchanged. ``obstacles`` are transforms base_from_body (4, 4) of bodies in front of the
+    If ``swapped`` is True, the left and the right image are exchanged. ``marks`` are then laid over
+    the images. ``obstacles`` are transforms base_from_body (4, 4) of bodies in front of the
     platform, by their names in ``fault_bodies``.
 
     Examples

@@ -72,7 +72,7 @@ def fault_bodies() -> dict[str, trimesh.Trimesh]:
 
 
 class FaultGenerator:
-    """Generator of random faults at the places in the images where stickers are expected.
+    """Generator of random faults in the images, at the pixels where stickers are expected.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class FaultGenerator:
         one_camera_dark     one black image
         one_camera_covered  one image of a single grey level
         false_discs         discs that look like stickers, each in one image only
-        false_points        discs in both images that look like stickers at wrong places
+        false_points        discs in both images that look like stickers at wrong positions
         glint               bright light with a tail, on stickers or beside them
         merging             discs that overlap stickers, touch them or leave a small gap
         swapped             left and right image exchanged
@@ -165,7 +165,7 @@ class FaultGenerator:
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
-        """Choose from 1 to ``most`` random stickers. The default of ``most`` is all stickers.
+        """Return the indices of 1 to ``most`` random stickers; by default, up to all stickers.
 
         With probability one half, at most FEW stickers are chosen.
         """
@@ -201,21 +201,23 @@ class FaultGenerator:
 
     def _obstacles(self, pose: Array, rng: np.random.Generator) -> Fault:
         names = list(fault_bodies())
-        places = {}
+        base_from_bodies = {}
         for number in rng.choice(len(names), rng.integers(1, len(names) + 1), replace=False):
             sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
-            at = apply(pose_to_transform(pose), sticker)
+            position = apply(pose_to_transform(pose), sticker)
             middle = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
-            at = (
-                at
-                + rng.uniform(0.02, 0.5) * (middle - at)
+            position = (
+                position
+                + rng.uniform(0.02, 0.5) * (middle - position)
                 + rng.uniform(-0.7, 0.7, 3) * BODY_SIZES[number]
             )
-            places[names[number]] = pose_to_transform(np.r_[at, rng.uniform(-1.0, 1.0, 3)])
-        return Fault("obstacles", obstacles=places)
+            base_from_bodies[names[number]] = pose_to_transform(
+                np.r_[position, rng.uniform(-1.0, 1.0, 3)]
+            )
+        return Fault("obstacles", obstacles=base_from_bodies)
 
     def _right_eye(self) -> Array:
-        """Return the place (3,) of the right camera in the base frame."""
+        """Return the position (3,) of the right camera in the base frame, m."""
         return apply(self._taught.base_from_camera, invert(self._rig.right_from_left)[:3, 3])
 
     def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
@@ -235,7 +237,7 @@ class FaultGenerator:
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Lay discs at places in space near stickers. The discs hide what is behind them."""
+        """Lay discs at points in space near stickers. The discs hide what is behind them."""
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)

@@ -19,16 +19,16 @@ from cmmsim.photographs.taught_file import read_taught
 from cmmsim.sensor import Sensor
 from cmmsim.uncertainty.known_rig import KnownRig
 
-# Every sensor has a renderer, although photographs are not rendered. This one needs no OpenGL, and
-# adds no error to the stated errors of centres.
+# Every sensor has a renderer, although photographs are not rendered. This renderer needs no OpenGL,
+# and adds no error to the stated errors of centres.
 RENDERER = "analytic"
 
 
 def sensor_for(name: str | Path) -> Sensor:
     """Return the sensor of a file.
 
-    If the file states a covariance of the cameras, the sensor takes it into account. Raises
-    SensorFileError for a covariance that is not valid.
+    If the file states a covariance of the cameras, the sensor takes it into account. Raises the
+    exceptions of read_sensor_file, and SensorFileError for a covariance that is not valid.
     """
     file = read_sensor_file(name)
     if file.rig.covariance is None:
@@ -60,7 +60,7 @@ def teach(
 
     The cameras and the base stand still, and the platform moves from pair to pair. Stickers need no
     labels: those at the same pixels in most pairs belong to the base, and those that move together
-    belong to the platform. Each sticker is identified by its rough place in the sensor file. If
+    belong to the platform. Each sticker is identified by its rough position in the sensor file. If
     the file states the covariance of the cameras, as a file of `cmmsim calibrate` does, the cameras
     are adjusted within this covariance.
 
@@ -70,7 +70,7 @@ def teach(
         Folders of images, videos, or arrays (height, width) of both cameras.
     sensor : str or Path
         Built-in name, or path of a TOML sensor file with the cameras, the radius of the stickers,
-        and the planes with the rough places of the stickers.
+        and the planes with the rough positions of the stickers.
     colour : {"grey", "red", "green", "blue"}, optional
         How grey values are computed from colours. Without it, images with colours are refused.
     advance : callable, optional
@@ -125,7 +125,7 @@ def measure(
     Raises
     ------
     PhotographError
-        If images cannot be used; the message names the file.
+        If images cannot be used, or are those of the other camera; the message names the file.
     TeachingError
         If ``taught`` cannot be read, or belongs to another sensor.
 

@@ -44,7 +44,7 @@ def load_sensor(
         Entries that replace entries of the file, by dotted key.
     known : KnownRig, optional
         Rig that the estimator uses, if it differs from the file's rig. The file's rig forms the
-        images.
+        images. If ``taught`` is given, the estimator uses the rig that was known at teaching.
 
     Returns
     -------

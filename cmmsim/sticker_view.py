@@ -1,4 +1,4 @@
-"""Stickers at their expected places in the images, and the sizes of windows that hold them."""
+"""Stickers at their expected pixels, and the sizes of the windows that hold them."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class StickerView:
 
     @cached_property
     def sizes(self) -> WindowSizes:
-        """Sizes of windows. Large and blurred stickers need larger windows."""
+        """Sizes of windows, which are larger for large or blurred stickers."""
         radius = self.file.stickers.radius
-        place = self.camera_from_base
-        at_target = radius_at(self.rig, place, np.array(self.file.rig.target), radius)
+        camera_from_base = self.camera_from_base
+        at_target = radius_at(self.rig, camera_from_base, np.array(self.file.rig.target), radius)
         at_teaching = max(
-            largest_radius(self.rig, place, self.base, radius),
+            largest_radius(self.rig, camera_from_base, self.base, radius),
             largest_radius(self.rig, self._camera_from_platform, self.platform, radius),
         )
         focal_px = float(self.rig.left.focal_px)
@@ -58,8 +58,10 @@ class StickerView:
         ``centre_error_px`` is the error of a sticker's centre that the renderer causes, px rms.
         """
         timing = self.file.timing
-        size = self.file.stickers.radius
-        at_target = radius_at(self.rig, self.camera_from_base, np.array(self.file.rig.target), size)
+        radius = self.file.stickers.radius
+        at_target = radius_at(
+            self.rig, self.camera_from_base, np.array(self.file.rig.target), radius
+        )
         allowed = print_allowance(self.file, noise, at_target, self.sizes.fit)
         return DetectionSettings(
             self.sizes.window,
@@ -82,6 +84,6 @@ class StickerView:
 
     @property
     def _stickers(self) -> Array:
-        """Nominal places (n,3) of all stickers in the camera frame."""
-        places = (self._camera_from_platform, self.platform), (self.camera_from_base, self.base)
-        return np.concatenate([apply(move, body.nominal) for move, body in places])
+        """Nominal positions (n, 3) of all stickers in the camera frame, m."""
+        poses = (self._camera_from_platform, self.platform), (self.camera_from_base, self.base)
+        return np.concatenate([apply(move, body.nominal) for move, body in poses])

@@ -2,8 +2,8 @@
 
 A tag is drawn on each plane of the platform, as large as fits between the plane's stickers. It has
 the same cameras, grey levels, lens and noise as the stickers. OpenCV finds its corners. Tags and
-stickers are searched in the whole images of each frame, without tracking. The rig and the places of
-all corners and stickers are known exactly. The errors are therefore those of the images alone.
+stickers are searched in the whole images of each frame, without tracking. The rig and the positions
+of all corners and stickers are known exactly. The errors are therefore those of the images alone.
 
 Corners are triangulated and fitted rigidly like stickers, with equal weights. OpenCV states no
 covariance of its corners. The covariance of a pose from tags is therefore that of least squares,
@@ -47,10 +47,10 @@ from cmmsim.measuring.pose_estimator import measure_frame
 from cmmsim.radiometry.stereo_images import StereoFrame
 from cmmsim.sensor import Sensor
 
-# Largest distance and angle of the random poses from home, in each axis.
+# Largest difference of the random poses from home in each coordinate and each angle.
 REACH_M = 0.01
 REACH_RAD = 0.04
-# Width of the bright margin of a tag, in sides of its cells.
+# Width of the bright margin of a tag, in units of the side of a cell.
 QUIET_CELLS = 1
 # Fewest corners from which a pose is computed: those of one tag on each of two planes.
 FEWEST_CORNERS = 8
@@ -60,7 +60,7 @@ class Found(NamedTuple):
     """Marks found in one frame.
 
     pixels      (2, n, 2), the left and the right image, px
-    expected    (2, n, 2), exact places of the marks in the images, px
+    expected    (2, n, 2), exact pixels of the same marks
     pose        (6,), m and rad; NaN if the frame is lost
     covariance  (6, 6), of the pose
     seconds     time from the images to the pose
@@ -84,8 +84,8 @@ class MarkScore:
     bias_px, scatter_px  rms error of a point per axis without noise, and rms change by noise
     position_*_um        bias and scatter of the position, rms over axes
     angle_*_urad         bias and scatter of the orientation, rms over axes
-    normalised_error     rms error in units of the stated covariance; 1 if the covariance is right
-    lost                 share of frames without a pose
+    normalised_error     rms Mahalanobis distance of a pose, divided by √6; ideally 1
+    lost                 fraction of frames without a pose
     milliseconds         median time from whole images to the pose
     """
 
@@ -107,8 +107,8 @@ class MarkScore:
 class Tags:
     """Tags of one dictionary on the planes of a platform.
 
-    ``corners`` (k, 4, 3) are their places in platform axes, m, in the order of OpenCV, and
-    ``prints`` are the tags with their margins.
+    ``corners`` (k, 4, 3) are the positions of the corners of k tags in platform axes, m, in the
+    order of OpenCV. ``prints`` are the tags with their margins.
     """
 
     name: str
@@ -123,22 +123,22 @@ def tags_on(name: str, body: MarkedBody, stickers: Stickers) -> Tags:
     """
     dictionary = tag_dictionary(name)
     cells = dictionary.markerSize + 2
-    across = cells + 2 * QUIET_CELLS
+    cells_across = cells + 2 * QUIET_CELLS
     prints = []
     for plane in range(len(PLANE_NAMES)):
         own = body.plane_index == plane
         axes = body.in_plane[own][0]
-        places = body.nominal[own] @ axes
-        low, high = places.min(axis=0), places.max(axis=0)
-        side = float((high - low).min()) / across
+        coordinates = body.nominal[own] @ axes
+        low, high = coordinates.min(axis=0), coordinates.max(axis=0)
+        cell_side = float((high - low).min()) / cells_across
         normal = np.cross(axes[:, 0], axes[:, 1])
-        turn = np.column_stack([axes[:, 0], -axes[:, 1], -normal])
+        rotation = np.column_stack([axes[:, 0], -axes[:, 1], -normal])
         middle = axes @ (0.5 * (low + high)) + body.offsets[plane] * normal
-        first = middle - 0.5 * across * side * (turn[:, 0] + turn[:, 1])
+        first = middle - 0.5 * cells_across * cell_side * (rotation[:, 0] + rotation[:, 1])
         picture = cv2.aruco.generateImageMarker(dictionary, plane, cells) > 0
         bright = np.pad(picture, QUIET_CELLS, constant_values=True)
         levels = np.where(bright, stickers.sticker_level, stickers.ring_level) / 255.0
-        prints.append(Print(levels.astype(np.float32), side, rigid(turn, first)))
+        prints.append(Print(levels.astype(np.float32), cell_side, rigid(rotation, first)))
     inner = QUIET_CELLS + cells * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     flat = np.column_stack([inner, np.zeros(4)])
     corners = [apply(each.body_from_print, each.side * flat) for each in prints]
@@ -167,22 +167,24 @@ def compare_tags(
     body = marked_body("platform", file.platform)
     kinds = [tags_on(name, body, file.stickers) for name in dictionaries]
     reach = np.repeat([REACH_M, REACH_RAD], 3)
-    at = sensor.home + rng.uniform(-reach, reach, (poses, 6))
+    true_poses = sensor.home + rng.uniform(-reach, reach, (poses, 6))
     seeds = rng.integers(2**32, size=poses)
     found = []
-    for pose, seed in zip(at, seeds, strict=True):
+    for pose, seed in zip(true_poses, seeds, strict=True):
         pair = _sticker_frames(camera, pose, seed)
         found.append([_stickers_found(sensor, pose, frame) for frame in pair])
         report()
-    scores = [_score("stickers", sensor.observer.detector.name, at, found)]
+    scores = [_score("stickers", sensor.observer.detector.name, true_poses, found)]
     for tags in kinds:
         by_method: dict[str, list[list[Found]]] = {method: [] for method in REFINEMENTS}
-        for pose, seed in zip(at, seeds, strict=True):
+        for pose, seed in zip(true_poses, seeds, strict=True):
             pair = _tag_frames(camera, file.stickers, tags, pose, seed)
             for method, results in by_method.items():
                 results.append([_tags_found(sensor, tags, method, pose, frame) for frame in pair])
             report()
-        scores += [_score(tags.name, method, at, each) for method, each in by_method.items()]
+        scores += [
+            _score(tags.name, method, true_poses, each) for method, each in by_method.items()
+        ]
     return scores
 
 
@@ -207,10 +209,12 @@ def _tag_frames(
         apply(each.body_from_print, each.side * np.column_stack([each.corners, np.zeros(4)]))
         for each in tags.prints
     ]
-    move = camera.camera_from_base @ pose_to_transform(pose)
+    camera_from_platform = camera.camera_from_base @ pose_to_transform(pose)
     light = [
-        plates_image(drawn, each, step @ move, plates, PRINT_SUPERSAMPLING)
-        for each, step in zip(camera.rig.cameras, camera.rig.from_camera, strict=True)
+        plates_image(
+            drawn, each, camera_from_left @ camera_from_platform, plates, PRINT_SUPERSAMPLING
+        )
+        for each, camera_from_left in zip(camera.rig.cameras, camera.rig.from_camera, strict=True)
     ]
     rng = np.random.default_rng(seed)
     clean = replace(camera.noise, enabled=False)
@@ -232,8 +236,8 @@ def _stickers_found(sensor: Sensor, pose: Array, frame: StereoFrame) -> Found:
     seconds = perf_counter() - begin
     names = sensor.platform.sticker_ids.tolist()
     used = [names.index(name) for name in measured.target_ids]
-    move = sensor.camera.camera_from_base @ pose_to_transform(pose)
-    places = apply(move, sensor.truth.platform_places[used])
+    camera_from_platform = sensor.camera.camera_from_base @ pose_to_transform(pose)
+    places = apply(camera_from_platform, sensor.truth.platform_places[used])
     expected = sensor.rig.project(places)[0]
     pixels = np.stack([measured.left_pixels, measured.right_pixels])
     return Found(pixels, expected, measured.pose, measured.covariance, seconds)
@@ -253,8 +257,8 @@ def _tags_found(sensor: Sensor, tags: Tags, method: str, pose: Array, frame: Ste
     places = tags.corners[both].reshape(-1, 3)
     measured, covariance = _pose_of(sensor, places, pixels)
     seconds = perf_counter() - begin
-    move = sensor.camera.camera_from_base @ pose_to_transform(pose)
-    expected = sensor.rig.project(apply(move, places))[0]
+    camera_from_platform = sensor.camera.camera_from_base @ pose_to_transform(pose)
+    expected = sensor.rig.project(apply(camera_from_platform, places))[0]
     return Found(pixels, expected, measured, covariance, seconds)
 
 
@@ -265,22 +269,22 @@ def _pose_of(sensor: Sensor, places: Array, pixels: Array) -> tuple[Array, Array
     """
     if len(places) < FEWEST_CORNERS:
         return LOST
-    unit = np.tile(np.eye(2), (len(places), 1, 1))
-    points = triangulate(sensor.rig, pixels[0], pixels[1], unit, unit)
+    unit_covariances = np.tile(np.eye(2), (len(places), 1, 1))
+    points = triangulate(sensor.rig, pixels[0], pixels[1], unit_covariances, unit_covariances)
     fit = register(places, points.points, points.covariances)
     # Each point has four pixel coordinates, and the pose six unknowns.
     squares = points.ray_gap.sum() + fit.misfit.sum()
     variance = squares / (4 * len(places) - len(LOST[0]))
     base_from_camera = invert(sensor.camera.camera_from_base)
     base_from_platform = base_from_camera @ fit.transform
-    spread = compose_covariance(base_from_camera, variance * fit.covariance)
-    return transform_to_pose(base_from_platform), pose_covariance(base_from_platform, spread)
+    covariance = compose_covariance(base_from_camera, variance * fit.covariance)
+    return transform_to_pose(base_from_platform), pose_covariance(base_from_platform, covariance)
 
 
 def _score(marks: str, method: str, poses: Array, found: Sequence[Sequence[Found]]) -> MarkScore:
-    """Return the score of ``found``, which has a frame without and one with noise at each pose.
+    """Return the score of ``found``, which has two results per pose: without and with noise.
 
-    The ``poses`` (N, 6) are the true ones.
+    ``poses`` (N, 6) are the true poses.
     """
     clean = np.array([pair[0].pose for pair in found]) - poses
     noisy = np.array([pair[1].pose for pair in found]) - poses

@@ -1,4 +1,4 @@
-"""Teaching (paper section 4.2), which finds the frames of base and platform from sticker planes.
+"""Teaching (paper section 4.2), which determines the frames of base and platform by stickers.
 
 The base stands still, and its stickers are observed in the mean of many exposures. The platform
 follows a smooth path. Its stickers are observed at each pose, and registration moves all
@@ -48,21 +48,24 @@ Progress = Callable[[int, int], None]
 # Amplitude of the teaching path about home, m and rad.
 SHIFT = 0.008
 TURN = 0.03
+# Number of cycles of each pose coordinate on the path.
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
-# Largest distance of a sticker from its place in averaged exposures, m. The distance is a few
-# micrometres unless the sticker is partly hidden.
+# Teaching fails if a sticker of the platform is farther than this from its expected position in
+# averaged exposures, m. It is off by a few micrometres unless it is partly hidden.
 LARGEST_GAP = 1e-4
-# Largest rms distance between the two rays of a sticker of the base, in standard deviations. The
-# distance is 1.2 to 1.4 if cameras and stickers are as stated.
+# A warning is given if the rms distance between the two rays of a sticker of the base exceeds this,
+# in standard deviations. It is 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
 # Additional distance that is allowed for errors of the print, in standard deviations.
 PRINT_REACH = 20.0
+# Phase of each pose coordinate at the start of the path, rad.
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 # Only the part of a window around the bright spot is fitted. Ratio of half the side of this part to
 # a sticker's radius at the rig's target.
 ROOM = 1.35
 # Smallest free margin around the largest sticker at teaching, px. Rounding can use up half a pixel.
 SMALLEST_ROOM_PX = 0.7
+# Smallest sides of the fitted part, px, for sharp and for blurred stickers.
 SMALLEST_FIT = 12
 SMALLEST_BLURRED_FIT = 14
 # Smallest margin in px on each side for the blur of point spread and exposure.
@@ -76,7 +79,8 @@ class TeachingPlan:
     """Plan of teaching.
 
     ``base`` and ``platform`` are the qualities of the views. ``poses`` is the number of views of
-    the platform. The other entries are sizes of windows in px.
+    the platform. The other entries are sides of windows, px: for the base, for the first two views
+    of the platform, and for its other views.
     """
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
@@ -116,7 +120,11 @@ class Teacher:
         rng: np.random.Generator,
         progress: Progress | None = None,
     ) -> Taught:
-        """Teach base and platform around the pose ``home`` (6,). Raises TeachingError."""
+        """Teach base and platform around the pose ``home`` (6,).
+
+        ``progress`` is called with the number of steps done and their total. Raises TeachingError
+        if a sticker is not seen, or if the stickers are not found or do not determine the frames.
+        """
         steps = self.plan.poses + 2
         report = progress or (lambda done, total: None)
         report(0, steps)
@@ -124,7 +132,7 @@ class Teacher:
             path = teaching_path(home, self.plan.poses)
             ellipses = bright_ellipses(self.camera.look(path[0], rng), self.observer)
             points = candidate_points(ellipses, self.observer, self.observer.settings.limits)
-            start = [
+            rough_poses = [
                 find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]
                 for body in (self.base, self.platform)
             ]
@@ -133,7 +141,7 @@ class Teacher:
             # the most exposures.
             base = self._look_at(
                 self.base,
-                start[0],
+                rough_poses[0],
                 self.base.nominal,
                 path[0],
                 rng,
@@ -143,10 +151,10 @@ class Teacher:
             self._warn_of_parted_rays(base)
             base = replace(base, covariances=base.covariances + self._constant(base.points))
             camera_from_base, base_covariance, base = by_planes(
-                base, self.base, plane_normals(self.base, start[0])
+                base, self.base, plane_normals(self.base, rough_poses[0])
             )
             report(2, steps)
-            seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
+            seen = self._platform_views(rough_poses[1], path, rng, lambda k: report(k + 2, steps))
         except LostError as error:
             raise TeachingError(f"teaching failed: {error}") from error
         base_from_camera = invert(camera_from_base)
@@ -239,7 +247,7 @@ class Teacher:
         ``rough`` (4, 4) is a rough camera_from_platform in the first view.
         """
         places = self.platform.nominal
-        last = rough
+        previous = rough
         step = np.eye(4)
         seen = []
         for k, pose in enumerate(path):
@@ -247,7 +255,7 @@ class Teacher:
             size = self.plan.first_window if k < 2 else self.plan.platform_window
             seen.append(
                 self._look_at(
-                    self.platform, last @ step, places, pose, rng, self.plan.platform, size
+                    self.platform, previous @ step, places, pose, rng, self.plan.platform, size
                 )
             )
             if k == 0:
@@ -255,27 +263,27 @@ class Teacher:
                     by_planes(seen[0], self.platform, plane_normals(self.platform, rough))[0]
                 )
                 places = apply(body_from_camera, seen[0].points)
-            now = register(places, seen[-1].points, seen[-1].covariances).transform
-            self._require_rigid(places, now, seen[-1])
-            step = invert(last) @ now if k else step
-            last = now
+            current = register(places, seen[-1].points, seen[-1].covariances).transform
+            self._require_rigid(places, current, seen[-1])
+            step = invert(previous) @ current if k else step
+            previous = current
             report(k + 1)
         return seen
 
     def _require_rigid(
         self, places: Array, camera_from_body: Array, seen: StickerObservation
     ) -> None:
-        """Raise LostError if a sticker seems to have moved relative to the others."""
-        gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
+        """Raise LostError if a sticker of the platform is too far from its expected position."""
+        distances = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         depth = np.linalg.norm(seen.points, axis=1).max()
         focal = self.observer.rig.left.focal_px
         settings = self.observer.settings
         errors = settings.line_error_px + PRINT_REACH * settings.allowed.changing_px
         limit = LARGEST_GAP + errors * depth / focal
-        if gaps.max() > limit:
-            worst = self.platform.sticker_ids[gaps.argmax()]
+        if distances.max() > limit:
+            worst = self.platform.sticker_ids[distances.argmax()]
             raise LostError(
-                f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its "
+                f"{self.platform.name}: sticker {worst} is {distances.max() * 1e6:.0f} um off its "
                 f"place, allowed are {limit * 1e6:.0f} um; perhaps it is partly hidden"
             )
 
@@ -327,7 +335,7 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
 def largest_radius(
     rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
 ) -> float:
-    """Return the longest half axis, px, in the images of the stickers that both cameras see.
+    """Return the longest semi-axis, px, in the images of the stickers that both cameras see.
 
     The result is 0 if no sticker of the body is seen by both cameras.
     """
@@ -341,9 +349,9 @@ def largest_radius(
 
 
 def exactly_taught(file: SensorFile) -> Taught:
-    """Return the result of a teaching without errors: the true frames and sticker places.
+    """Return the result of a teaching without errors: the true frames and sticker positions.
 
-    All covariances are zero. Raises SensorFileError.
+    All covariances are zero. Raises SensorFileError for an impossible rig.
     """
     _, camera_from_base = rig_from_file(file.rig)
     platform, base = (

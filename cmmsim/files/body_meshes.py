@@ -20,23 +20,28 @@ from cmmsim.geometry.pose import Array
 if TYPE_CHECKING:
     import trimesh
 
+# Length of each unit of a mesh, m.
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 # Largest length of a mesh, m. A larger one probably has a wrong unit.
 LARGEST_SIZE = 10.0
-# Largest ratio of a mesh's length to the largest distance between its stickers.
+# Largest and smallest ratio of a mesh's length to the diagonal of its stickers' bounding box. Other
+# ratios are refused, because they suggest a wrong unit.
 LARGEST_SIZE_RATIO = 100.0
-# Smallest ratio of a mesh's length to the largest distance between its stickers.
 SMALLEST_SIZE_RATIO = 0.3
 # Largest depth of a sticker below the surface, m. Up to this depth, the body does not hide the
 # sticker's dark ring.
 LARGEST_DEPTH = 0.0002
 REMEDY = "; {}.drop = true moves the planes of stickers onto the surface"
-# A line may miss a triangle by this fraction of its size, so that no line passes between triangles.
+# A line may miss a triangle by this fraction of the triangle's size, so that no line passes between
+# two triangles.
 EDGE_TOLERANCE = 1e-6
 
 
 def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
-    """Return the mesh of a body in m. Raises SensorFileError if it is missing or not closed."""
+    """Return the mesh of a body in m.
+
+    Raises SensorFileError if the file is missing or cannot be read, or if the mesh is not closed.
+    """
     path = Path(str(section.mesh))
     return closed_mesh(path, METRES[section.mesh_unit], f"{name}.mesh {path}")
 
@@ -44,8 +49,8 @@ def read_mesh(section: Body, name: str) -> trimesh.Trimesh:
 def closed_mesh(path: Path, scale: float, where: str) -> trimesh.Trimesh:
     """Return the closed mesh of a file in m. One unit of the file is ``scale`` m.
 
-    Raises SensorFileError, which begins with ``where``, if the file is missing or not a closed
-    mesh.
+    Normals that point inwards are turned outwards. Raises SensorFileError, which begins with
+    ``where``, if the file is missing or cannot be read, or if the mesh is not closed.
     """
     import trimesh
 
@@ -119,9 +124,10 @@ def require_size(mesh: trimesh.Trimesh, section: Body, name: str) -> None:
 
 
 def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Array:
-    """Return the heights (n,) of a mesh's surface above places (n, 3), along normals (n, 3), m.
+    """Return the heights (n,) of a mesh's surface above points (n, 3), along normals (n, 3), m.
 
-    The nearest outer surface counts. The height is NaN if the line along a normal misses the mesh.
+    Only surfaces that face in the direction of the normal count, and of these the nearest. The
+    height is NaN if there is none.
     """
     first, second, third = np.moveaxis(np.asarray(mesh.triangles), 1, 0)
     sides = second - first, third - first
@@ -130,10 +136,10 @@ def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Arr
     for k, (place, normal) in enumerate(zip(places, normals, strict=True)):
         across = np.cross(normal, sides[1])
         volume = np.einsum("ni,ni->n", sides[0], across)
-        gap = place - first
-        turned = np.cross(gap, sides[0])
+        offset = place - first
+        turned = np.cross(offset, sides[0])
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.einsum("ni,ni->n", gap, across) / volume
+            u = np.einsum("ni,ni->n", offset, across) / volume
             v = turned @ normal / volume
             height = np.einsum("ni,ni->n", sides[1], turned) / volume
             inside = (
@@ -149,7 +155,8 @@ def surface_heights(mesh: trimesh.Trimesh, places: Array, normals: Array) -> Arr
 def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
     """Return the body with each plane moved along its normal onto the surface of the mesh.
 
-    Each plane is moved to the highest place at which its stickers' normals meet the surface.
+    Each plane is moved to the highest point at which its stickers' normals meet the surface. Raises
+    SensorFileError if no normal of a plane meets the surface.
     """
     body = marked_body(name, section)
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)
@@ -172,7 +179,8 @@ def _require_on_surface(
 ) -> None:
     """Raise SensorFileError unless all stickers lie on the surface of a mesh.
 
-    The message has the name of a sticker, and the remedy.
+    A sticker must not be deeper than LARGEST_DEPTH below the surface, nor farther than ``radius``
+    from it. The message names a sticker, and ends with ``remedy``.
     """
     from trimesh.proximity import closest_point_naive  # needs no R-tree
 

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from cmmsim.checks import Section
 from cmmsim.files.quantities import Bounds, Direction3, Length, Level, Vector3, quantity
 
-# px: narrowest point spread that the samples of drawn images can resolve.
+# Standard deviation of the narrowest point spread that the samples of drawn images resolve, px.
 NARROWEST_PSF = 0.1
 Share = Annotated[float, Bounds(0.0, 1.0)]
 Offset = Annotated[float, Bounds(-100.0, 100.0, "px")]
@@ -61,7 +61,7 @@ class Lens(Section):
 
 
 class Lamp(Section):
-    """Lamp that shines on the stickers: a place, or a direction for a lamp that is far away."""
+    """Lamp that shines on the stickers, at a position, or in a direction if it is far away."""
 
     place: Vector3 | None = quantity(None, "m", "place of the lamp in the base frame")
     direction: Direction3 | None = quantity(
@@ -83,9 +83,10 @@ class Lamp(Section):
 class Light(Section):
     """Light on the stickers and their rings, and bright objects behind them.
 
-    Without lamps, stickers have their grey level from all sides, as retro-reflective ones have in
-    the light of the cameras. With lamps, the level is multiplied by ``ambient`` and the light of
-    the lamps, which falls with the cosine of its angle and the square of the distance.
+    Without lamps, stickers have their grey level from all sides, as retro-reflective stickers have
+    in the light of the cameras. With lamps, the level is multiplied by the sum of ``ambient`` and
+    the light of all lamps. The light of a lamp is proportional to the cosine of its angle of
+    incidence and, if it has a position, to the inverse square of its distance.
     """
 
     lamps: tuple[Lamp, ...] = quantity((), "", "lamps")
@@ -101,11 +102,12 @@ class Light(Section):
 
 
 class Print(Section):
-    """Bodies and print of the stickers, which are the same in all frames.
+    """Thickness and print of the stickers, which are the same in all frames.
 
     ``unevenness`` and ``outline`` are drawn anew for each sticker, from ``seed``. With ``known``,
     the estimator knows the sizes of these errors, but not their values. It counts them among the
-    errors that all frames have in common, with standard deviations of these sizes.
+    errors that all frames have in common, with standard deviations of these sizes. The part of the
+    errors that changes from frame to frame counts as noise.
     """
 
     thickness: Annotated[float, Bounds(1e-6, 5e-3, "m", zero=True)] = quantity(

@@ -10,7 +10,7 @@ from cmmsim.geometry.sticker_print import PrintSizes
 
 
 def print_sizes(file: SensorFile) -> PrintSizes:
-    """Return the sizes of the print errors of the stickers of a sensor file."""
+    """Return the sizes of the stickers' print errors in a sensor file."""
     stickers = file.stickers
     section = file.print
     rim = stickers.sticker_level if section.rim_level is None else section.rim_level
@@ -26,7 +26,7 @@ def print_sizes(file: SensorFile) -> PrintSizes:
 def drawn_print(file: SensorFile, count: int, stream: int) -> tuple[Array, Array]:
     """Draw the coefficients of brightness (n, 5) and outline (n, 8) of a body's n stickers.
 
-    ``stream`` is the number of the body, 0 for the platform and 1 for the base.
+    ``stream`` is 0 for the platform and 1 for the base.
     """
     rng = np.random.default_rng([file.print.seed, stream])
     return print_sizes(file).drawn(count, rng)

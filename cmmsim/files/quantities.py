@@ -24,7 +24,10 @@ class Bounds:
     zero: bool = False
 
     def check(self, value: float | None) -> float | None:
-        """Return the value. Raises ValueError, which states the range, for a value outside."""
+        """Return the value, which can be None.
+
+        Raises ValueError, which states the range, for a value outside of the range.
+        """
         if value is None or self.least <= value <= self.most or (self.zero and value == 0.0):
             return value
         also = "0 or " if self.zero else ""

@@ -1,8 +1,8 @@
 """Stereo rig and bodies with stickers, made from the content of a sensor file.
 
 A rig is either nominal, with both cameras toed in to the target, or calibrated. A body has its
-stickers on three machined planes. The planes are exact, but the places of the stickers are nominal:
-a sticker can lie up to about a millimetre from its nominal place.
+stickers on three machined planes. The planes are exact, but the positions of the stickers are
+nominal: a sticker can lie up to about a millimetre from its nominal position.
 """
 
 from dataclasses import dataclass, replace
@@ -29,12 +29,12 @@ from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 # Number of points along each side of the image at which the distortion is checked.
 BORDER_POINTS = 65
 SHORTEST_BASELINE = 1e-3  # m
-# Smallest volume that the unit normals of three planes span. For a corner of a cube, it is 1.
+# Smallest volume that the unit normals of three planes must span. For a corner of a cube, it is 1.
 SMALLEST_CORNER = 0.001
 
 
 def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
-    """Return the rig and the true camera_from_base (4, 4).
+    """Return the rig, and camera_from_base (4, 4), as the file states them.
 
     Raises SensorFileError, which names the wrong entry, if the rig is impossible.
     """
@@ -70,7 +70,10 @@ def lens_from_file(file: SensorFile) -> Optics:
 
 
 def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) -> PinholeCamera:
-    """Return the calibrated camera, or the nominal one if the file has no calibration."""
+    """Return the calibrated camera, or the nominal one if the file has no calibration.
+
+    Raises SensorFileError if the distortion has no inverse in some part of the image.
+    """
     if calibrated is None:
         return nominal
     focal_x, focal_y = calibrated.focal_px
@@ -99,7 +102,7 @@ def _require_whole_image(camera: PinholeCamera, name: str) -> None:
 
 
 def _right_from_left(section: RightFromLeft) -> Array:
-    """Return right_from_left (4, 4). Raises SensorFileError for an impossible place."""
+    """Return right_from_left (4, 4). Raises SensorFileError for an impossible pose."""
     right_from_left = rigid(rotation_exp(np.array(section.rotation_vector)), section.translation)
     right_centre = -right_from_left[:3, :3].T @ right_from_left[:3, 3]
     if np.linalg.norm(right_centre) < SHORTEST_BASELINE:
@@ -108,25 +111,25 @@ def _right_from_left(section: RightFromLeft) -> Array:
             f"apart, got {list(section.translation)}"
         )
     if right_centre[0] <= 0.0 or right_from_left[2, 2] <= 0.0:
-        place = ", ".join(f"{value:.4g}" for value in section.translation)
+        shift = ", ".join(f"{value:.4g}" for value in section.translation)
         turn = ", ".join(f"{value:.4g}" for value in section.rotation_vector)
         raise SensorFileError(
             "rig.right_from_left: the right camera must stand to the right of the left camera "
             "(translation x below zero if both look in the same direction) and look in about the "
-            f"same direction, got translation [{place}] m and rotation_vector [{turn}] rad"
+            f"same direction, got translation [{shift}] m and rotation_vector [{turn}] rad"
         )
     return right_from_left
 
 
 @dataclass(frozen=True)
 class MarkedBody:
-    """Body with planes and nominal sticker places, in body axes.
+    """Body with planes and nominal sticker positions, in body axes.
 
     normals      (3, 3), unit normals n of the planes A, B, C
     offsets      (3,), offsets d of the planes n . p = d, m
     sticker_ids  (n,), names of the stickers, such as "A1"
     plane_index  (n,), plane of each sticker, 0 to 2
-    nominal      (n, 3), nominal places, m
+    nominal      (n, 3), nominal positions, m
     in_plane     (n, 3, 2), u and v axes of each sticker's plane
     """
 
@@ -164,7 +167,10 @@ class MarkedBody:
 
 
 def marked_body(name: str, body: Body) -> MarkedBody:
-    """Return the body that a section of a sensor file describes."""
+    """Return the body that a section of a sensor file describes.
+
+    Raises SensorFileError for a direction of length zero.
+    """
     planes = [getattr(body.planes, plane) for plane in PLANE_NAMES]
     normals = np.stack([unit(p.normal) for p in planes])
     offsets = np.array([n @ np.array(p.point) for n, p in zip(normals, planes, strict=True)])
@@ -190,7 +196,7 @@ def marked_body(name: str, body: Body) -> MarkedBody:
 
 
 def require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the planes of a body meet in one point, the frame's origin."""
+    """Raise TeachingError unless the planes of a body meet in one point."""
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
         raise TeachingError(

@@ -38,7 +38,7 @@ from cmmsim.files.quantities import (
 )
 from cmmsim.geometry.pose import Array
 
-# Largest deviation of a frame's latency from the mean, in standard deviations.
+# Deviations of a frame's latency from the mean are clipped to this many standard deviations.
 WIDEST_JITTER = 3.0
 
 
@@ -114,7 +114,7 @@ class Calibrated(Section):
 
 
 class RightFromLeft(Section):
-    """Place of the right camera: x_right = R(rotation_vector) x_left + translation."""
+    """Pose of the right camera: x_right = R(rotation_vector) x_left + translation."""
 
     translation: Vector3 = quantity(
         ..., "m", "position of the left camera in the right camera's frame"
@@ -141,7 +141,7 @@ class RigCovariance(Section):
 
 
 class Rig(Section):
-    """Both cameras and their places.
+    """Both cameras and their poses.
 
     ``distance`` moves ``position`` along the line to ``target``, to this distance from ``target``.
     ``left`` and ``right`` replace ``focal_px`` and the principal point in the middle of the image.
@@ -173,7 +173,7 @@ class Rig(Section):
 
 
 class Camera(Section):
-    """Noise parameters of a camera after EMVA 1288.
+    """Noise parameters of both cameras after EMVA 1288.
 
     ``noise = false`` switches off all noise, including the fixed pattern of prnu and dsnu.
     ``pattern_seed`` is the seed of the fixed pattern. ``grey_noise_percent`` replaces
@@ -288,7 +288,7 @@ class HalfSpace(Section):
 
 
 class StickerPlane(HalfSpace):
-    """Plane with stickers at nominal places [u, v], m, counted from its point.
+    """Plane with stickers at nominal positions [u, v] relative to ``point``, m.
 
     The u axis is ``across``, projected onto the plane.
     """
@@ -298,7 +298,7 @@ class StickerPlane(HalfSpace):
 
 
 class Planes(Section):
-    """Three planes of a body, with stickers."""
+    """The three planes of a body that carry stickers."""
 
     A: StickerPlane
     B: StickerPlane

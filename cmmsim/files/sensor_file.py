@@ -53,7 +53,7 @@ def require_keys(name: str | Path, changes: object) -> None:
 
 
 def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
-    """Apply changes to the content of a file.
+    """Apply changes to the content of a file, in place.
 
     Unknown keys are accepted here; the schema refuses them later. ``source`` names the content in
     messages. Raises SensorFileError for a change of ``based_on``, and if a change treats a section
@@ -82,22 +82,23 @@ def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> Non
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
-    """Return places (count, 2) [u, v], m, on the one-standard-deviation ellipse of listed places.
+    """Return positions (count, 2) [u, v], m, on the one-sigma ellipse of listed positions.
 
-    ``listed`` (n, 2) are the listed places. Three or more points at equal angles on an ellipse have
-    the same mean and the same mean second moments, whatever their number. Only their number then
-    changes the accuracy of a plane or a pose, which improves with its square root.
+    ``listed`` (n, 2) are the listed positions. Three or more points at equal angles on an ellipse
+    have the same mean and the same covariance, whatever their number. The accuracy of a plane or a
+    pose then depends on the number alone, and improves with its square root.
     """
-    places = np.asarray(listed, dtype=float)
-    reach = np.linalg.cholesky(np.cov(places.T, bias=True))
+    positions = np.asarray(listed, dtype=float)
+    root = np.linalg.cholesky(np.cov(positions.T, bias=True))
     angle = 2.0 * np.pi * np.arange(count) / count
     return np.asarray(
-        places.mean(axis=0) + np.column_stack([np.cos(angle), np.sin(angle)]) @ reach.T, dtype=float
+        positions.mean(axis=0) + np.column_stack([np.cos(angle), np.sin(angle)]) @ root.T,
+        dtype=float,
     )
 
 
 def closest(places: Array) -> float:
-    """Return the smallest distance between neighbours on a ring of places (n, 2), m."""
+    """Return the smallest distance between neighbours on a ring of positions (n, 2), m."""
     return float(np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).min())
 
 
