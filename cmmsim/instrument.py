@@ -343,7 +343,7 @@ class Instrument:
         changes : mapping of str to float
             Amounts by name, as in `move_rig`. An empty mapping ends the drift.
         frames : int
-            Number of frames. The last of them has the full amounts, and so have all later frames.
+            Number of frames of the drift. The last one and all later frames have the full amounts.
 
         Raises
         ------

@@ -2,13 +2,14 @@
 
 The observations are all measured pixels. Nine intrinsics describe a camera: the focal lengths fx
 and fy and the principal point cx, cy in px, then the distortion coefficients k1, k2, p1, p2, k3 of
-Brown and Conrady in OpenCV's order. Intrinsics that are not free stay at their start values.
+Brown and Conrady in OpenCV's order. Intrinsics that are not free stay at their initial values.
 
 Levenberg and Marquardt's method solves the normal equations. A board pose affects only the
 residuals of its own view. The poses are therefore eliminated view by view (Schur complement), and
 the reduced normal matrix N of the free intrinsics and of right_from_left remains. All pixels have
 equal weight, and their variance sigma² is estimated from the residuals. The covariance for
-independent errors is sigma² N^-1. It is enlarged if the points of a view have common errors.
+independent errors is sigma² N^-1. The stated covariance is larger if the points of a view have
+common errors.
 """
 
 from collections.abc import Callable
@@ -31,7 +32,7 @@ DEFAULT_DISTORTION = "brown5"
 MOST_STEPS = 60
 # The iteration ends when a step decreases the sum of squares by less than this fraction.
 SMALLEST_GAIN = 1e-11
-# N, scaled to a unit diagonal, counts as singular if its smallest eigenvalue is below this.
+# The adjustment fails if N, scaled to a unit diagonal, has an eigenvalue that is not above this.
 SINGULAR = 1e-14
 POSE = 6  # number of unknowns of a pose
 # Slices of the unknowns of a view. The pose of the view's board follows the common unknowns.
@@ -153,8 +154,8 @@ class _Normal:
 
     ``matrix`` (v, s, s) and the right-hand side ``rhs`` (v, s) have s = c + 6 unknowns: first the c
     common ones, then the pose of the view's board. ``residuals`` are those of each camera (m, 2),
-    px. ``cost`` is the sum of the squared residuals of both cameras, px². It is inf if a point lies
-    behind a camera.
+    px. ``cost`` is the sum of the squared residuals of both cameras, px². A point behind a camera
+    makes it inf.
     """
 
     matrix: Array

@@ -68,7 +68,7 @@ class Distances:
 
     @property
     def normalised_error(self) -> float:
-        """Root mean square of errors divided by their standard deviations; 1 if these are right."""
+        """Root mean square of errors divided by their stated deviations; ideally 1."""
         return float(np.sqrt(np.mean(self.errors**2 / self.variances)))
 
 

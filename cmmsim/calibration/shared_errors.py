@@ -21,7 +21,7 @@ affected most. The whitened estimate is N^-1/2 (sum s_v s_v') N^-1/2. The rank o
 number of views minus one, so the matrix is singular for 10 to 25 views and 24 unknowns. The matrix
 is therefore shrunk towards the unit matrix as in Ledoit and Wolf (2004, J. Multivar. Anal. 88,
 365-411), and scaled to the mean eigenvalue above. An error that is common to all views, such as a
-constant bend of the board, cannot be found by comparing views.
+constant bend of the board, cannot be detected by comparing views.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class SharedErrors:
     """Common errors of the points of a view.
 
     ``ratio`` is the estimated mean eigenvalue of the covariance relative to the covariance for
-    independent errors. With independent errors it exceeds ``limit`` with probability CHANCE.
+    independent errors. For independent errors, it exceeds ``limit`` with probability CHANCE.
     ``independent`` (c, c) is the covariance of the common unknowns for independent errors, sigma²
     N^-1. ``covariance`` (c, c) takes the common errors into account. Both are equal if the ratio
     does not exceed its limit. Where the ratio cannot be estimated, as from a single view, it is 1

@@ -10,7 +10,7 @@ from cmmsim.geometry.pose import Array
 # Half the width of cornerSubPix's window, as a fraction of the distance between neighbouring
 # corners.
 FINE_WINDOW_RATIO = 0.3
-# A ChArUco board with fewer detected corners is not found.
+# A ChArUco board with fewer detected corners is not accepted.
 FEWEST_CORNERS = 4
 # Fraction of the margin between marker and edge of the square that is painted over with the marker.
 PAINTED = 0.5

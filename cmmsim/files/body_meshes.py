@@ -85,7 +85,7 @@ def with_meshes(file: SensorFile, source: str) -> SensorFile:
 
     The planes of a body are moved if its entry ``drop`` is True. Raises SensorFileError for a mesh
     that cannot be read, is not closed or has a wrong unit, and for a sticker that does not lie on
-    it.
+    its mesh.
     """
     changes = {}
     for name, section in (("platform", file.platform), ("base", file.base)):

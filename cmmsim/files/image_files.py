@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from cmmsim.errors import CalibrationError, CmmError
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
-# Part of a message.
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
 
 
@@ -43,10 +42,9 @@ def pair_images(
     """Return pairs of the images in two folders, in the order of the sorted file names.
 
     Without their suffixes, the names in both folders are either all different (left_01, right_01)
-    or all equal.
-    Raises ``error`` if a folder is missing or empty, if both folders are the same, if the numbers
-    of images differ, or if only some names are equal. In the last two cases, the message lists the
-    names that exist in one folder only.
+    or all equal. Raises ``error`` if a folder is missing or empty, if both folders are the same, if
+    the numbers of images differ, or if only some names are equal. In the last two cases, the
+    message lists the names that exist in one folder only.
     """
     if Path(left).resolve() == Path(right).resolve():
         raise error(

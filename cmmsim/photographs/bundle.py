@@ -33,7 +33,7 @@ RIG = len(PARAMETER_NAMES)
 
 @dataclass(frozen=True)
 class Observations:
-    """m observations, each of the centres of one sticker in both images of a pair.
+    """Observations of stickers, m of them, each in both images of a pair.
 
     pair         (m,), index of the pair
     sticker      (m,), index of the sticker; those of the base precede those of the platform

@@ -25,7 +25,7 @@ SAME_PX = 1.5
 # Shifts between the two folders that are tried, in images; positive if the left camera started
 # later.
 SHIFTS = (1, -1, 2, -2)
-# Point spreads that are tried for images that do not fit, px.
+# Standard deviations of the point spreads that are tried for images that do not fit, px.
 SPREADS = (0.3, 0.45, 0.6, 0.8, 1.0, 1.3)
 
 
@@ -97,7 +97,7 @@ def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str
     """Return a text about a wrong noise or point spread in the sensor file, or an empty text.
 
     Measuring rejects stickers whose grey values differ too much from a blurred disc. The text names
-    the point spread that fits best. It is empty for a simulated exposure without images.
+    the point spread that fits best. For a simulated exposure without images, the text is empty.
     """
     chi2 = _misfit(spots)
     limit = observer.settings.limits.largest_misfit

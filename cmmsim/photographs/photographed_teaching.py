@@ -38,9 +38,9 @@ from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
 FEWEST_PAIRS = 3
-# Largest number of pairs that are used. A video has more, of which some are selected evenly.
+# Largest number of pairs that are used. If there are more, this many are selected evenly.
 MOST_PAIRS = 500
-# A warning is given if the squared residuals exceed the stated noise by this factor.
+# A warning is given if squared residuals exceed those of the stated noise by this factor.
 LARGEST_FACTOR = 1.5
 # A warning is given if the radius of stickers differs from the stated one by more than this
 # fraction.
