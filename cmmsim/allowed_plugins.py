@@ -196,11 +196,11 @@ def find(
     if not callable(function):
         raise CmmError(f"{label} is of type {type(function).__name__}, which cannot be called")
     carried = [field for field in number_fields if hasattr(own, field.name)]
-    values = {field.name: _figure(label, own, field) for field in carried}
+    values = {field.name: _number(label, own, field) for field in carried}
     return kind(name, PluginFunction(label, function, CmmError, (CmmError,), check), **values)
 
 
-def _figure(part: str, owner: Any, field: Any) -> Any:
+def _number(part: str, owner: Any, field: Any) -> Any:
     """Return a number that is an attribute of a user's own function, such as ``bias_px``."""
     value = getattr(owner, field.name)
     kind = type(field.default)

@@ -284,7 +284,7 @@ class Teacher:
             worst = self.platform.sticker_ids[distances.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {distances.max() * 1e6:.0f} um off its "
-                f"place, allowed are {limit * 1e6:.0f} um; perhaps it is partly hidden"
+                f"expected position, at most {limit * 1e6:.0f} um is possible; is it partly hidden?"
             )
 
 

@@ -52,9 +52,9 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
     ]
     limits = {
         k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
-        for k, v in _figures(values[drawn]).items()
+        for k, v in _mean_rms_p95(values[drawn]).items()
     }
-    by_name = {name: float(value) for name, value in _figures(values).items()}
+    by_name = {name: float(value) for name, value in _mean_rms_p95(values).items()}
     return Statistics(
         len(values),
         **by_name,
@@ -63,7 +63,7 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
     )
 
 
-def _figures(values: Array) -> dict[str, Array]:
+def _mean_rms_p95(values: Array) -> dict[str, Array]:
     """Return mean, root mean square and 95th percentile of values (..., n)."""
     return {
         "mean": np.mean(values, axis=-1),

@@ -37,13 +37,13 @@ FEWEST_CHARUCO = 6
 # A view is rejected if a measured point is farther than this from the pixel that the homography of
 # the board predicts. The unit is the distance between neighbouring points.
 LARGEST_POINT_GAP = 0.25
-# Largest relative difference between the measured and the given radius of the dots. A larger one
-# would make the correction of the dots' centres wrong by more than 20 %.
+# A measured radius contradicts the board file if it differs by more than this fraction. The
+# correction of the dots' centres would then be wrong by more than 20 %.
 LARGEST_RADIUS_GAP = 0.1
 
 FIT_ITERATIONS = 5
-# Radius of the part of the image that is fitted around a dot, in dot radii. Its pixels beyond
-# GROUND_FROM dot radii belong to the background.
+# Radius of the part of the image that is fitted around a dot, in dot radii. The pixels of
+# this part beyond GROUND_FROM dot radii belong to the background.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
 # Standard deviations of blur that are tried, and the number of dots on which they are tried.
@@ -111,7 +111,7 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
         )
     if found is None:
         squares = board.kind == "chessboard" and counts_squares(grey, board.columns, board.rows)
-        hint = ", but one with a corner less each way: count inner corners, not squares"
+        hint = ", but one with a corner less in each row and column: count inner corners"
         return f"no {board.kind} of {board.columns} x {board.rows} found{hint if squares else ''}"
     measured = np.isfinite(found).all(axis=1)
     fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(found)

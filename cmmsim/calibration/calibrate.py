@@ -300,7 +300,7 @@ def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
     if len(unused) <= LARGEST_UNUSED * len(pairs):
         return []
     return [
-        f"{len(unused)} of {len(pairs)} pairs are not used, the first is {unused[0].name} "
+        f"in {len(unused)} of {len(pairs)} pairs an image is not used, first in {unused[0].name} "
         f"({unused[0].reasons}): does the board have {board.columns} columns and {board.rows} rows "
         "as its file states?"
     ]

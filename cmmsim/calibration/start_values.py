@@ -30,8 +30,8 @@ ALIKE_PX = 2.0
 ALIKE_ANGLE = 0.06
 ALIKE_SHIFT = 0.12
 MISFIT = (
-    "the two poses of the board fit no other pair: the images do not belong together, or the board "
-    "moved between the exposures"
+    "the right camera's pose from this pair differs from that of most pairs: the images do not "
+    "belong together, or the board moved between the exposures"
 )
 
 
@@ -51,7 +51,7 @@ def start_values(
     """
     left, in_left = _one_camera(board, pairs, 0, size, radial_terms, fix_aspect)
     right, in_right = _one_camera(board, pairs, 1, size, radial_terms, fix_aspect)
-    read, in_right, right_from_left = _read_alike(board, pairs, in_left, in_right)
+    read, in_right, right_from_left = _with_agreeing_orders(board, pairs, in_left, in_right)
     right_from_left = _stereo(board, read, (left, right), size, right_from_left)
     # Boards that no camera sees get any pose, which is not used.
     boards = [
@@ -105,7 +105,7 @@ def _one_camera(
     ]
     if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(poses).all()):
         raise CalibrationError(
-            f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
+            f"OpenCV's {SIDES[side]} camera is not valid (focal lengths {values[:2]}): show the "
             "board tilted to several sides"
         )
     return values, dict(zip(views, poses, strict=True))
@@ -141,7 +141,7 @@ def _distance(a: BoardView, b: BoardView) -> float:
     return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
 
 
-def _read_alike(
+def _with_agreeing_orders(
     board: Board,
     pairs: Sequence[PairView],
     from_left: dict[int, Array],
@@ -160,7 +160,7 @@ def _read_alike(
     rigs = np.stack(
         [from_right[k] @ symmetry_motions[j] @ invert(from_left[k]) for k, j in candidates]
     )
-    alike = _alike(rigs)
+    alike = _nearly_equal(rigs)
     pair_of = np.array([k for k, _ in candidates])
     support = np.array([len(set(pair_of[row])) for row in alike])
     angle = _angles(rigs, np.eye(3)[None])[:, 0]
@@ -201,7 +201,7 @@ def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
     return rigid(turn, points[0] - turn @ renamed[0])
 
 
-def _alike(places: Array) -> Array:
+def _nearly_equal(places: Array) -> Array:
     """Return a mask (n, n). Entry (i, j) is True if transforms i and j are nearly equal.
 
     The transforms ``places`` are (n, 4, 4).

@@ -42,10 +42,10 @@ class Lens(Section):
         None, "m", "depth in focus; without it, the distance from the cameras to rig.target"
     )
     ghost: Annotated[float, Bounds(0.0, 0.9)] = quantity(
-        0.0, "", "share of the light that appears again beside its place, by a reflection"
+        0.0, "", "light of the ghost, a copy by reflection, as a fraction of the image's light"
     )
     ghost_offset_px: tuple[Offset, Offset] = quantity(
-        (6.0, 4.0), "px", "place of the ghost relative to the image, whole pixels"
+        (6.0, 4.0), "px", "offset of the ghost from the image, whole pixels"
     )
     known: bool = quantity(True, "", "true if the estimator knows aperture, focus and ghost")
 
@@ -63,12 +63,12 @@ class Lens(Section):
 class Lamp(Section):
     """Lamp that shines on the stickers, at a position, or in a direction if it is far away."""
 
-    place: Vector3 | None = quantity(None, "m", "place of the lamp in the base frame")
+    place: Vector3 | None = quantity(None, "m", "position of the lamp in the base frame")
     direction: Direction3 | None = quantity(
         None, "", "direction from the scene to a lamp that is far away, in the base frame"
     )
     strength: Annotated[float, Bounds(0.0, 10.0)] = quantity(
-        1.0, "", "share of its grey level that a face at rig.target has if it looks at the lamp"
+        1.0, "", "fraction of its grey level that a face at rig.target has if it faces the lamp"
     )
 
     @model_validator(mode="after")
@@ -90,7 +90,9 @@ class Light(Section):
     """
 
     lamps: tuple[Lamp, ...] = quantity((), "", "lamps")
-    ambient: Share = quantity(0.0, "", "share of the grey level without any lamp, where lamps are")
+    ambient: Share = quantity(
+        0.0, "", "fraction of the grey level without lamp light; used only with lamps"
+    )
     fall_off: Annotated[float, Bounds(0.0, 20.0)] = quantity(
         0.0, "", "power of the cosine of the angle of view with which stickers become darker"
     )

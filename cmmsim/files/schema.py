@@ -240,9 +240,9 @@ class Stickers(Section):
     radius: Length = quantity(..., "m", "radius of a sticker")
     ring_radius: Length = quantity(..., "m", "radius of the dark ring around a sticker")
     placement: tuple[Distance, Distance] = quantity(
-        (0.0, 0.0), "m", "smallest and largest distance of a sticker from its nominal place"
+        (0.0, 0.0), "m", "smallest and largest distance of a sticker from its nominal position"
     )
-    placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "seed of the stickers' places")
+    placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "seed of the stickers' positions")
     sticker_level: Level = quantity(..., "", "grey level of stickers, 0 to 255")
     ring_level: Level = quantity(..., "", "grey level of the dark rings, 0 to 255")
     body_level: Level = quantity(..., "", "grey level of platform and base, 0 to 255")

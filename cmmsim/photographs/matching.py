@@ -384,7 +384,7 @@ def _missing(
             )
         elif sticker not in found:
             count = int(seen[near[0]].sum()) if len(near) else 0
-            reasons[sticker] = f"found in {count} of {len(names)} pairs near its rough place"
+            reasons[sticker] = f"found in {count} of {len(names)} pairs near its rough position"
     return reasons
 
 

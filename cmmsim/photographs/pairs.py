@@ -103,9 +103,9 @@ class Format:
             return np.ascontiguousarray(colours[..., 0])
         if self.colour is None:
             raise PhotographError(
-                f"{name} has colours: say how to make grey values of them, by colour "
-                f"{', '.join(COLOURS)} (one channel of a camera with a colour filter has gaps "
-                "that were filled in, so grey values of colours are less exact)"
+                f"{name} has colours: say how they become grey values, by the option colour: "
+                f"{', '.join(COLOURS)} (cameras with a colour filter interpolate each channel, so "
+                "grey values from colours are less exact)"
             )
         channel = COLOURS[self.colour]
         if channel is not None:

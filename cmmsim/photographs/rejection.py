@@ -70,7 +70,7 @@ def adjust_robustly(
 ) -> Judged:
     """Adjust a state to the observations that agree; ``names`` (K,) are those of the pairs.
 
-    If the noise is enlarged, the ``factor`` of the result is that before. Raises LostError if fewer
+    The ``factor`` of the result is that before the noise is enlarged. Raises LostError if fewer
     than two pairs remain.
     """
     kept = np.ones(len(seen.pair), dtype=bool)
@@ -103,7 +103,7 @@ def adjust_robustly(
 def _worst(seen: Observations, squares: Array) -> NDArray[np.int_]:
     """Return the indices of the observations that are left out next.
 
-    A wrong centre pulls the place of its sticker and the pose of its pair, so that right centres
+    A wrong centre pulls the position of its sticker and the pose of its pair, so that right centres
     seem wrong as well. A centre is therefore left out only if it is nearly the worst of its sticker
     and, on the platform, the worst of its pair.
     """
@@ -132,7 +132,9 @@ def _left_out(
         if moved := _movement(seen.selected(own), state, names):
             stickers[sticker] = moved
         elif kept[own].mean() < LARGEST_SHARE:
-            stickers[sticker] = "does not fit to the other stickers: hidden, damaged, or not round?"
+            stickers[sticker] = (
+                "does not agree with the others: is it hidden, damaged or not round?"
+            )
     kept[np.isin(seen.sticker, list(stickers))] = False
     judged = seen.moves & ~np.isin(seen.sticker, list(stickers))
     for pair in np.unique(seen.pair[judged]).tolist():

@@ -301,7 +301,7 @@ class Finding:
                 f"stickers are not where the cameras should see them, noticed after "
                 f"{self.noticed_s:.2f} s, and a movement of {MOST_NAMED} parameters of the cameras "
                 f"explains only {100 * self.explained:.0f} % of it: more likely, the detection of "
-                f"the stickers or their places are wrong {alarm}"
+                f"the stickers or their positions are wrong {alarm}"
             )
         moved = ", ".join(map(str, self.movements))
         since, what = (

@@ -168,7 +168,7 @@ def test_a_plane_with_fewer_than_three_stickers_is_named(sensor, good):
         pairs.append(without(pair, sensor.rig.project(places)[0][1]))
     said = cause(sensor, pairs)
     assert "platform: plane C has 2 stickers that can be used, at least 3 are needed" in said
-    assert "C1 of the platform found in 0 of 8 pairs near its rough place" in said
+    assert "C1 of the platform found in 0 of 8 pairs near its rough position" in said
 
 
 def test_images_without_spots_and_a_platform_that_stands_are_reported(sensor, good):

@@ -145,7 +145,7 @@ def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons():
     worse[7] = PairView("07.png", noisy, pairs[7].right)
     found = calibrate(BOARD, worse, SIZE)
     assert set(found.rejected) == {"03.png", "07.png"}
-    assert "fit no other pair" in found.rejected["03.png"]
+    assert "from that of most pairs" in found.rejected["03.png"]
     assert re.fullmatch(
         r"left: rms 2\.\d\d px, more than 4 times the median of 0\.0\d px", found.rejected["07.png"]
     )
@@ -254,7 +254,9 @@ def test_many_pairs_not_used_are_warned_of_with_the_board_of_the_file():
     ]
     assert not lines_with("not used", pairs=fewer[0])
     (line,) = lines_with("not used", pairs=fewer[1])
-    assert line.startswith(f"5 of 12 pairs are not used, the first is 00.png (right: {NONE})")
+    assert line.startswith(
+        f"in 5 of 12 pairs an image is not used, first in 00.png (right: {NONE})"
+    )
     assert "9 columns and 7 rows" in line
 
 

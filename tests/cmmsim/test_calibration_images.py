@@ -201,7 +201,7 @@ def test_a_chessboard_whose_squares_were_counted_in_place_of_its_corners_is_told
     image = np.pad(255 * squares, 60, constant_values=255).astype(np.uint8)
     said = find_board(image, Board(kind="chessboard", columns=9, rows=7, spacing=0.05))
     assert said.endswith(
-        "9 x 7 found, but one with a corner less each way: count inner corners, not squares"
+        "9 x 7 found, but one with a corner less in each row and column: count inner corners"
     )
     right = find_board(image, Board(kind="chessboard", columns=8, rows=6, spacing=0.05))
     assert len(right.index) == 48
