@@ -18,9 +18,9 @@ class Part(NamedTuple):
 
     The name is, for example, link1 or link1a. `leg` is the index of the leg, and `body` is the row
     of the body in the layout of the robot. `offset` (3,) is the vector from the joint of the body
-    to the joint of the part, in the axes of the body before, m. `share` is the part's share of the
-    parameters of the body. `before` is the index of the part to which this part is connected, or -1
-    for the base. `last` is True if the part ends at the platform.
+    to the joint of the part, in the axes of the body before, m. `share` is the fraction of the
+    body's parameters that the part has. `before` is the index of the part to which this part is
+    connected, or -1 for the base. `last` is True if the part ends at the platform.
     """
 
     name: str

@@ -90,10 +90,7 @@ def real(
     above: float | None = None,
     unit: str = "",
 ) -> float:
-    """Value as a finite float, >= least or > above if these are given. Raises `error` otherwise.
-
-    In the message, `unit` follows the value. It begins with a space, as in " m".
-    """
+    """Value as a finite float, >= least or > above if these are given. Raises `error` otherwise."""
     limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise error(f"{name} is {shown(value)}{unit}, must be a number{limit}")

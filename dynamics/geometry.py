@@ -17,8 +17,7 @@ from dynamics.legs.leg import Leg
 from dynamics.parameter_set import EXACT, Unstated
 from dynamics.parameters import ParameterLayout, parameter_layout
 
-# Difference, m, of each coordinate of joints B and A below which two legs coincide.
-SAME_PLACE = 1e-6
+SAME_PLACE = 1e-6  # difference, m, of all coordinates of B and A below which legs coincide
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +35,9 @@ class RobotGeometry:
     between this model and the real bodies and joints. `meshes` are drawn in place of the rods of
     bodies of the legs.
 
-    Raises RobotFileError, with legs and numbers, for numbers that are not finite, if the legs do
-    not match each other or the freedoms of the chart, if two legs coincide, if a leg cannot reach
-    the home pose or is singular there, or for a mesh of an unknown body. Raises ParameterError for
-    unknown names in `full_bodies` or `passive_friction`.
+    Raises RobotFileError, with legs and numbers, for numbers that are not finite, for a mesh of an
+    unknown body, and if legs do not match each other or the chart, coincide, cannot reach the home
+    pose or are singular there. Raises ParameterError for unknown full bodies or passive friction.
     """
 
     legs: tuple[Leg, ...]

@@ -64,10 +64,7 @@ class Friction(Strict):
 
 
 class PassiveFriction(Strict):
-    """Dry friction, N m, and viscous friction, N m s/rad, of a passive joint of all legs or one.
-
-    None means that the robot has no such parameter.
-    """
+    """Dry friction, N m, and viscous friction, N m s/rad, of a passive joint. None means zero."""
 
     coulomb: Force | None = None
     viscous: Damping | None = None

@@ -193,11 +193,7 @@ class ParameterLayout:
         return tuple(slice(end - count, end) for end, count in zip(ends, counts, strict=True))
 
     def bodies_of(self, rigid: np.ndarray) -> np.ndarray:
-        """Inertial parameters (..., bodies, 10) of all bodies as full bodies.
-
-        `rigid` (..., r or more) begins with the inertial parameters. Entries that a centred body
-        does not have are zero.
-        """
+        """Inertial parameters (..., bodies, 10) as of full bodies, zero where a body lacks one."""
         full_bodies = np.zeros((*rigid.shape[:-1], len(self.bodies), len(FULL_INERTIAL)))
         for body, rows in enumerate(self.body_slices):
             full_bodies[..., body, ALL_TEN if self.full[body] else CENTRED] = rigid[..., rows]
@@ -305,7 +301,7 @@ class ParameterLayout:
 
 
 def may_be_absent(name: str) -> bool:
-    """Return True for a parameter that a layout can lack, because its value is then zero.
+    """Return True for a parameter that a layout can lack. Its value is then zero.
 
     These are first moments and products of inertia, and the friction of passive joints.
     """

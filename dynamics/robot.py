@@ -69,7 +69,7 @@ class Robot(RobotDynamics):
     parameter_sets : dict
         All sets of the robot file by name.
     layout : ParameterLayout
-        Position and unit of each parameter.
+        Names, order and units of the parameters.
     geometry : RobotGeometry
         Joints, legs and chart.
     functions_of : RobotGeometry

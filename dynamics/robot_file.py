@@ -177,10 +177,7 @@ def plural(name: str) -> str:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """Content of a robot file: name, geometry and parameter sets.
-
-    Raises RobotFileError for a name that cannot be used as a file name.
-    """
+    """Content of a robot file. Raises RobotFileError for a name that cannot be a file name."""
 
     name: str
     geometry: RobotGeometry

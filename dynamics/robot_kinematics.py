@@ -124,7 +124,7 @@ class RobotKinematics(RobotPlatform):
         Returns
         -------
         ndarray, shape (k, 6)
-            Poses, of which the position of the first is nearest to home. k is 0 if none is found.
+            Poses, sorted by the distances of their positions from home. k is 0 if none is found.
 
         Raises
         ------

@@ -1,9 +1,10 @@
 """Robot with other lengths than a given robot.
 
-Seen from above, joints keep their directions from the middle of the robot. Cranks and sliders keep
-their axes. All joint coordinates are zero at home. There, a crank with a vertical axis is at right
-angles to its link, as seen from above, because it then moves the platform best. All other cranks
-keep their direction. `scaled_bodies` says what becomes of the bodies.
+Seen from above, joints keep their directions from the middle of the robot, other than the base
+joints of a planar robot. Cranks and sliders keep their axes. All joint coordinates are zero at
+home. There, a crank with a vertical axis is at right angles to its link, as seen from above,
+because it then moves the platform best. All other cranks keep their direction. `scaled_bodies` says
+what becomes of the bodies.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +48,7 @@ VERTICAL_TOLERANCE = 1e-9  # largest difference from 1 of the vertical component
 
 
 def lengths_of(geometry: RobotGeometry) -> dict[str, float]:
-    """Lengths of a robot, m, by name. They are those of its first leg, because all must agree."""
+    """Lengths of a robot, m, by name. They are read from leg 1, because all legs must agree."""
     leg = geometry.legs[0]
     radii = [np.hypot(*joint[:2]) for joint in (leg.base_joint, leg.platform_joint)]
     lengths = dict(zip(RADII, map(float, radii), strict=True))
@@ -170,10 +171,7 @@ def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
 
 
 def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> np.ndarray:
-    """Base joint of a planar leg whose crank is at right angles to its link at home.
-
-    Raises RobotFileError if there is none on the circle of the base joints.
-    """
+    """Base joint of a planar leg, its crank square to its link at home. Raises RobotFileError."""
     base_radius, platform_radius = (new[name] for name in RADII)
     span = np.hypot(new["crank"], new["link"])
     nearest, farthest = abs(base_radius - platform_radius), base_radius + platform_radius
@@ -239,10 +237,7 @@ def _check_stroke(leg: Leg) -> None:
 
 
 def _within_limits(robot: Robot) -> Robot:
-    """Robot with a travel limit so small that no sampled pose is near a singularity.
-
-    Raises RobotFileError if the limit would be below `LEAST_TRAVEL` times the original one.
-    """
+    """Robot whose travel limit keeps sampled poses from singularities. Raises RobotFileError."""
     limit = robot.travel_limit
     while True:
         geometry = replace(robot.geometry, travel_limit=limit)

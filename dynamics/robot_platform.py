@@ -341,8 +341,7 @@ class RobotPlatform:
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
         """Output (rows, columns) of a function, or (N, rows, columns) if an argument is a batch.
 
-        Raises ShapeError for batches of different lengths, and SingularPoseError if output 0 is
-        not finite.
+        Raises ShapeError for unequal batches, and SingularPoseError if output 0 is not finite.
         """
         batched = [argument.shape[0] for argument in arguments if argument.ndim == 2]
         if len(set(batched) - {1}) > 1:

@@ -94,7 +94,7 @@ class WorkspaceMeasures:
 class Extreme:
     """Point of a motion that is nearest to a limit.
 
-    `row` is the row of the motion. `time` is in s, and NaN if no times are given. `leg` is 1 to n,
+    `row` is the index of the pose. `time` is in s, and NaN if no times are given. `leg` is 1 to n,
     and None if the value belongs to no single leg.
     """
 

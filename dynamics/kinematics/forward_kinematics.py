@@ -16,7 +16,7 @@ from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
 from dynamics.kinematics.platform import Chart
 
-# Largest entry of a step, m or rad, at which the iteration ends.
+# The iteration ends when no entry of a step, m or rad, is larger than this.
 STEP_TOLERANCE = 1e-12
 # Residual of a joint coordinate, rad or m, below which a pose counts as a solution.
 ANGLE_TOLERANCE = 1e-12
@@ -93,8 +93,8 @@ def assembly_modes(
     """Distinct poses (k, 6) with joint coordinates theta (n,), found from random starts.
 
     The starts are in a cube about `centre` (3,), which reaches `radius`, m, in each direction, with
-    any orientation that the chart allows. Each pose is checked by the inverse kinematics. The
-    position of the first pose is nearest to home.
+    any orientation that the chart allows. Each pose is checked by the inverse kinematics. Poses are
+    sorted by the distances of their positions from home.
     """
     rng = np.random.default_rng(seed)
     turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")

@@ -74,7 +74,7 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
     changes = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
     if leg.turned:
         between = _frame(nominal).T @ _frame(leg)
-        # only the axis of this leg is rotated: Rx(u) Ry(v) z
+        # this leg has no zero direction, and its axis is Rx(u) Ry(v) z in the nominal frame
         if len(leg.turned) == 1:
             x, y, z = between[:, 2]
             turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]

@@ -51,7 +51,7 @@ EXACT = 1e-12
 
 
 def _direction(value: object) -> np.ndarray:
-    """Unit vector of three numbers. Raises ValueError."""
+    """Unit vector along three numbers. Raises ValueError if their length is far from 1."""
     array = _vector(value)
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > ROUNDED:

@@ -50,10 +50,8 @@ CONDITIONING = "conditioning"
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
     """Return the indices of the stickers that must stay visible.
 
-    In each plane, they are the stickers that are farthest from the limits of visibility at home.
-
-    Raises TrajectoryError if too few stickers of a plane are visible at home. The message names the
-    plane.
+    In each plane, they are those farthest from their limits at home. Raises TrajectoryError if too
+    few stickers of a plane are visible at home. The message names the plane.
     """
     shares = np.array(
         _shares_function(sight, range(len(sight.platform.sticker_ids)))(home)
@@ -88,11 +86,9 @@ def visibility_shares(sight: SightLines, stickers: list[int], pose: ca.SX) -> ca
     for k in stickers:
         position = rotation @ platform.nominal[k] + pose[0:3]
         normal = rotation @ platform.sticker_normals[k]
-        for camera, camera_from_base in zip(
-            sight.rig.cameras, sight.cameras_from_base, strict=True
-        ):
-            seen = camera_from_base[:3, :3] @ position + camera_from_base[:3, 3]
-            facing = -ca.dot(seen, camera_from_base[:3, :3] @ normal) / ca.norm_2(seen)
+        for camera, transform in zip(sight.rig.cameras, sight.cameras_from_base, strict=True):
+            seen = transform[:3, :3] @ position + transform[:3, 3]
+            facing = -ca.dot(seen, transform[:3, :3] @ normal) / ca.norm_2(seen)
             pixel = seen[0:2] / seen[2] * camera.focal_lengths + camera.centre
             half = np.array([camera.width - 1, camera.height - 1]) / 2
             rows += [(1 - facing) / (1 - GRAZING), (pixel - half) / (half - EDGE_PX)]
@@ -111,10 +107,10 @@ def sees_required_stickers(sight: SightLines, stickers: list[int], home: Array, 
     shifts = np.linalg.norm(box[:3]) + turn * np.linalg.norm(
         sight.platform.nominal[stickers], axis=1
     )
-    for camera, camera_from_base, used in zip(
+    for camera, transform, used in zip(
         sight.rig.cameras, sight.cameras_from_base, shares.swapaxes(0, 1), strict=True
     ):
-        seen = apply(camera_from_base, positions)
+        seen = apply(transform, positions)
         # Smallest possible depth of the sticker, at which a shift moves its image most.
         nearest = seen[:, 2] - shifts
         if (nearest <= 0).any():

@@ -18,9 +18,8 @@ joint controller are not included.
 
 H_1 is divided by a triangular matrix R, the factor of the QR factorisation of H_1 for the
 trajectory `typical`. This removes the units of the parameters and makes H_1^T H_1 well conditioned.
-The inverse of R is rounded to numbers on which all processors agree. Twice the logarithm of the
-determinant of this rounded inverse is then subtracted from ln det, so that the index does not
-change.
+The inverse of R is rounded to numbers on which all processors agree. To keep the index unchanged,
+twice the logarithm of the determinant of this rounded inverse is subtracted from ln det.
 
 A run of whole periods is sampled over one period, because the index does not depend on the number
 of periods. Any other run is sampled from start to end.
@@ -66,9 +65,8 @@ class Criterion:
 
     value   Function z -> logarithm of the criterion.
     smooth  Differentiable approximation of `value`.
-    judge   More accurate measure by which the results of a gradient search are ranked; larger is
-            better. It raises TrajectoryError for a trajectory that cannot be judged. If None,
-            `value` ranks them.
+    judge   More accurate measure, or None for `value`, that ranks the results of a gradient search.
+            Larger is better. It raises TrajectoryError for a trajectory that cannot be judged.
     """
 
     value: ca.Function

@@ -90,7 +90,7 @@ class Knowledge:
 
     start                Name of the parameter set of the guess.
     guess                Initial guess of the parameters.
-    settings             Loop of the model.
+    settings             Settings of the loop around the model.
     times (N,)           Times of the frames of the run, s.
     covariance (6, 6)    Covariance of a measured pose, m and rad.
     scaled_prior (p, p)  Information of the prior in units of its standard deviations.

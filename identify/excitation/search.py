@@ -135,7 +135,8 @@ MOST_MEMBERS = 32  # largest size of the population. Larger populations converge
 # Fraction of the unknowns that a trial takes from its mutant. It is the best of several values that
 # were tried with MOST_MEMBERS.
 RECOMBINATION = 0.9
-NOT_ADMISSIBLE = 1e6  # cost of a member that violates a limit, larger than any value of a criterion
+# Least cost of a member that violates a limit. It is larger than any value of a criterion.
+NOT_ADMISSIBLE = 1e6
 
 
 def evolve(
@@ -230,7 +231,7 @@ def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progre
     """Return the best result of IPOPT from the best candidates.
 
     Criterion and constraints have exact derivatives. The Hessian is approximated from gradients
-    (limited memory). A criterion with 48 unknowns then converges in some tens of iterations, while
+    (limited memory). A criterion with 48 unknowns then converges in a few tens of iterations, while
     an exact Hessian of a regressor would take longer. There are several starts because the
     criterion has many local optima.
 

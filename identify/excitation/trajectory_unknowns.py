@@ -6,7 +6,7 @@ n - 1 free directions, together 2 (n - 1) for each coordinate. The m coordinates
 
     q(t) = home + D Z B_0(t)^T,    q_dot(t) = D Z B_1(t)^T,    q_ddot(t) = D Z B_2(t)^T.
 
-D is the diagonal matrix of their amplitudes. Z is a dimensionless matrix (m, 2 (n - 1)). The bases
+D is the diagonal matrix of `Unknowns.box`. Z is a dimensionless matrix (m, 2 (n - 1)). The bases
 B_0, B_1 and B_2 are those of `Unknowns.basis`. The unknowns z are the 2 m (n - 1) entries of Z, row
 by row. They correspond one-to-one to the trajectories with a smooth start at home.
 """

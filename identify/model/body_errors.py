@@ -53,7 +53,7 @@ class BodyError:
 
 
 def body_error_stds(robot: Robot, model: Model, kinds: tuple[str, ...]) -> dict[str, float]:
-    """Return the standard deviations of the errors of bodies and passive joints, of some kinds.
+    """Return, by name, the standard deviations of some kinds of errors of bodies and joints.
 
     They are those of the model or, if it states none, of the robot file. Errors that are assumed to
     be zero are left out. Raises the ScenarioError of `check_parameter_set`.

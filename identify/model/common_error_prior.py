@@ -41,9 +41,7 @@ if TYPE_CHECKING:
 
 Run = TypeVar("Run", bound="LoopModel")
 
-# Smallest scale of the commands, and smallest ratio of the Stribeck velocity to its stated value,
-# that a model can contain.
-LEAST_SCALE = 0.1
+LEAST_SCALE = 0.1  # smallest factor of the commands, or of the stated Stribeck velocity, in a model
 
 
 def with_recorded_errors(
@@ -124,8 +122,8 @@ def zero_name(joint: int, unit: str) -> str:
 def _friction_stds(robot: Robot, model: Model) -> dict[str, float]:
     """Return, by name, the standard deviations of constants of friction.
 
-    These are the constants of its law, and the offset of the friction of each joint. Raises
-    ScenarioError for a law of friction or of the drives that does not have them.
+    These are the constants of the law of friction, and the offset of the friction of each joint.
+    Raises ScenarioError for a law of friction or of the drives that does not have them.
     """
     velocity = f"{STRIBECK_VELOCITY}_{robot.layout.joint_unit}/s"
     stds: dict[str, float] = {

@@ -19,8 +19,8 @@ from identify.runtime import in_threads
 if TYPE_CHECKING:
     from identify.model.loop_model import LoopModel
 
-# Step of the differences in a constant of the law of friction, in standard deviations. The step in
-# other errors is one standard deviation. The motion is far from linear in constants of friction.
+# Step of the differences in a constant of friction, in standard deviations. It is small because the
+# motion is far from linear in such a constant. The step in other errors is one standard deviation.
 FRICTION_STEP = 1e-4
 
 

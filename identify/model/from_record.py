@@ -154,7 +154,7 @@ def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
 def _settings(settings: LoopSettings, acting: Array) -> LoopSettings:
     """Return the settings of a loop whose commands act at given times (M,), without a latency.
 
-    The rate of commands is the frame rate, unless the times show another one.
+    The frame rate is kept, unless the times show another rate of commands, which then replaces it.
     """
     rate_hz = settings.timing.frame_rate_hz
     shown_hz = mean_rate(acting)

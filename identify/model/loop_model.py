@@ -62,7 +62,7 @@ class LoopModel(Residuals):
                                     `with_common_errors` computes them.
     groups                          Combinations of the inertial parameters on which the motion
                                     depends. If they are given, sensitivities are with respect to
-                                    their pivots and to all other parameters.
+                                    their pivots and to the parameters that are not inertial.
     """
 
     robot: Robot
@@ -94,7 +94,7 @@ class LoopModel(Residuals):
         return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return a copy with common errors (k,), in standard deviations, raised to their limits."""
+        """Return a copy with common errors (k,), in standard deviations, clipped at the limits."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         other = replace(self, drawn=contained, marginal=None)
         if not other.errors_had[other.contained].size:
@@ -185,7 +185,7 @@ class LoopModel(Residuals):
 
     @property
     def contained(self) -> slice:
-        """Indices of the common errors that move the model. Those of poses move it by its servo."""
+        """Slice of common errors that move the model. Errors of poses do so only with a servo."""
         return slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
 
     def in_deciding_stds(self, change: Array) -> Array:
@@ -218,15 +218,13 @@ class LoopModel(Residuals):
         if sensitivities:
             return self.along(parameters)
         given = *self.moving(parameters, robot or self.robot), self.reference, self._loop
-        latencies = self.latencies
+        late = self.latencies
         if self.driven:
             known = *given, self._commands(parameters), self._sensor
-            return simulate_commands(*known, latencies=latencies)
+            return simulate_commands(*known, latencies=late)
         fed = fed_forward(self, *given)
         # The servo always uses the robot that it knows, even if another robot moves.
-        return simulate_servo(
-            *given, self._sensor, servo_robot=self.robot, latencies=latencies, **fed
-        )
+        return simulate_servo(*given, self._sensor, servo_robot=self.robot, latencies=late, **fed)
 
     def along(self, parameters: Array, directions: Array | None = None) -> ClosedLoopRun:
         """Simulate the model with sensitivities, also along directions (N, n, k) of its commands.

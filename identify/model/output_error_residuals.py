@@ -75,10 +75,7 @@ class Residuals:
         return self.without_common(residual), self.without_common(jacobian)
 
     def of_all(self, shown: Array) -> Array:
-        """Return derivatives (..., p) by all parameters, from those by pivots and ungrouped ones.
-
-        Derivatives by all parameters are returned as they are.
-        """
+        """Return derivatives (..., p) by all parameters from those by pivots and ungrouped ones."""
         if self.groups is None or shown.shape[-1] == len(self.robot.layout.names):
             return shown
         return self.groups.of_all(shown)

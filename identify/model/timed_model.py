@@ -195,7 +195,7 @@ class TimedModel(LoopModel):
         runs = []
         for stretch in self.stretches:
             seen = np.round(self.times[stretch.rows], ROUNDING)
-            # Of commands that act before the start, the last two determine the rate of the last.
+            # Of the commands that act before the start, the latest two give the rate of the latest.
             newest = max(int(np.searchsorted(acting, seen[0], side="right")), 1)
             earlier = slice(max(newest - 2, 0), newest)
             inside = np.arange(newest, int(np.searchsorted(acting, seen[-1])))
@@ -209,7 +209,7 @@ class TimedModel(LoopModel):
             given = moved, values, still, settings, written
             more: dict[str, Any] = {"start": start, "times": events}
             if directions is not None:
-                # each event has the direction of the command that was written last
+                # each event has the direction of the latest command
                 rows = np.maximum(np.searchsorted(acting, events, side="right") - 1, newest - 1)
                 more |= {"directions": directions[rows], "start_directions": directions[newest - 1]}
             run = (
