@@ -151,8 +151,8 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
 
     Random poses, twists and accelerations excite every parameter that can be excited. The rows of a
     motion are the components of the wrench along the m coordinates in which the platform can move.
-    Raises EstimationError if the robot reaches the drawn poses for none of REACH_SHARES. The
-    message has the reason for the smallest.
+    Raises EstimationError if the robot reaches the drawn poses for none of REACH_SHARES, with the
+    reason for the smallest.
     """
     rng = np.random.default_rng(seed)
     chart = robot.geometry.chart

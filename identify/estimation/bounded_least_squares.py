@@ -128,7 +128,7 @@ def minimise(
 
     problem            Problem to minimise.
     start, lower (p,)  Parameters at the start, and their lower bounds.
-    scale (p,)         Typical size of a large change of each parameter.
+    scale (p,)         Large change of each parameter, and unit of the trust region's radius.
     criteria           Criteria by which the search stops.
     on_iteration       Function (number of the iteration, cost) that is called after each iteration.
     ahead              True if the problem can be linearised at a trial step before the step is

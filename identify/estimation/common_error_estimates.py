@@ -57,7 +57,7 @@ def errors_of_run(run: LoopModel, parameters: Array) -> Array:
 
 
 def errors_from_residuals(modes: Array, missed: Array) -> Array:
-    """Return the most likely errors (k,) of modes (m, k) and residuals (m,).
+    """Return the most likely errors (k,) for modes (m, k) and residuals (m,).
 
     Modes and residuals are in standard deviations of the noise alone.
     """

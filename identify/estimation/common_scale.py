@@ -61,9 +61,9 @@ def deviations(estimate: Array, covariance: Array, gain: int) -> tuple[Array, Ar
 def found_errors(identification: Mapping[str, Any]) -> tuple[float, float] | None:
     """Return the relative error of the common scale, and the largest one that is left without it.
 
-    Both are errors against the truth. The second is that of the parameters that share the scale,
-    in size. None is returned if there is no common scale, or if a true value or an estimate is zero
-    or unknown.
+    Both are errors against the truth. The second is the largest absolute one of the parameters that
+    share the scale. None is returned if there is no common scale, or if a true value or an estimate
+    is zero or unknown.
     """
     scale = identification.get(ENTRY)
     if scale is None:

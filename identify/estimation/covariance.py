@@ -51,7 +51,7 @@ from identify.progress import Advance
 from identify.runtime import in_threads
 
 NOISE, MODEL, LOAD, GUESS, ANCHOR = "noise", "model", "load", "guess", "anchor"
-"""Sources of uncertainty beside the common errors: noise of the poses, error of the model, error of
+"""Sources of uncertainty other than common errors: noise of the poses, error of the model, error of
 a known load, errors of the initial guess, and error of the scale anchor.
 """
 CORRELATED = "correlated"
@@ -269,10 +269,10 @@ def _noise(
     """Return the covariance (q, q) of the scores due to noise, and the misfit.
 
     The third result is the number of unstable repetitions. found: linearisation of each run, with
-    rows in the units of the scores. No experiment is repeated if logged commands drive all models,
-    because the residuals of noise alone are then white. They also count as white if the model's
-    error causes most of the residuals of LANES repetitions, or if the residuals are large and fewer
-    than FEWEST repetitions are stable. If they are not large, the latter raises EstimationError.
+    rows in the units of the scores. If logged commands drive all models, the residuals of noise
+    alone are white, and no experiment is repeated. They also count as white if the residuals of the
+    record are so large that the model's error decides, and the first repetitions confirm this or
+    fewer than FEWEST are stable. Otherwise, too few stable repetitions raise EstimationError.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))

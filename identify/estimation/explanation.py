@@ -11,7 +11,7 @@ residuals r with the Jacobian J and the autocorrelation R_k, the scores J^T r ha
 (Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J.
 Guidance, Control, and Dynamics 20(1), 1997), with R_k estimated from the residuals. The covariance
 due to the model's error is added to that due to noise. An error that is compensated by wrong
-parameters does not appear in the residuals. If the model's error makes most of the residual, no
+parameters does not appear in the residuals. If the model's error causes most of the residual, no
 interval can be trusted, and nothing counts as identified.
 
 A model driven by the logged commands has the same input as the plant. If it is right, its residuals
@@ -36,10 +36,10 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.files.dataset import POSE
 
 SIGNIFICANT = float(ndtri(0.999))
-"""Excess of the residual, in standard deviations, from which on the model has an error."""
+"""Excess of the residual, in standard deviations, above which the model has an error."""
 
 MISFIT_STDS = 5.0
-"""Deficit of the residual, in standard deviations, from which on the stated covariance is wrong."""
+"""Deficit of the residual, in standard deviations, above which the stated covariance is wrong."""
 
 NOISE_DECIDES = 3.0
 """Ratio of the residual to its expected value above which the model's error dominates."""
@@ -83,7 +83,7 @@ class Misfit:
 
     @property
     def decides(self) -> bool:
-        """True if the model's error makes most of the residual."""
+        """True if the model's error causes most of the residual."""
         return self.found > NOISE_DECIDES * self.expected
 
     def warnings(self, model: str = "the model") -> tuple[str, ...]:

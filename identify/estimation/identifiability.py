@@ -139,7 +139,7 @@ class GroupEstimates:
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """True for each group (rank,) that is identified only with the guess of parameters."""
+        """True for each group (rank,) that is identified only with the help of the guess."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
 
@@ -185,7 +185,7 @@ def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
 # Largest relative standard deviation of the common factor without a warning. Only the part due to
 # the initial guess counts, and only if an instrument was used to fix the factor.
 SCALE_KNOWN = 0.015
-# Largest relative standard deviation of the common factor without a warning, of all causes.
+# Largest relative standard deviation of the common factor, from all causes, without a warning.
 SCALE_WIDE = 0.03
 
 

@@ -56,7 +56,7 @@ Record: TypeAlias = xr.Dataset | str | PathLike[str]  # record, or the path of i
 
 @dataclass(frozen=True)
 class Asked:
-    """Records of an identification, and what the estimator knows beside them."""
+    """Records of an identification, and what else the estimator knows."""
 
     records: list[xr.Dataset]
     side: ModelSide

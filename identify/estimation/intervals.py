@@ -82,8 +82,8 @@ class BoundedEstimate:
     def probabilities(self, rows: Array, values: Array) -> Array:
         """Return the probabilities (n,) of rows (n, p) @ parameters < values (n,).
 
-        The stated distribution of each of these quantities is normal with
-        the moments of `TruncatedNormal.marginals`, truncated at the smallest allowed value.
+        The stated distribution of each of these quantities is normal with the moments of
+        `TruncatedNormal.marginals`, truncated at the smallest allowed value.
         """
         centre, std = self.within.marginals(rows)
         # Logarithms of upper tails keep their digits far below a bound.

@@ -2,11 +2,11 @@
 
 A model that is unstable, or that leaves the reach of the robot, has no output error over a whole
 record. Driven by the logged commands, such a model still has an output error over segments of half
-a second. Each segment starts from its own state, which is unknown like the parameters, except that
-the first segment of a record starts in equilibrium. A state holds the
-coordinates of the platform, their rates, and the integrals of the joint PID. For m coordinates and
-n joints these are s = 2 m + n numbers. The end of each segment must agree with the start of the
-next segment within the accuracy of the sensor, so that at the optimum the segments form one run.
+a second. The first segment of a record starts in equilibrium. Every other segment starts from its
+own state, which is unknown like the parameters. A state holds the coordinates of the platform,
+their rates, and the integrals of the joint PID. For m coordinates and n joints these are
+s = 2 m + n numbers. The end of each segment must agree with the start of the next segment within
+the accuracy of the sensor, so that at the optimum the segments form one run.
 
 In the linearised problem the states form a chain. They are eliminated one after the other by QR,
 which leaves a problem in the parameters alone (condensing; Bock and Plitt, "A multiple shooting
@@ -67,7 +67,7 @@ class Segment:
 
     @property
     def chart(self) -> Chart:
-        """Coordinates of the platform."""
+        """Chart of the platform's coordinates."""
         return self.run.robot.geometry.chart
 
     @property
@@ -133,11 +133,11 @@ def segments(run: LoopModel) -> list[Segment]:
     std = np.concatenate([coordinate_std, BANDWIDTH * coordinate_std, joint_std / BANDWIDTH])
     poses = run.reference.poses
     rates = run.reference.rates
-    found = []
+    chain = []
     for first, last in pairwise(edges):
         reference = Reference(poses[first : last + 1], rates[first : last + 1])
-        found.append(Segment(run, reference, int(first), int(last), std))
-    return found
+        chain.append(Segment(run, reference, int(first), int(last), std))
+    return chain
 
 
 def measured_states(chain: list[Segment], parameters: Array, low_pass: Filter) -> Array:

@@ -148,7 +148,7 @@ class IdentificationResult:
 
     @property
     def rests_on_prior(self) -> NDArray[np.bool_]:
-        """True for each parameter (p,) that is identified only with the guess of parameters."""
+        """True for each parameter (p,) that is identified only with the help of the guess."""
         return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
     @property

@@ -162,8 +162,8 @@ def two_steps(evidence: Evidence) -> Estimate:
 
     Both steps are weighted least squares. The first step holds friction at the initial guess.
     Errors of this guess bias the inertias (the two-step procedure that Li et al., Electronics 8(8),
-    836, 2019, section 1, quote for parallel robots). Each step takes the parameters that it holds
-    as exact, also in the standard deviations.
+    836, 2019, section 1, quote for parallel robots). In each step, the held parameters count as
+    exact, also in the standard deviations.
     """
     began = time.perf_counter()
     equations = measured_equations(evidence)

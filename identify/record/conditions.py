@@ -71,7 +71,7 @@ OPTIONAL: Variables = {
     )
 }
 
-CLOCK_S = 1e-6  # largest difference, s, of two clock readings of the same instant
+CLOCK_S = 1e-6  # largest difference, s, of two readings of a clock that counts as rounding
 SAME_S = 1e-9  # difference, s, below which latencies are the same
 
 
@@ -172,7 +172,7 @@ def read_finding(record: xr.Dataset) -> dict[str, Any] | None:
 
 
 def drift_warnings(records: Sequence[xr.Dataset]) -> tuple[str, ...]:
-    """Return the warnings in the findings of records. Raises RecordError as `read_finding`."""
+    """Return the warnings in the findings of records. Raises the RecordError of `read_finding`."""
     findings = [read_finding(record) for record in records]
     return tuple(
         found["warning"] for found in findings if found is not None and found["warning"] is not None

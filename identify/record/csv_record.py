@@ -19,7 +19,7 @@ from identify.errors import RecordError
 from identify.files.dataset import POSE
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
-# Rules for records of users.
+# Rules for users' tables, which templates and the documentation show.
 RULES = """\
 Units are m, rad and s. A pose is the pose of the platform frame in the base frame of the robot
 file, R = Rx(alpha) Ry(beta) Rz(gamma). The time of a row is the instant at which the sensor saw the
@@ -235,7 +235,7 @@ def _checked_header(
 
 
 def _meant(name: str, known: list[str]) -> str:
-    """Return a hint at the column that was probably meant, or else a list of all columns."""
+    """Return a hint about the column that was probably meant, or else a list of all columns."""
     stem = name.rpartition("_")[0]
     alike = [one for one in known if stem and one.startswith(f"{stem}_")]
     # For reference_x_mm the hint is reference_x_m, but for rate_x_mm it is not rate_x_m_s.

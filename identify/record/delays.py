@@ -55,26 +55,28 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
     step = max(float(np.median(np.diff(time))) / 2, FINEST_S)
     for reach in (min(CLOSE_S, duration), duration):
         lags = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
-        found = np.array(
+        correlations = np.array(
             [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
         )
         # If a lag near zero has a good correlation, larger lags are not tried.
-        if len(found) and found.max() > 1 - 5 * ALIKE:
+        if len(correlations) and correlations.max() > 1 - 5 * ALIKE:
             break
-    if not len(found) or found.max() <= 0:
+    if not len(correlations) or correlations.max() <= 0:
         return MotionLag(0.0, 0.0)
-    good = np.flatnonzero(found >= found.max() - ALIKE)
+    good = np.flatnonzero(correlations >= correlations.max() - ALIKE)
     nearest = good[np.argmin(np.abs(lags[good]))]
     # From the good lag nearest to zero, climb to the peak to which it belongs.
     best = int(nearest)
-    while 0 < best < len(lags) - 1 and found[best] < max(found[best - 1], found[best + 1]):
-        best += 1 if found[best + 1] > found[best - 1] else -1
+    while 0 < best < len(lags) - 1 and correlations[best] < max(
+        correlations[best - 1], correlations[best + 1]
+    ):
+        best += 1 if correlations[best + 1] > correlations[best - 1] else -1
     shift = 0.0
     if 0 < best < len(lags) - 1:
-        before, peak, after = found[best - 1 : best + 2]
+        before, peak, after = correlations[best - 1 : best + 2]
         curvature = before - 2 * peak + after
         shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return MotionLag(float(lags[best] + shift * step), float(found[best]))
+    return MotionLag(float(lags[best] + shift * step), float(correlations[best]))
 
 
 def _correlation(time: Array, coordinates: Array, command_time: Array, command: Array) -> float:
@@ -137,7 +139,7 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
     step = float(np.median(np.diff(time))) / PARTS
     reach = np.ceil(REACH_S / step)
     delays = step * (np.arange(-reach, reach + 1) + 0.5)
-    found = np.array(
+    correlations = np.array(
         [
             _correlation_of_noises(
                 noise, windows.deviations(_held(telemetry, rows, moments, time + delay)[1])
@@ -146,8 +148,8 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
         ]
     )
     # A command is held until the next, so PARTS successive delays correlate. Take their middle.
-    best = int(np.argmax(np.convolve(np.abs(found), np.ones(PARTS), mode="same")))
-    correlation = float(found[best])
+    best = int(np.argmax(np.convolve(np.abs(correlations), np.ones(PARTS), mode="same")))
+    correlation = float(correlations[best])
     if abs(correlation) * np.sqrt(noise.size) < CERTAIN:
         return None
     held = _held(telemetry, rows, moments, time[windows.rows] + delays[best])[0]

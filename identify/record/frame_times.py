@@ -1,7 +1,7 @@
 """Times of poses: those that a log states, or frames one period apart.
 
 Cameras are triggered by a clock, but logs round times or write them late. Poses of a moving robot
-show which times are right, because they lie on smoother curves as a function of the right times.
+show which times are right: as a function of the right times, the poses lie on smoother curves.
 """
 
 import numpy as np

@@ -271,7 +271,7 @@ def _stated(measured: Measured, path: Path) -> Array:
 def _state_anchor(
     record: xr.Dataset, settings: Identification, measured: Measured, source: Path
 ) -> None:
-    """Store with a record the quantity that fixes the scale of its parameters."""
+    """Store with a record its scale anchor. Raises RecordError if the measured value is missing."""
     record.attrs["scale_anchor"] = settings.scale_anchor
     # These two anchors have no measured value.
     if settings.scale_anchor in ("payload", "prior"):

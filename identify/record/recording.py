@@ -234,7 +234,7 @@ def run_names(path: Path | str) -> list[str]:
 
 
 def run_name(number: int) -> str:
-    """Return the group of the run with this number, counted from 1."""
+    """Return the name of the group of the run with this number, counted from 1."""
     return f"run{number:02d}"
 
 

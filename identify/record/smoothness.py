@@ -23,7 +23,7 @@ LONGEST = 2.5  # longest time between two poses of a polynomial, as a multiple o
 # Mahalanobis distance, whose mean is six for noise alone.
 GROSS = 100.0
 MEDIAN = float(chdtri(6, 0.5))  # median of this squared distance for noise alone
-FEWEST = 30  # smallest number of poses in which wrong ones are searched
+FEWEST = 30  # smallest number of poses among which wrong ones are looked for
 
 
 @dataclass(frozen=True)

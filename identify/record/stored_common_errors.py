@@ -1,8 +1,8 @@
 """Errors that all measured poses of a record have in common.
 
 Cameras and taught frames are not known exactly. Their errors d are constant during a run, have a
-known covariance, and move the measured poses by J(pose) d. Beside its poses, a record contains J
-of every frame and the covariance of d.
+known covariance, and move the measured poses by J(pose) d. In addition to its poses, a record
+contains J of every frame and the covariance of d.
 
 An estimator that whitens poses by the noise alone would attribute such an error to the model. Here
 the error is marginalised. With noise of unit covariance and modes M = J L, where L L^T is the
@@ -12,7 +12,7 @@ covariance of d, the residuals have the covariance 1 + M M^T. With M = U S V^T t
 
 This is equivalent to estimating d together with the parameters, with a prior of this covariance. M
 can depend on d, for example for a latency, or for cameras within a servo. The model then contains
-the most likely d, and M is evaluated there.
+the most likely d, and M is evaluated at this d.
 """
 
 from dataclasses import dataclass, field
@@ -55,9 +55,9 @@ class CommonErrors:
     names              Names of the k errors, each ending with its unit.
     changes (N, 6, k)  Change of the measured poses per unit of each error.
     covariance (k, k)  Covariance of the true values about the known values.
-    loop_std           Standard deviations of errors in the loop by name, such as those of the mean
-                       latency of the frames, s, of the zero of each joint, and of the scale of the
-                       commands. A model of the loop is needed to compute their effect on the poses.
+    loop_std           Standard deviations of errors in the loop by name, such as the mean latency
+                       of the frames, the zero of each joint, and the scale of the commands. A model
+                       of the loop is needed to compute their effect on the poses.
     geometry           Errors of the robot's geometry. A model of the loop is needed to compute
                        their effect. None if the geometry is exact.
     body_std           Standard deviations of errors of bodies and passive joints by name. See
@@ -96,7 +96,7 @@ class CommonErrors:
         return np.array([kind_of(name) in OF_RECORD for name in self.all_names], dtype=bool)
 
     def known_as(self, other: "CommonErrors") -> bool:
-        """Return whether other errors, except those `of_record`, have the same covariances."""
+        """Return whether other errors, except those `of_record`, have the same priors as these."""
         pairs = [(self.covariance, other.covariance)]
         if self.geometry and other.geometry:
             pairs.append((self.geometry.covariance, other.geometry.covariance))
@@ -121,7 +121,7 @@ class CommonErrors:
         """
         root = self.whole_factor
         kinds = np.array([kind_of(name) for name in self.all_names])
-        # Effects per error in its own unit: there the kinds are separate columns.
+        # Each column is the effect of one error per unit, so it belongs to one kind.
         per_error = modes @ np.linalg.pinv(root)
         return {
             kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())
@@ -151,7 +151,7 @@ class CommonErrors:
 
     @cached_property
     def modes(self) -> Array:
-        """Errors (N, 6, k) of the measured poses for k independent numbers of unit variance."""
+        """Changes (N, 6, k) of the measured poses by each column of `factor`."""
         return np.asarray(self.changes @ self.factor)
 
 
@@ -161,7 +161,7 @@ NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
 
 @dataclass(frozen=True)
 class Marginal:
-    """Whitener of residuals of unit covariance that have modes in common.
+    """Whitener of residuals for common errors. The residuals are whitened for noise already.
 
     modes (m, k)  Modes of the m residuals.
     had (m,)      Part of the residuals that is due to the common errors that the model contains.
@@ -212,7 +212,7 @@ def store_common_errors(record: xr.Dataset, errors: CommonErrors) -> None:
 
 
 def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErrors:
-    """Return the common errors of a record with these kinds (`kind_of`), or NONE.
+    """Return the common errors of the poses of a record with these kinds (`kind_of`), or NONE.
 
     Raises RecordError if one of the two variables is missing, a shape is wrong, a number is not
     finite, or the covariance is not valid.

@@ -41,7 +41,8 @@ IN_REACH = 0.5
 FITS = 0.9
 # Correlation of a joint with its command below which their directions are opposite.
 OPPOSES = -0.8
-# Difference, rad, of a joint's offset from a whole number of turns below which it is such a number.
+# Distance, rad, of a joint's offset from a whole number of turns below which its zero is off by
+# these turns.
 NEAR_TURN = 0.3
 # Largest offset of a joint from its command, as a fraction of its travel limit, that needs no other
 # zero. Drives without an integral hold a joint away from its command.

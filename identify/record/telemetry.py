@@ -112,7 +112,7 @@ class Telemetry:
 
     @property
     def is_one_table(self) -> bool:
-        """True if each row holds a pose and a command, and the reference if there is one."""
+        """True if poses, commands and the reference, if there is one, have the same times."""
         times = [self.commands.time]
         times += [] if self.reference is None else [self.reference.time]
         return all(np.array_equal(time, self.poses.time) for time in times)
