@@ -190,9 +190,11 @@ def clock_notes(records: Sequence[CommonErrorEstimates]) -> tuple[str, ...]:
             said.append(f"{offset:.3f} ± {doubt:.3f} ms after their logged times")
         if CLOCK_DRIFT in std:
             drift, doubt = 1e6 * found.learned[CLOCK_DRIFT], 1e6 * std[CLOCK_DRIFT]
-            said.append(f"later by {drift:.1f} ± {doubt:.1f} us every second")
+            said.append(f"{drift:.1f} ± {doubt:.1f} us later in every second")
         if said:
             of_record = f" of record {number}" if len(records) > 1 else ""
             what = ", and ".join(said)
-            notes.append(f"the commands{of_record} act {what}: their clock is another")
+            notes.append(
+                f"the commands{of_record} act {what}: their clock differs from that of the poses"
+            )
     return tuple(notes)

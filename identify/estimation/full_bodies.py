@@ -41,9 +41,9 @@ def _unseen(layout: ParameterLayout, shown: NDArray[np.bool_]) -> tuple[str, ...
         for kind, names in unseen.items()
     )
     return (
-        "the record shows nothing of these numbers of full bodies, alone or in a sum, so that they "
-        f"keep their initial guess: {said}; a motion that turns these bodies more can show them, "
-        "or they have no effect on this robot",
+        "the record determines these parameters of full bodies neither alone nor in a sum, so they "
+        f"keep their initial guess: {said}; a motion that turns these bodies more can determine "
+        "them, unless they have no effect on this robot",
     )
 
 

@@ -255,7 +255,7 @@ def output_error_problem(
     anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
-            f"the scale anchor is a payload, but the {len(runs)} records have all the same load: "
+            f"the scale anchor is a payload, but the {len(runs)} records all have the same load: "
             "a record with and a record without the load are needed"
         )
     guess = model_guess(robot, side.model, settings)

@@ -116,8 +116,8 @@ class BoundedEstimate:
         )
         return (
             f"the estimate is held at {len(self.active_bounds)} bounds, beyond which no robot "
-            f"exists: {said}; in brackets the distance of the unbounded estimate beyond the bound, "
-            "in standard deviations; the intervals take it into account",
+            f"exists: {said}; each number in brackets is the distance of the unbounded estimate "
+            "beyond the bound, in standard deviations; the intervals take it into account",
         )
 
 

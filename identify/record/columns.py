@@ -47,7 +47,7 @@ def _check_convention(name: str) -> str:
         return name
     raise ValueError(
         f"{name!r} is not a convention: {', '.join(CONVENTIONS)}; capitals are turns about the "
-        "body's own axes, small letters about axes that stand still"
+        "body's own axes, small letters about fixed axes"
     )
 
 
@@ -81,14 +81,14 @@ class Log(Section):
     )
     time: str | None = Field(
         None,
-        description="column of the times; without it, that of the measured poses. A row in which "
-        "it is empty is no row of these columns",
+        description="column of the times; without it, that of the measured poses. Rows in which it "
+        "is empty are ignored",
     )
     time_unit: Literal["s", "ms", "us", "ns", "frames"] = Field(
         "s", description="unit of the times; frames are those of timing.frame_rate_hz"
     )
     time_offset_s: float = quantity(
-        0.0, "s", "what to add to the times, for example between two clocks", ge=-1e10, le=1e10
+        0.0, "s", "what is added to the times, such as an offset of clocks", ge=-1e10, le=1e10
     )
 
     @property
@@ -112,7 +112,7 @@ class PoseColumns(Log):
     convention: Convention = Field(
         description="quaternion_xyzw, quaternion_wxyz, matrix (row by row), rotation_vector, or an "
         "Euler sequence of scipy's Rotation: euler_XYZ and so on turn about the body's own axes, "
-        "euler_xyz about axes that stand still"
+        "euler_xyz about fixed axes"
     )
     angle_unit: Literal["rad", "deg"] = Field(
         "rad", description="unit of Euler angles and of a rotation vector"
@@ -142,9 +142,9 @@ class PoseColumns(Log):
     )
     covariance: list[str] | None = Field(
         None,
-        description="columns of the covariance of the position and of small turns about axes of "
-        "the log that stand still, in squares of position_unit and angle_unit: 36 row by row, 21 "
-        "of the upper triangle, or 6 standard deviations; without them, [record] states it",
+        description="columns of the covariance of the position and of small turns about fixed axes "
+        "of the log, in squares of position_unit and angle_unit: 36 row by row, 21 of the upper "
+        "triangle, or 6 standard deviations; without them, [record] states it",
     )
     covariance_of: Literal["turns", "angles"] = Field(
         "turns",
@@ -193,18 +193,18 @@ class CommandColumns(Log):
 
     names: list[str] = Field(description="columns of the commands of joints 1, 2, ...")
     unit: Annotated[str | float, AfterValidator(_check_unit)] = Field(
-        description="unit of the commands, or rad or m in one unit, such as of a gear or a spindle"
+        description="unit of the commands, or rad or m per unit, as for a gear or a spindle"
     )
     signs: list[Literal[1, -1]] | None = Field(
-        None, description="1 where a joint counts as in the robot file, -1 where it counts against"
+        None, description="1 for joints with the direction of the robot file, -1 for all others"
     )
     zeros: list[float] | None = Field(
         None, description="values of the columns at the zeros of the robot file's joints"
     )
     written: str | None = Field(
         None,
-        description="column of the times at which commands were written to the drives, if they "
-        "stand in the rows of the poses; in rows of their own, the times of the rows",
+        description="column of the times at which commands were written to the drives, if commands "
+        "share the rows of the poses; commands in rows of their own are written at the rows' times",
     )
 
     @model_validator(mode="after")
@@ -218,7 +218,7 @@ class CommandColumns(Log):
         if self.written is not None and self.is_own:
             raise ValueError(
                 f"written = {self.written!r} is for commands in the rows of the poses, but these "
-                "have rows of their own, whose times are those at which they were written"
+                "commands have rows of their own, and are written at the times of these rows"
             )
         _check_once(self.names)
         return self

@@ -131,7 +131,7 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
             indices = "".join(f"[{k + 1}]" for k in worst)
             raise EstimationError(
                 f"the record is of another robot {robot.name!r}: {name}{indices} was "
-                f"{theirs[worst]:.9g} when it was made, the robot file says {known[worst]:.9g}"
+                f"{theirs[worst]:.9g} when it was made, but is {known[worst]:.9g} in the robot file"
             )
 
 

@@ -274,7 +274,7 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     strange = np.flatnonzero((stated != 0) & (stated != 1))
     if len(strange):
         raise RecordError(
-            f"{source}: measured_ok must be 1 or 0, it is {stated[strange[0]]} in frame "
+            f"{source}: measured_ok must be 1 or 0, but is {stated[strange[0]]} in frame "
             f"{strange[0]}" + (f" and wrong in {len(strange) - 1} more" if len(strange) > 1 else "")
         )
     ok = stated.astype(bool)
@@ -285,7 +285,7 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
         if len(bad):
             which = "frames that count as measured" if name in MAY_BE_LOST else "frames"
             raise RecordError(
-                f"{source}: {name} is not finite in {len(bad)} {which}, the first is frame {bad[0]}"
+                f"{source}: {name} is not finite in {len(bad)} {which}, first in frame {bad[0]}"
             )
     steps = np.diff(record["time"].values)
     if not (steps > 0).all():

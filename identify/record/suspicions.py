@@ -248,7 +248,7 @@ def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]
     hint = _fitting(telemetry, robot, 0.0)
     return (
         f"{place}: leg {leg} of {robot.name} cannot reach the measured pose [{pose}], m and rad, "
-        f"as {1 - reached.mean():.0%} of the poses; "
+        f"and {1 - reached.mean():.0%} of the poses are out of reach; "
         + (hint or "its units, its frame (base_from_frame) or its body differ from the robot file")
     )
 

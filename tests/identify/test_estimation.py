@@ -366,7 +366,7 @@ def test_the_payload_recovers_the_scale_of_the_papers_experiment():
 
 def test_the_payload_anchor_needs_two_loads(scenario):
     records = loaded(scenario, seed=1)
-    with pytest.raises(EstimationError, match=r"1 records have all the same load"):
+    with pytest.raises(EstimationError, match=r"1 records all have the same load"):
         identify(records[:1], rss6(), scenario)
 
 

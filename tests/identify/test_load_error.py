@@ -145,7 +145,7 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
             RecordError,
             "payload_mass is None, must be a number >= 0",
         ),
-        ((again, heavy), EstimationError, "2 records have all the same load"),
+        ((again, heavy), EstimationError, "2 records all have the same load"),
     ):
         with pytest.raises(error, match=says):
             identify(list(pair), rss6(), SCENARIO)

@@ -108,11 +108,11 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
     for values, says in (
         (
             {"measured_pose": measured},
-            "is not finite in 1 frames that count as measured, the first is frame 7",
+            "is not finite in 1 frames that count as measured, first in frame 7",
         ),
         (
             {"command": np.full((120, 6), np.inf)},
-            "command is not finite in 120 frames, the first is frame 0",
+            "command is not finite in 120 frames, first in frame 0",
         ),
         ({"command": np.zeros(120)}, "120"),
         ({"measured_covariance": np.zeros((120, 6))}, "120"),
@@ -122,8 +122,8 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
         with pytest.raises(RecordError, match=says):
             stated(**values)
     for frames, value, says in (
-        ([3, 9, 11], -1.0, "it is -1.0 in frame 3 and wrong in 2 more"),
-        ([0], np.nan, "it is nan in frame 0$"),
+        ([3, 9, 11], -1.0, "but is -1.0 in frame 3 and wrong in 2 more"),
+        ([0], np.nan, "but is nan in frame 0$"),
     ):
         flags = record["measured_ok"].values.astype(float)
         flags[frames] = value
@@ -142,7 +142,7 @@ def test_what_a_file_lacks_or_damages_is_named(tmp_path, record):
     with h5py.File(path, "r+") as file:
         file["reference_position"][3, 1] = np.nan
     with pytest.raises(
-        RecordError, match="reference_position is not finite in 1 frames, the first is frame 3"
+        RecordError, match="reference_position is not finite in 1 frames, first in frame 3"
     ):
         read(path)
     for kept in (path.stat().st_size - 1, path.stat().st_size // 2, 100, 0):
@@ -404,7 +404,8 @@ def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geo
     )
     assert load_robot(path).name == "rss6"
     with pytest.raises(
-        EstimationError, match=r"crank_length was 0.06 when it was made, the robot file says 0.062"
+        EstimationError,
+        match=r"crank_length was 0.06 when it was made, but is 0.062 in the robot file",
     ):
         identify(record, load_robot(path), SHORT)
     bare = without(record, "robot_geometry")
