@@ -161,7 +161,7 @@ def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
     distance = float(np.hypot(*span[:2]))
     if not crank < distance:
         raise RobotFileError(
-            f"crank is {crank:g} m, must be shorter than the {distance:.4g} m in plan from its "
+            f"crank is {crank:g} m but must be shorter than the {distance:.4g} m in plan from its "
             "axis to its platform joint at home"
         )
     along = span[:2] / distance
@@ -177,7 +177,7 @@ def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> 
     nearest, farthest = abs(base_radius - platform_radius), base_radius + platform_radius
     if not nearest < span < farthest:
         raise RobotFileError(
-            f"crank and link at right angles reach {span:.4g} m at home, must be between "
+            f"crank and link at right angles reach {span:.4g} m at home but must be between "
             f"{nearest:.4g} m and {farthest:.4g} m, the nearest and farthest distance of joints on "
             "circles of base_radius and platform_radius"
         )
@@ -231,8 +231,8 @@ def _check_stroke(leg: Leg) -> None:
     shortest, longest = leg.stroke  # type: ignore[attr-defined]
     if not shortest < leg.zero_length < longest:  # type: ignore[attr-defined]
         raise RobotFileError(
-            f"leg is {leg.zero_length:g} m, must be between {shortest:g} m, the longer of cylinder "  # type: ignore[attr-defined]
-            f"and rod, and {longest:g} m, their sum; state cylinder and rod, too"
+            f"leg is {leg.zero_length:g} m but must be between {shortest:g} m, the longer of "  # type: ignore[attr-defined]
+            f"cylinder and rod, and {longest:g} m, their sum; state cylinder and rod, too"
         )
 
 

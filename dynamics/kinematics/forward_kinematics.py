@@ -68,7 +68,7 @@ def solve(
     angles = np.atleast_2d(theta)
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
         raise ShapeError(
-            f"initial_pose has shape {start.shape}, must be (6,) or one row for each of theta "
+            f"initial_pose has shape {start.shape} but must be (6,) or one row for each of theta "
             f"{theta.shape}"
         )
     poses = np.array(np.broadcast_to(start, (len(angles), 6)))

@@ -207,7 +207,7 @@ def _check_parallel(what: str, direction: np.ndarray, of: str, other: np.ndarray
     )
     if sine > SAME:
         raise RobotFileError(
-            f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be parallel"
+            f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}: not parallel"
         )
 
 

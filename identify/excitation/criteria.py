@@ -106,10 +106,10 @@ def _check_criterion(part: str, made: object, *given: Any) -> None:
         function = getattr(made, name)
         wanted = f"{part} must have a CasADi function {name} of z ({unknowns.size},) to one number"
         if not isinstance(function, ca.Function):
-            raise ScenarioError(f"{wanted}, has {type(function).__name__}")
+            raise ScenarioError(f"{wanted}, but has {type(function).__name__}")
         counts = (function.n_in(), function.n_out())
         if counts != (1, 1) or function.numel_in(0) != unknowns.size or function.numel_out(0) != 1:
-            raise ScenarioError(f"{wanted}, has {function}")
+            raise ScenarioError(f"{wanted}, but has {function}")
         if np.isnan(float(function(typical))):
             raise ScenarioError(f"{wanted}, but its value is NaN at an admissible trajectory")
     if made.judge is not None and not callable(made.judge):

@@ -299,7 +299,7 @@ def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, A
 
 
 def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:
-    """Return the names of limits whose used share is larger than `share`."""
+    """Return the names of limits whose used share is larger than `share`, or is NaN."""
     return {worst.name for worst in problem.worst(z) if not worst.share <= share}
 
 
