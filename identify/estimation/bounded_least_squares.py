@@ -68,8 +68,7 @@ AT_BOUND = 1e-12  # distance from a bound that counts as rounding, in scales of 
 Linearisation = tuple[float, Array, Array]
 
 # Function (factor, residual, parameters, lower bounds, scale, radius) -> (step, predicted gain). A
-# gain is a decrease of the cost. The step stays within the bounds and within `radius` times the
-# scale.
+# gain is a decrease of the cost. The step stays within the bounds and `radius` times the scale.
 Proposal = Callable[[Array, Array, Array, Array, Array, float], tuple[Array, float]]
 
 
@@ -123,8 +122,7 @@ def minimise(
 ) -> Solution:
     """Minimise a least-squares problem within bounds.
 
-    The search ends when it has converged, when no step lowers the cost, or after the largest number
-    of iterations.
+    The search ends when it has converged, when no step lowers the cost, or by `max_iterations`.
 
     problem            Problem to minimise.
     start, lower (p,)  Parameters at the start, and their lower bounds.

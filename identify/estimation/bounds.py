@@ -75,8 +75,7 @@ class ParameterBounds:
         """Return these parameters (p,), moved to within the bounds.
 
         Parameters below their bounds are raised. With `physical`, impossible bodies are changed, if
-        possible without an effect on the motion, and full bodies that are nearly flat are made
-        thicker.
+        possible without an effect on the motion, and flat full bodies are made thicker.
         """
         allowed = np.maximum(parameters, least_values(self.layout))
         if self.physical:

@@ -24,9 +24,8 @@ def common_scale(result: IdentificationResult) -> dict[str, Any] | None:
     """Return the entry of the common scale for JSON.
 
     The entry has the gain, the relative standard deviation of the scale, and for each identified
-    parameter that shares the scale the relative standard deviation that is left without it. None is
-    returned if the law of the drives did not act, the gain is not identified, or no parameter
-    shares the scale.
+    parameter that shares the scale the relative standard deviation that is left without it. Returns
+    None if no law of the drives acted, the gain is unidentified, or none shares the scale.
     """
     gain = result.layout.joint_pid.start
     if not (result.drive.in_loop and result.identifiable[gain]):

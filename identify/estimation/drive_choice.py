@@ -34,8 +34,7 @@ SURE = 0.95  # smallest probability with which a law counts as certain
 # Number of iterations of the first search for every law. After these, laws that fit the record are
 # near their optimum. Other laws could need many more.
 FIRST = 4
-# Ratio to the lowest cost above which the search for a law is not continued. Such a law gets the
-# probability zero.
+# Ratio to the lowest cost above which a law gets no further search, and the probability zero.
 HOPELESS = 10.0
 
 
@@ -163,8 +162,7 @@ def _weighed(
 ) -> tuple[DriveName, dict[str, float]]:
     """Return the most probable law, and the probability of each.
 
-    A law without an entry in `found` has the probability zero. Its model is unstable, or its cost
-    is too high.
+    A law that is not in `found`, because its model is unstable or its cost is high, gets zero.
     """
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}

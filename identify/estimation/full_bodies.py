@@ -11,8 +11,7 @@ from dynamics.parameters import ParameterLayout
 from dynamics.spatial_inertia import FULL_INERTIAL
 from identify.arrays import Array
 
-# Distance of a centre of mass outside of its body, in standard deviations, above which there is a
-# warning.
+# Distance of a centre of mass from its body, in standard deviations, above which to warn.
 OUTSIDE_STDS = 3.0
 
 

@@ -60,8 +60,7 @@ from identify.estimation.scale_anchor import ScaleAnchor
 # Fraction of the prior standard deviation and of the size of a quantity. The standard deviation of
 # an identified quantity is below this fraction of both.
 IDENTIFIABLE_SHARE = 0.5
-# Fraction of an estimate's variance, due to errors of the guess, above which the estimate rests on
-# the prior.
+# Fraction of the variance due to errors of the guess above which an estimate rests on the prior.
 RESTS_ON_PRIOR = 0.5
 # Ordinary friction, as a fraction of the holding torque or force. It is Coulomb friction, or
 # viscous friction at 1 rad/s or 1 m/s.

@@ -88,19 +88,13 @@ class Segment:
         count = len(chart.freedoms)
         coordinates, rates, integral = np.split(state, [count, 2 * count])
         pose = chart.pose(coordinates)
-        servo_integral = np.zeros(count)
+        at_rest = np.zeros(count)  # integral of the servo, which does not act
         start = None
         # Only the first segment begins in equilibrium.
         if self.first:
             before, latencies = commands_before(run, self.first)
             start = StartState(
-                pose,
-                chart.lifted(rates),
-                integral,
-                servo_integral,
-                before,
-                pose,
-                latencies=latencies,
+                pose, chart.lifted(rates), integral, at_rest, before, pose, latencies=latencies
             )
         frames = slice(self.first, self.last + 1)
         commands = run.logged[frames]
@@ -144,23 +138,20 @@ def measured_states(chain: list[Segment], parameters: Array, low_pass: Filter) -
     """Return the states (segments, s) at the starts of a run's segments.
 
     They are filtered coordinates of the platform, their rates, and the integrals of the joint PID.
-    At the start of the run, the integrals are those that hold the model with parameters (p,) at
-    rest.
+    At the start of the run, the integrals hold the model with parameters (p,) at rest.
     """
     run = chain[0].run
     rate_hz = run.settings.timing.frame_rate_hz
     measured = run.robot.geometry.chart.coordinates(run.without_gaps())
-    filtered, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
+    smooth, rate, _ = filtered_derivatives(measured, rate_hz, low_pass.cutoff_hz, low_pass.order)
     _, _, command_integral = effective_command(run, low_pass)
-    angle_integral = running_integral(
-        run.robot.inverse_kinematics(run.robot.pose(filtered)), rate_hz
-    )
+    angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(smooth)), rate_hz)
     servo = run.settings.servo
     drives = run.settings.drives
     rest = equilibrium(
         run.robot, parameters + run.payload, run.reference.poses[0], servo, drives=drives
     )
-    states = np.hstack([filtered, rate, rest.joint_integral + command_integral - angle_integral])
+    states = np.hstack([smooth, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)
 
 
@@ -251,8 +242,7 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
 
     The next segment begins at the state `following`. The columns are the derivatives with respect
     to the segment's state, the following state and the parameters, and then the values. The
-    derivatives with respect to the state of the first segment are zero, because it starts in
-    equilibrium.
+    derivatives with respect to the state of the first segment are zero (see `Segment.simulate`).
     """
     run = part.simulate(parameters, state, sensitivities=True)
     by_state = np.asarray(run.start_sensitivity)
@@ -276,8 +266,7 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
     """Return the states (segments, s) after a step (p + 1,) of the parameters.
 
-    The last entry of the step is 1. eliminated: triangular factor from the elimination of each
-    state.
+    The last entry of the step is 1. eliminated: triangular factor of each state.
     """
     moved = states.copy()
     size = states.shape[1]

@@ -28,8 +28,7 @@ from identify.progress import Advance, Progress
 from identify.record.stored_common_errors import FRICTION, kind_of
 
 LINEARISATIONS = 6  # largest number of linearisations in the common errors
-# Number of linearisations after which steps of the common errors are halved, because full steps can
-# alternate.
+# Number of linearisations after which steps of the common errors are halved to end alternation.
 FULL_STEPS = 2
 # Change of the most likely common errors, in standard deviations, up to which they have converged.
 SETTLED = 0.02
@@ -253,8 +252,7 @@ def _with_common_errors(
 ) -> tuple[OutputErrorProblem, Array]:
     """Return the problem with its common errors, and the best of several starts (p,).
 
-    The modes of the errors are evaluated at the best start. The model must be stable with at least
-    one start.
+    The modes of the errors are evaluated at the best start. At least one start must be stable.
     """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])

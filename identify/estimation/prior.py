@@ -73,8 +73,7 @@ def starting_guess(
 
     relative_std: standard deviation of each parameter, as a fraction of its size (`typical_sizes`).
     known: values and standard deviations that replace the guess for some parameters, by name.
-    Raises ScenarioError if the robot has no such set, or the model no parameter of a name in
-    `known`.
+    Raises ScenarioError if the robot has no such set, or no parameter with a name in `known`.
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]

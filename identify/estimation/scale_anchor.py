@@ -76,8 +76,7 @@ def measured_anchor(
 ) -> ScaleAnchor:
     """Return the anchor of this name. If it is in MEASURING, it has a simulated measurement.
 
-    std: standard deviation of the instrument, None for the default. true (p,): true parameters of
-    the robot.
+    std: standard deviation of the instrument, None for the default. true (p,): true parameters.
     """
     if name not in MEASURING:
         # These anchors have no measured parameter. The record under a load states the load.

@@ -27,10 +27,8 @@ SWEEPS = 100
 """Largest number of passes over all bounds."""
 
 SETTLED = 1e-9
-"""Tolerance below which the passes end.
-
-It applies to the change of the mean, in standard deviations, and to the relative change of the
-precision along each bound's direction.
+"""Change of the mean, in standard deviations, and relative change of a precision, below which the
+passes end.
 """
 
 
@@ -53,8 +51,7 @@ class TruncatedNormal:
         """Return mean and standard deviation (n,) of the quantities rows (n, p) @ x.
 
         If a quantity is a positive multiple of a bounded one, the factor of this bound is taken out
-        again. The quantity's distribution is then the returned normal distribution, truncated at
-        the bound.
+        again. Truncated at the bound, the returned normal distribution is then the quantity's.
         """
         mean = rows @ self.mean
         variance = np.einsum("gi,ij,gj->g", rows, self.covariance, rows)

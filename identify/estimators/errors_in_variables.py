@@ -47,8 +47,7 @@ from identify.estimators.least_squares import (
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 MAX_ITERATIONS = 10  # largest number of simulated runs
-# Step of every parameter, as a fraction of its standard deviation, up to which the iterations have
-# converged.
+# Largest step of a parameter at convergence, as a fraction of its standard deviation.
 STEP_TOLERANCE = 0.05
 
 
@@ -148,10 +147,8 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     blocks = ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std))))
     for block, columns in blocks:
         matrix = rows.matrix[block, columns]
-        right_side = rows.right[block]
-        solution, covariance = _fit_block(
-            matrix, right_side, errors[:, block], columns, values, std
-        )
+        rhs = rows.right[block]
+        solution, covariance = _fit_block(matrix, rhs, errors[:, block], columns, values, std)
         unknowns[columns] += std[columns] * solution
         deviations[columns] *= np.sqrt(np.diag(covariance))
     admissible = nearest_admissible(guess.layout, unknowns, information(rows, guess), std)

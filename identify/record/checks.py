@@ -1,8 +1,7 @@
 """Checks that a record is suitable for an identification.
 
 A record must come from this robot and loop, be long enough, and contain motion. It must begin at
-rest and be in m and rad. If a check fails, it raises EstimationError with its finding. Frames are
-counted from 0.
+rest and be in m and rad. Each check raises EstimationError with its finding. Frames count from 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,8 +28,7 @@ from identify.trajectory import FourierTrajectory
 MINIMUM_GOOD_SHARE = 0.5  # smallest allowed fraction of measured frames
 # Largest difference of a reference from the integral of its rate, as a fraction of its travel.
 REFERENCE_GAP = 0.05
-# Largest difference, m or rad, that counts as rounding. For frame rates it is a relative
-# difference.
+# Largest difference, m or rad (relative for frame rates), that counts as rounding.
 ROUNDING = 1e-9
 # Largest difference of two mirrored entries of a covariance that counts as rounding, as a fraction
 # of the product of the two standard deviations.

@@ -55,28 +55,26 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
     step = max(float(np.median(np.diff(time))) / 2, FINEST_S)
     for reach in (min(CLOSE_S, duration), duration):
         lags = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
-        correlations = np.array(
+        scores = np.array(
             [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
         )
         # If a lag near zero has a good correlation, larger lags are not tried.
-        if len(correlations) and correlations.max() > 1 - 5 * ALIKE:
+        if len(scores) and scores.max() > 1 - 5 * ALIKE:
             break
-    if not len(correlations) or correlations.max() <= 0:
+    if not len(scores) or scores.max() <= 0:
         return MotionLag(0.0, 0.0)
-    good = np.flatnonzero(correlations >= correlations.max() - ALIKE)
+    good = np.flatnonzero(scores >= scores.max() - ALIKE)
     nearest = good[np.argmin(np.abs(lags[good]))]
     # From the good lag nearest to zero, climb to the peak to which it belongs.
     best = int(nearest)
-    while 0 < best < len(lags) - 1 and correlations[best] < max(
-        correlations[best - 1], correlations[best + 1]
-    ):
-        best += 1 if correlations[best + 1] > correlations[best - 1] else -1
+    while 0 < best < len(lags) - 1 and scores[best] < max(scores[best - 1], scores[best + 1]):
+        best += 1 if scores[best + 1] > scores[best - 1] else -1
     shift = 0.0
     if 0 < best < len(lags) - 1:
-        before, peak, after = correlations[best - 1 : best + 2]
+        before, peak, after = scores[best - 1 : best + 2]
         curvature = before - 2 * peak + after
         shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return MotionLag(float(lags[best] + shift * step), float(correlations[best]))
+    return MotionLag(float(lags[best] + shift * step), float(scores[best]))
 
 
 def _correlation(time: Array, coordinates: Array, command_time: Array, command: Array) -> float:

@@ -10,8 +10,7 @@ from identify.arrays import Array
 from identify.record.smoothness import local_misfit
 
 GAP = 1.5  # time between two rows, as a multiple of the usual time, above which rows are missing
-# Largest distance of a stated time from a frame, in periods, at which the time can belong to this
-# frame.
+# Largest distance of a stated time from its frame, in periods.
 FARTHEST = 0.4
 # Ratio of the misfit at the frames to that at the stated times, below which the frames are taken.
 BETTER = 0.97

@@ -30,8 +30,7 @@ CENTRE = slice(1, 4)  # indices of the centre of mass among the figures
 def load_parameters(layout: ParameterLayout, figures: Array) -> Array:
     """Return the change (p,) of a robot's parameters by the figures (7,) of a load.
 
-    Raises RecordError if the load's centre of mass is off the origin and the platform is no full
-    body.
+    Raises RecordError for a centre of mass off the origin if the platform is no full body.
     """
     return _of_platform(layout, full_body(figures[0], figures[CENTRE], np.diag(figures[4:])))
 

@@ -25,8 +25,7 @@ TRIED = 200  # number of poses with which other units and axes are tried
 LAGS_S = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3)
 # Times, s, of the taps of the filter by which a joint follows its command, relative to the lag.
 FILTER_S = (-0.1, -0.05, 0.0, 0.05, 0.1)
-# Fraction of the joints' motion that the commands may leave unexplained. Above it, other orders are
-# tried.
+# Unexplained fraction of the joints' motion above which other orders are tried.
 EXPLAINED = 0.02
 # Largest ratio of the unexplained fraction of another order to that of the stated one at which the
 # other one counts as right.
@@ -41,8 +40,7 @@ IN_REACH = 0.5
 FITS = 0.9
 # Correlation of a joint with its command below which their directions are opposite.
 OPPOSES = -0.8
-# Distance, rad, of a joint's offset from a whole number of turns below which its zero is off by
-# these turns.
+# Distance, rad, of a joint's offset from whole turns below which it counts as these turns.
 NEAR_TURN = 0.3
 # Largest offset of a joint from its command, as a fraction of its travel limit, that needs no other
 # zero. Drives without an integral hold a joint away from its command.
@@ -68,8 +66,7 @@ ANGLES_TRIED = {
 
 NAMES = ("x", "y", "z")
 
-# Columns whose orders and signs are tried: their slice of a pose, their names, and the other
-# columns.
+# Columns whose orders and signs are tried: slice of a pose, names, and the other columns.
 COLUMNS = {
     "position": (slice(0, 3), NAMES, "orientation"),
     "angles": (slice(3, 6), POSE[3:], "position"),
@@ -116,8 +113,7 @@ def better_order(stated: float, shares: Mapping[str, float]) -> str:
     """Return a sentence about conventions of Euler angles that fit better than the stated one.
 
     It is empty if none fits much better. ``stated`` is the fraction of the motion that is
-    `unexplained` with the stated convention. ``shares`` holds these fractions of other conventions,
-    by their names.
+    `unexplained` with the stated convention. ``shares`` are those of other conventions by name.
     """
     best = min(shares.values(), default=1.0)
     if best > BETTER * stated:

@@ -1,8 +1,7 @@
 """Tables as CSV: plain ones, and exports of Motive and Vicon with headers of several lines.
 
 Motive writes the names of the bodies above the columns of their rotations and positions. Vicon
-writes a section for each kind of data, with the rate, the names of the bodies, the components and
-their units.
+writes a section for each kind of data, with the rate, bodies, components and units.
 """
 
 from collections.abc import Mapping, Sequence

@@ -36,8 +36,7 @@ from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, T
 
 # Largest deviation of a quaternion's length from one, and of R R^T from the identity.
 UNIT_LENGTH = 0.01
-# Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones are probably
-# degrees.
+# Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones may be degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
 
 
@@ -167,8 +166,7 @@ def _since(moments: Iterable[Decimal], start: Decimal) -> Array:
 def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
     """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured.
 
-    Other poses are NaN. Raises RecordError if a mark or a rotation is not valid, or if no pose was
-    measured.
+    Other poses are NaN. Raises RecordError for an invalid mark or rotation, or if all are NaN.
     """
     position = np.stack([stream.numbers(name) for name in log.position], axis=1)
     orientation = np.stack([stream.numbers(name) for name in log.orientation], axis=1)
