@@ -253,15 +253,15 @@ class Plant:
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
         geometry = self.robot.geometry
         known = self.nominal.geometry
-        found: dict[str, ArrayLike] = {}
+        mismatch: dict[str, ArrayLike] = {}
         if geometry != known:
-            found["base_joint_error"] = geometry.base_joints - known.base_joints
-            found["platform_joint_error"] = geometry.platform_joints - known.platform_joints
+            mismatch["base_joint_error"] = geometry.base_joints - known.base_joints
+            mismatch["platform_joint_error"] = geometry.platform_joints - known.platform_joints
         if run.motor_angle is not None:
-            found["motor_angle"] = run.motor_angle
+            mismatch["motor_angle"] = run.motor_angle
         if self.settings.drives.joint_zeros:
-            found["joint_zero_error"] = np.array(self.settings.drives.joint_zeros)
-        return found
+            mismatch["joint_zero_error"] = np.array(self.settings.drives.joint_zeros)
+        return mismatch
 
     def _settings_at(self, parameters: Array, pose: Array) -> LoopSettings:
         """Return the settings with enough steps per frame for the vibration of elastic joints."""
@@ -283,11 +283,11 @@ def with_command_errors(
     contains the zeros of the joints, as for a plant whose geometry is calibrated. Raises the
     ScenarioErrors of `true_zeros`.
     """
-    off = true_zeros(nominal, switches)
+    errors = true_zeros(nominal, switches)
     limits = of_actuators(nominal, switches, "command_limits")
     drives = replace(
         settings.drives,
-        joint_zeros=tuple(off.tolist()) if zeros and off.any() else (),
+        joint_zeros=tuple(errors.tolist()) if zeros and errors.any() else (),
         command_scale=switches.command_scale,
         command_step=of_actuators(nominal, switches, "command_quantum"),
         command_limits=None if limits is None else tuple(limits),

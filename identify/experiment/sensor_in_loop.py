@@ -227,16 +227,16 @@ class SensorInLoop:
         A sensor with a method `in_advance` draws all frames before the run. The loop then runs
         compiled, without a call at each frame, and gives the same numbers.
         """
-        drawn = getattr(self._sensor, "in_advance", None)
-        if drawn is None:
+        draw = getattr(self._sensor, "in_advance", None)
+        if draw is None:
             return RateSensor(self.measure)
-        made: DrawnFrames = drawn(len(times))
-        for frame, (t, reason) in enumerate(zip(times, made.lost, strict=True)):
-            self.covariances.append(np.full((6, 6), np.nan) if reason else made.covariance)
+        frames: DrawnFrames = draw(len(times))
+        for frame, (t, reason) in enumerate(zip(times, frames.lost, strict=True)):
+            self.covariances.append(np.full((6, 6), np.nan) if reason else frames.covariance)
             if reason:
                 self._lose(frame, t, reason)
         self._advance(len(times))
-        return IdealSensor(np.array([bool(reason) for reason in made.lost]), made.noise)
+        return IdealSensor(np.array([bool(reason) for reason in frames.lost]), frames.noise)
 
     @property
     def common(self) -> Array:

@@ -55,10 +55,10 @@ def json_with_digest(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def json_without_digest(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a JSON file without its digest, or raise RecordError if it is wrong."""
-    held = {name: value for name, value in entry.items() if name != KEY}
-    if KEY in entry and entry[KEY] != _of_json(held):
+    content = {name: value for name, value in entry.items() if name != KEY}
+    if KEY in entry and entry[KEY] != _of_json(content):
         raise RecordError(f"{path} is damaged: {_DIFFERS}; write it anew")
-    return held
+    return content
 
 
 def toml_with_digest(text: str) -> str:

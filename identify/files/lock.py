@@ -24,12 +24,12 @@ def lock_folder(folder: Path) -> Iterator[None]:
     folder cannot be made, or if nothing can be written into the folder.
     """
     with writing(folder):
-        made = make_folder(folder)
+        new_folders = make_folder(folder)
     try:
         with locked(folder, OutputFolderError):
             yield
     finally:
-        remove_empty_folders(made)
+        remove_empty_folders(new_folders)
 
 
 @contextmanager

@@ -74,8 +74,8 @@ class RunFolder:
     @property
     def records(self) -> tuple[str, ...]:
         """Names of the records for an identification: runs by name, then that with the payload."""
-        found = sorted(path.name for path in self.path.glob("experiment*.nc"))
-        return (*found, *([self.payload.name] if self.payload.is_file() else []))
+        runs = sorted(path.name for path in self.path.glob("experiment*.nc"))
+        return (*runs, *([self.payload.name] if self.payload.is_file() else []))
 
     def require(self, *names: str) -> None:
         """Check that files of earlier stages exist, and that netCDF files are not damaged.
@@ -113,7 +113,7 @@ def new_run_folder(path: Path | str, also: Collection[str] = ()) -> Iterator[Run
     if folder.exists() and not folder.is_dir():
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
     with lock_folder(folder):
-        if any(found.name not in (LOCK, *also) for found in folder.iterdir()):
+        if any(entry.name not in (LOCK, *also) for entry in folder.iterdir()):
             raise _not_empty(folder)
         yield RunFolder(folder)
 

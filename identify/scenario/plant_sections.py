@@ -100,12 +100,12 @@ class _Side(Section):
                 # Keys of turning and of sliding actuators exclude each other.
                 given = {name: value for name in keys if (value := getattr(self, name)) is not None}
                 if (law == self.friction) != (len(given) == 1):
-                    said = " and ".join(
+                    text = " and ".join(
                         f"{name} = {value}" for name, value in (given or {keys[0]: None}).items()
                     )
                     needed = " and ".join(" or ".join(names) for names in constants)
                     raise ValueError(
-                        f"friction = {self.friction!r} with {said}: the law {law} needs {needed}, "
+                        f"friction = {self.friction!r} with {text}: the law {law} needs {needed}, "
                         "and no other law has them"
                     )
         return self

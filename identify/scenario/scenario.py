@@ -292,10 +292,10 @@ def load_scenario(name_or_path: str | Path, **entries: Any) -> Scenario:
     >>> load_scenario("quick", renderer="analytic", timing={"latency_s": 0.01}).timing.latency_s
     0.01
     """
-    found = SCENARIOS.load(name_or_path)
+    scenario = SCENARIOS.load(name_or_path)
     if not entries:
-        return found
-    changed = found.with_overrides(dict(_dotted(entries)))
+        return scenario
+    changed = scenario.with_overrides(dict(_dotted(entries)))
     if "robot" in entries and changed.robot not in _robot_names() and not is_file(changed.robot):
         raise ScenarioError(
             f"robot {changed.robot[:200]!r} is neither built in ({', '.join(_robot_names())}) nor "

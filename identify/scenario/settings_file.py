@@ -175,10 +175,10 @@ def one_line(error: ValidationError, model: type[BaseModel]) -> str:
 
     Each error has its key, value and unit and, for a wrong name, the valid names.
     """
-    found = error.errors()
-    said = [_complaint(details, model) for details in found[:MOST_COMPLAINTS]]
-    more = len(found) - len(said)
-    return "; ".join(said + ([f"and {more} more"] if more else []))
+    errors = error.errors()
+    complaints = [_complaint(details, model) for details in errors[:MOST_COMPLAINTS]]
+    more = len(errors) - len(complaints)
+    return "; ".join(complaints + ([f"and {more} more"] if more else []))
 
 
 def _entry(name: str, value: Any, field: FieldInfo) -> str:

@@ -80,9 +80,9 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
         "seed": seed,
         "settings": scenario.estimator_settings(),
     }
-    found = _identified_files(run_folder, names, asked, heading, progress)
+    results = _identified_files(run_folder, names, asked, heading, progress)
     changed = {} if scenario == planned else scenario_file(run_folder, scenario.to_toml())
-    write_files(changed | found)
+    write_files(changed | results)
 
 
 def identify_own(
@@ -120,7 +120,7 @@ def identify_own(
         "settings": scenario.estimator_settings(),
     }
     try:
-        found = _identified_files(run_folder, names, asked, heading, progress)
+        results = _identified_files(run_folder, names, asked, heading, progress)
     except LoopFailure as error:
         raise LoopFailure(
             f"{error}; the model does not run as the record does: axes, signs or the order of its "
@@ -131,7 +131,7 @@ def identify_own(
     files = scenario_file(run_folder, scenario.to_toml())
     for name, one in records.items():
         files[folder / name] = netcdf(recording.record_groups(one))
-    write_files(files | found, parents=True)
+    write_files(files | results, parents=True)
 
 
 def _identified_files(

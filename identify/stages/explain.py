@@ -49,10 +49,10 @@ def diagnose(folder: Path, own: Sequence[Cause] = ()) -> Diagnosis:
     records = [files.content(name) for name in names]
     problem = output_error_problem(records, side, scenario.identification)
     estimate = parameter_vector(side.robot, identification, "estimate")
-    found = diagnosis_from(problem, estimate, own, identification["nuisance_estimates"])
-    found = replace(found, not_needed=not_needed(result, found))
-    save_result(files.folder.result, with_diagnosis(result, found))
-    return found
+    diagnosis = diagnosis_from(problem, estimate, own, identification["nuisance_estimates"])
+    diagnosis = replace(diagnosis, not_needed=not_needed(result, diagnosis))
+    save_result(files.folder.result, with_diagnosis(result, diagnosis))
+    return diagnosis
 
 
 def _identified(

@@ -151,9 +151,9 @@ def designed_runs(
     trajectories = []
     with (
         progress.stage("design the runs", count) as advance,
-        mapped(workers, partial(_designed, setup), seeds) as found,
+        mapped(workers, partial(_designed, setup), seeds) as designed,
     ):
-        for trajectory in found:
+        for trajectory in designed:
             trajectories.append(trajectory)
             advance()
     duration_s = setup.scenario.excitation.duration_s

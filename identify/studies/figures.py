@@ -241,15 +241,15 @@ def _title(figure: Figure, text: str) -> None:
 
 def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
     """Draw one legend below all panels, where it covers no data, if any curve has a label."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
-        found = dict(zip(labels, handles, strict=True)) | found
-    if set(found) - {"rows"}:
-        fits = int(LETTERS_PER_INCH * figure.get_figwidth() / (max(map(len, found)) + 8))
-        columns = max(1, min(fits, len(found)))
+        entries = dict(zip(labels, handles, strict=True)) | entries
+    if set(entries) - {"rows"}:
+        fits = int(LETTERS_PER_INCH * figure.get_figwidth() / (max(map(len, entries)) + 8))
+        columns = max(1, min(fits, len(entries)))
         style: Any = {"loc": "outside lower center", "fontsize": "small", "ncols": columns}
-        figure.legend(found.values(), found, **style)
+        figure.legend(entries.values(), entries, **style)
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:

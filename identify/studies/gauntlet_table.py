@@ -133,8 +133,8 @@ def _right(cases: pd.DataFrame, sort: str) -> pd.Series:
 def _share(what: str, values: pd.Series, goal: str) -> Share:
     right = int(values.sum())
     band = binomtest(right, len(values)).proportion_ci(LEVEL)
-    share = right / len(values)
-    return Share(what, right, len(values), share, float(band.low), float(band.high), goal)
+    fraction = right / len(values)
+    return Share(what, right, len(values), fraction, float(band.low), float(band.high), goal)
 
 
 def coverage(cases: pd.DataFrame) -> dict[str, float]:
@@ -148,14 +148,14 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
     percent = named["covered_percent"].dropna()
     if not len(percent):
         return {}
-    found = {
+    statistics = {
         "cases": len(percent),
         "cases_without_intervals": len(named) - len(percent),
         "covered_percent": float(percent.mean()),
     }
     if len(percent) == 1:
-        return found
-    return found | {"std_percent": float(percent.std(ddof=1) / np.sqrt(len(percent)))}
+        return statistics
+    return statistics | {"std_percent": float(percent.std(ddof=1) / np.sqrt(len(percent)))}
 
 
 def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
@@ -210,16 +210,16 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
 
 def _miss(row: pd.Series) -> dict[str, Any]:
     named = [row[f"trouble_{place}"] for place in (1, 2) if row[f"trouble_{place}"]]
-    said = row["first_finding"] or "nothing"
+    answer = row["first_finding"] or "nothing"
     if row["none_of_these"] == 1:
-        said = f"none of these, first {said}"
+        answer = f"none of these, first {answer}"
     if row["stopped"] == 1 or row["error"]:
-        said = row["error"] or "stopped with an error"
+        answer = row["error"] or "stopped with an error"
     misfit = row["misfit"]
     return {
         "case": int(row["case"]),
         "wrong": " and ".join(named) or "nothing",
-        "said": said,
+        "said": answer,
         "misfit": None if np.isnan(misfit) else float(misfit),
     }
 

@@ -171,7 +171,7 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
     _check_entries(folder)
     new = not (folder / STUDY).exists()
     try:
-        made = make_folder(folder)
+        new_folders = make_folder(folder)
     except OSError as error:
         raise StudyError(
             f"study folder {folder} cannot be made: {error.strerror}; name another with --out"
@@ -180,7 +180,7 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
         with _locked_study(folder, entry, rows, new) as journal:
             yield journal
     finally:
-        remove_empty_folders(made)
+        remove_empty_folders(new_folders)
 
 
 @contextmanager
@@ -232,8 +232,8 @@ def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
     stored: dict[str, str] | None = here.pop(VERSIONS, None) if here else None
     # A study without rows gets the present versions.
     begun = stored if stored and _has_rows(folder) else versions()
-    for name, found in ((STUDY, here), (TABLE, study_in(folder / TABLE))):
-        if found is not None and (others := _differences(found, entry)):
+    for name, other in ((STUDY, here), (TABLE, study_in(folder / TABLE))):
+        if other is not None and (others := _differences(other, entry)):
             raise StudyError(
                 f"{folder / name} belongs to another study, which differs in "
                 f"{', '.join(others[:4])}; name another folder with --out"

@@ -157,14 +157,14 @@ class Design:
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the overrides of a scenario for settings with ``scenario.`` and ``sensor.`` only."""
-    found = {}
+    replaced = {}
     for path, value in settings.items():
         root, _, key = path.partition(".")
         if root == "scenario":
-            found[key] = value
+            replaced[key] = value
         elif root == "sensor":
-            found[f"{SENSOR_CHANGES}.{key}"] = value
-    return found
+            replaced[f"{SENSOR_CHANGES}.{key}"] = value
+    return replaced
 
 
 def prepare(study: Study, given: Scenario | None = None) -> Shared:
@@ -288,10 +288,10 @@ def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
     The paths are keys of scenarios, of sensor files, and of `options`, the model of the options of
     a kind.
     """
-    found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
+    fields = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
     for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
-        del found[path]
-    return found | (_leaves(options, "options.") if options is not None else {})
+        del fields[path]
+    return fields | (_leaves(options, "options.") if options is not None else {})
 
 
 def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | None:
@@ -307,17 +307,17 @@ def field_of(path: str, options: type[BaseModel] | None = None) -> FieldInfo | N
 
 def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
     """Return the fields that are not sections, by dotted path."""
-    found: dict[str, FieldInfo] = {}
+    leaves: dict[str, FieldInfo] = {}
     for name, field in model.model_fields.items():
         kinds = (field.annotation, *get_args(field.annotation))
         inner = next((t for t in kinds if isinstance(t, type) and issubclass(t, BaseModel)), None)
         # A list of sections counts as one value, because no dotted path leads to its entries.
         listed = getattr(field.annotation, "__origin__", None) is list
         if inner is None or listed:
-            found[f"{prefix}{name}"] = field
+            leaves[f"{prefix}{name}"] = field
         else:
-            found |= _leaves(inner, f"{prefix}{name}.")
-    return found
+            leaves |= _leaves(inner, f"{prefix}{name}.")
+    return leaves
 
 
 def _nearest(name: str, known: Collection[str]) -> str:

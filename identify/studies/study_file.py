@@ -137,11 +137,11 @@ class Study(Section):
     @field_validator("factors", mode="before")
     @classmethod
     def _factors_by_path(cls, tables: Any) -> Any:
-        found = _by_path(tables, keep=("low", "high"))
+        values = _by_path(tables, keep=("low", "high"))
         return (
-            {path: _factor(path, value) for path, value in found.items()}
-            if isinstance(found, dict)
-            else found
+            {path: _factor(path, value) for path, value in values.items()}
+            if isinstance(values, dict)
+            else values
         )
 
     @model_validator(mode="after")
@@ -286,8 +286,8 @@ def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
     """Flatten nested tables by dotted path, except empty ones and those with a key in ``keep``."""
     if not isinstance(tables, Mapping):
         return tables
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in tables.items():
         nested = isinstance(value, Mapping) and value and not set(value) & set(keep)
-        found |= _by_path(value, keep, f"{section}{key}.") if nested else {f"{section}{key}": value}
-    return found
+        flat |= _by_path(value, keep, f"{section}{key}.") if nested else {f"{section}{key}": value}
+    return flat

@@ -130,18 +130,18 @@ def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.Dat
     Raises StudyError if a folder has no table, its rows are of another kind or have other factors,
     or the folder is named twice.
     """
-    found: dict[str, pd.DataFrame] = {}
+    tables: dict[str, pd.DataFrame] = {}
     for folder in folders:
         own, rows = _rows_beside(study, folder)
         names = [
             name
             for name in (own, folder.name, str(folder.resolve()))
-            if name not in (study.name, *found)
+            if name not in (study.name, *tables)
         ]
         if not names:
             raise StudyError(f"{folder} is named twice to be plotted beside this study")
-        found[names[0]] = rows
-    return list(found.items())
+        tables[names[0]] = rows
+    return list(tables.items())
 
 
 def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:

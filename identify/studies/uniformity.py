@@ -82,12 +82,12 @@ def judge_uniformity(done: pd.DataFrame, factors: Sequence[str]) -> list[Uniform
     Each figure is tested at each point of the factors where enough rows have it.
     """
     figures = probabilities_at_points(done, factors)
-    found = []
+    tests = []
     for (point, name), values in figures.items():
         p_value = float(kstest(values, "uniform").pvalue)
         corrected = min(1.0, p_value * len(figures))
-        found.append(Uniformity(name, point, np.sort(values), p_value, corrected))
-    return sorted(found, key=lambda one: one.p_value)
+        tests.append(Uniformity(name, point, np.sort(values), p_value, corrected))
+    return sorted(tests, key=lambda one: one.p_value)
 
 
 def probabilities_at_points(

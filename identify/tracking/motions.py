@@ -66,7 +66,7 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
         fastest = of_actuators(robot, limits, "max_joint_velocity")
         return [read_motion(own, robot, fastest)]
     duration = design.unseen.duration_s
-    found: list[NamedMotion] = [
+    named: list[NamedMotion] = [
         NamedMotion(f"unseen {k}", path, duration)
         for k, path in enumerate(unseen_trajectories(design, seed), start=1)
     ]
@@ -75,9 +75,9 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
     )
     # One turn takes one period of the highest harmonic.
     turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
-    found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
-    found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
-    return found
+    named.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
+    named.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
+    return named
 
 
 def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:

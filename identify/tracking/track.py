@@ -142,8 +142,8 @@ def model_of_run(plant: Plant, run_folder: Path, own: str) -> KnownModel:
         identification = load_result(path).get("identification")
         names = plant.nominal.layout.names
         column = parameter_column(identification, "estimate", names)
-        told: list[Any] = [(identification or {}).get(name) for name in MISFIT]
-        misfit = None if None in told else Misfit(*told)
+        numbers: list[Any] = [(identification or {}).get(name) for name in MISFIT]
+        misfit = None if None in numbers else Misfit(*numbers)
         return KnownModel(np.array(column), settled_drive(identification), _fitted_doubt(misfit))
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
@@ -251,8 +251,8 @@ def _entry(task: Tracking, law: str, model: str | None, advance: Advance) -> dic
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
         covariances += [seen.noise(int(frame)) for frame in np.flatnonzero(done.run.measured_ok)]
-        found = done.normalised_squared_error(robot)
-        normalised += [] if found is None else [found]
+        error_ratio = done.normalised_squared_error(robot)
+        normalised += [] if error_ratio is None else [error_ratio]
         rows.append(
             {"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated}
         )
@@ -280,7 +280,7 @@ def _shares(
     drawn with the noise that the sensor stated.
     """
     base = _drawn(task, law, known, covariance, None, advance)
-    shares = {}
+    fractions = {}
     for what in EXACT:
         exact = _drawn(task, law, known, covariance, what, advance)
         # A component without motion has no error, and a failed run has NaN.
@@ -289,9 +289,9 @@ def _shares(
                 np.nansum(exact[part]) / np.nansum(base[part])
                 for part in (slice(0, 3), slice(3, 6))
             ]
-        shares[what] = dict(zip(PARTS, (1 - np.array(remaining)).tolist(), strict=True))
-    rest = {part: 1 - sum(share[part] for share in shares.values()) for part in PARTS}
-    return shares | {"rest": rest}
+        fractions[what] = dict(zip(PARTS, (1 - np.array(remaining)).tolist(), strict=True))
+    rest = {part: 1 - sum(fraction[part] for fraction in fractions.values()) for part in PARTS}
+    return fractions | {"rest": rest}
 
 
 def _drawn(
