@@ -29,8 +29,8 @@ TEMPORARY = ".cmmsim-"  # prefix of the names of files and folders that are bein
 def writing(path: Path | str, size: int | None = None) -> Iterator[None]:
     """Convert an OSError or ValueError in the block into a WriteError with a one-line message.
 
-    ``size`` is the number of bytes of the file, if known. The message then names it and the free
-    space.
+    ``size`` is the number of bytes of the file, if known. The message then states this size and the
+    free space.
     """
     try:
         yield

@@ -28,7 +28,7 @@ def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
 
 
 def netcdf(groups: Mapping[str, xr.Dataset]) -> bytes:
-    """Return the bytes of a file with datasets by the names of their groups.
+    """Return the content of a file with datasets, which are given by the names of their groups.
 
     The name ``""`` is the root group. Groups are written one by one, because an `xarray.DataTree`
     would give the group of a truth the coordinates of its record.
@@ -129,7 +129,10 @@ def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
 
 
 def joint_numbers(values: ArrayLike) -> list[int]:
-    """Return joint numbers from 1 on for values (..., N joints), none for fewer than two axes."""
+    """Return the joint numbers 1 to n for values (N, n).
+
+    The list is empty for values with fewer than two axes, whose shape is refused later.
+    """
     shape = np.shape(values)
     return list(range(1, (shape[-1] if len(shape) > 1 else 0) + 1))
 
@@ -251,7 +254,7 @@ def parameter_units(layout: ParameterLayout, others: Sequence[str] = ()) -> dict
 def covariance_netcdf(
     units: Mapping[str, str], covariance: Array, sources: Mapping[str, Array] | None = None
 ) -> bytes:
-    """Return the bytes of a file with a covariance (p, p) of quantities.
+    """Return the content of a file with a covariance (p, p) of quantities.
 
     `units` are the units of the quantities by their names. `sources` are the parts (p, p) of the
     covariance by the names of the sources of uncertainty.

@@ -41,7 +41,7 @@ def has_digest(path: Path | str, content: bytes) -> bool:
 
 
 def check_netcdf(path: Path) -> None:
-    """Check that a netCDF file has the right digest or none, without opening it.
+    """Check that a netCDF file has the right digest or none, without a library for such files.
 
     Raises RecordError if the digest is wrong or the file cannot be read.
     """
@@ -54,7 +54,7 @@ def json_with_digest(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def json_without_digest(path: Path | str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a JSON file without its digest, or raise RecordError if it is wrong."""
+    """Return a JSON file's content without its digest. Raises RecordError for a wrong digest."""
     content = {name: value for name, value in entry.items() if name != KEY}
     if KEY in entry and entry[KEY] != _of_json(content):
         raise RecordError(f"{path} is damaged: {_DIFFERS}; write it anew")

@@ -38,7 +38,7 @@ def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None 
     Raises UntrustedFileError with the reason if a limit is exceeded, if the process dies, or if the
     function raises an exception. A DynamicsError passes unchanged.
     """
-    limited = os.environ | {
+    environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
@@ -51,7 +51,7 @@ def within_limits(read: Callable[..., Any], *given: object, limit_s: int | None 
             input=pickle.dumps((read, given, limit)),
             capture_output=True,
             timeout=START_S + limit,
-            env=limited,
+            env=environment,
             check=False,
         )
     except subprocess.TimeoutExpired:

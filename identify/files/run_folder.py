@@ -52,7 +52,7 @@ class RunFolder:
         self.payload = path / "payload.nc"
         self.covariance = path / "covariance.nc"  # covariance of the estimated parameters
         self.validation = path / "validation.nc"  # records and truth of the validation runs
-        self.model = path / "model.nc"  # poses of the models on the same trajectories
+        self.model = path / "model.nc"  # poses of initial and identified model on all trajectories
         self.result = path / "result.json"  # figures of the run
         self.report = path / "report.html"
         self.figures = path / "figures"
@@ -73,7 +73,7 @@ class RunFolder:
 
     @property
     def records(self) -> tuple[str, ...]:
-        """Names of the records for an identification: runs by name, then that with the payload."""
+        """Names of the files with records, excitation runs first and the payload's run last."""
         runs = sorted(path.name for path in self.path.glob("experiment*.nc"))
         return (*runs, *([self.payload.name] if self.payload.is_file() else []))
 

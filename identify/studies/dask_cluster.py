@@ -5,7 +5,8 @@ batch is split, and each of its rows is computed alone. If a worker dies again d
 the row gets an error.
 
 Everyone who can connect to a scheduler can run code under the account of its owner. A scheduler on
-another machine must therefore be reached by TLS, with the certificates of Dask's configuration.
+another machine must therefore be reached by TLS, with the certificates of Dask's configuration,
+unless the user accepts the risk.
 
 A callback puts finished batches into a queue, which is read with a time limit. The time limit of
 ``distributed.as_completed`` would apply to the whole study, and that function polls ten times a
@@ -77,7 +78,7 @@ class DaskExecutor:
             raise scheduler_lost(error) from error
 
     def _send_more(self, shared: Shared, batches: Batches) -> bool:
-        """Submit batches so that all workers are busy. Return False once no batch is open.
+        """Submit batches so that all workers are busy. Return False once all rows are computed.
 
         Rows during which workers have died come last, one at a time.
         """

@@ -135,7 +135,8 @@ def _figures(
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
     """Plot the rms of each figure with its band against one factor.
 
-    There is a curve for each setting of the other factors. For a sample, single rows are plotted.
+    There is a curve for each setting of the other factors. For a sample, single rows are plotted. A
+    power law of the study is drawn with the rows.
     """
     figure, panels = panel_grid(len(shown), *PANEL)
     others = [other for other in study.factors if other != path]
@@ -191,7 +192,7 @@ def map_figure(
 def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]]) -> Figure:
     """Plot the quantity of each law against its factor, with the power law that is expected.
 
-    The axes are logarithmic.
+    Axes with positive values are logarithmic.
     """
     figure, panels = panel_grid(len(laws), *PANEL)
     # Panels over several factors share one legend, so each label has one look in all of them.

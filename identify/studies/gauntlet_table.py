@@ -96,8 +96,8 @@ _NEEDED = (
 )
 
 
-def _name(names: tuple[str, ...], places: pd.Series) -> list[str]:
-    return ["" if not place >= 0 else names[int(place)] for place in places]
+def _name(names: tuple[str, ...], numbers: pd.Series) -> list[str]:
+    return ["" if not number >= 0 else names[int(number)] for number in numbers]
 
 
 def shares(cases: pd.DataFrame) -> list[Share]:

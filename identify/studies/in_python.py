@@ -89,8 +89,8 @@ class Study:
         Raises
         ------
         StudyError
-            The study is not valid, or a row failed. The other rows are then kept in ``folder``
-            only.
+            The study is not valid, its folder or the memory does not suffice, or a row failed.
+            Finished rows are kept if a ``folder`` is given.
         ScenarioError
             The scenario is not valid, or the factors of the first row contradict each other.
         StudyInterrupted

@@ -64,7 +64,7 @@ SPAWN = get_context("spawn")
 # are set before a process loads its libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 MEMORY_SHARE = 0.95  # largest fraction of the installed memory, of which processes get equal parts
-LOOK_S = 1.0  # interval at which the memory of the processes is checked, s
+LOOK_S = 1.0  # interval of the checks of memory, and longest wait for a process to report, s
 # The study fails after this number of consecutive processes that die before they are ready.
 MOST_FAILED_STARTS = 3
 END_S = 10.0  # longest time to wait for the end of a killed process, s

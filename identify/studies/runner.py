@@ -122,7 +122,7 @@ def run_study(
 
 
 def _rate_limited(show: Callable[[], object]) -> Callable[[], None]:
-    """Return a function that calls `show`, at the intervals of SO_FAR_S and SO_FAR_SHARE."""
+    """Return a function that calls `show` only as often as SO_FAR_S and SO_FAR_SHARE allow."""
     next_time = time.perf_counter() + SO_FAR_S
 
     def show_if_due() -> None:

@@ -201,7 +201,7 @@ def _locked_study(folder: Path, entry: dict[str, Any], rows: int, new: bool) -> 
 
 
 def _check_content(folder: Path) -> None:
-    """Raise StudyError for a path that is a file, or a folder with files of something else."""
+    """Raise StudyError if the path is a file, or if the folder has other files and no study."""
     if folder.exists() and not folder.is_dir():
         raise StudyError(f"study folder {folder} is a file; name another with --out")
     if folder.is_dir() and not (folder / STUDY).exists():

@@ -39,7 +39,7 @@ def write(
     folder   Folder of the study.
     frame    Table of the study.
     figures  Whether plots are drawn.
-    others   Names and finished rows of other studies, which are plotted beside this study.
+    others   Names and finished rows of other studies, which are always plotted beside this study.
 
     Returns the content of summary.json. Raises WriteError if a file cannot be written. Raises
     StudyError as `main_figures` does.

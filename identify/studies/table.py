@@ -3,13 +3,14 @@
 The metadata of the table contain the resolved study. The columns are:
 
 - ``row`` and ``repeat``;
-- ``seed_entropy`` and ``seed_spawn_key``, the arguments of ``numpy.random.SeedSequence``;
+- ``seed_entropy``, as text, and ``seed_spawn_key``, the seed of the row, which is
+  ``numpy.random.SeedSequence(int(seed_entropy), spawn_key=(seed_spawn_key,))``;
 - each factor, under its dotted path;
 - each figure, with the unit in the name;
 - ``seconds``, the computing time, and ``error``.
 
-A failed row has NaN figures, and the reason in ``error``. If only some rows of a user's own kind
-have a figure, the figure is NaN in the other rows.
+A failed row has NaN figures, and the reason in ``error``. A figure that only some rows have is NaN
+in the other rows.
 """
 
 import io

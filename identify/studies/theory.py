@@ -59,13 +59,13 @@ class ScaleRegression:
 def reach(confidence: float, freedom: int) -> float:
     """Return the half-width of Student's interval in standard deviations.
 
-    scipy's function for the interval returns NaN if the standard deviation is zero.
+    `scipy.stats.t.interval` would return NaN for a standard deviation of zero.
     """
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
 
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:
-    """Fit non-negative squares (n,) to exp(design (n, k) @ beta).
+    """Fit exp(design (n, k) @ beta) to non-negative squares (n,).
 
     Raises StudyError if there are too few rows, the columns of the design are linearly dependent,
     the figure is zero in every row, or the fit does not converge.
@@ -194,7 +194,7 @@ class Verdict:
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
-    """Return a verdict for each law of a study, from its table without the failed rows."""
+    """Return a verdict for each law of a study. Failed rows of its table are excluded."""
     done = frame[frame["error"] == ""]
     return [_check(law, study, done) for law in study.theory]
 

@@ -36,11 +36,11 @@ SIMULATED = 4000
 class Uniformity:
     """Test of one figure.
 
-    name           Name of the figure without `PROBABILITY`.
-    point          Values of the factors, as text.
-    values (n,)    The figure in the rows of the point that have it, ascending.
-    p_value        p value of the Kolmogorov-Smirnov test.
-    corrected      p value multiplied by the number of tests (Bonferroni), at most 1.
+    name         Name of the figure without `PROBABILITY`.
+    point        Values of the factors, as text.
+    values (n,)  The figure in the rows of the point that have it, ascending.
+    p_value      p value of the Kolmogorov-Smirnov test.
+    corrected    p value multiplied by the number of tests (Bonferroni), at most 1.
     """
 
     name: str
@@ -155,7 +155,7 @@ def uniformity_figure(found: list[Uniformity]) -> Figure:
 
 
 def table(found: list[Uniformity]) -> list[str]:
-    """Return the lines of a Markdown table of the tests, the worst first."""
+    """Return the lines of a Markdown table of the tests."""
     lines = [
         "| quantity | rows | mean | p value | corrected | verdict |",
         "|---|---|---|---|---|---|",

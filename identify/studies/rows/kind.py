@@ -38,7 +38,7 @@ class IneffectiveKeys:
 
 @dataclass(frozen=True)
 class KeysRead:
-    """Keys that a kind reads, beside all of its options.
+    """Keys that a kind reads, in addition to all of its options.
 
     keys         Dotted paths, or sections that end in a dot.
     excluding    Keys in these sections that the kind does not read.
@@ -50,7 +50,7 @@ class KeysRead:
     ineffective: tuple[IneffectiveKeys, ...] = ()
 
     def covers(self, path: str) -> bool:
-        """Return whether the kind reads a dotted path under at least some condition."""
+        """Return whether the kind reads a dotted path under at least one condition."""
         return path.startswith("options.") or (
             among(path, self.keys) and not among(path, self.excluding)
         )
@@ -219,7 +219,7 @@ _SPELLINGS = [timing(name) for name in IN_FILE]
 
 
 Row = dict[str, float]  # figures of a row by name
-# Setting of all rows: no drift watch of the cameras, because no figure depends on it.
+# Override of a scenario in all rows: no drift watch of the cameras, as no figure depends on it.
 UNWATCHED = {"rig.watch": "none"}
 # Beginning of the names of figures that are probabilities of values below the truth. They are
 # uniform over the rows if the stated distributions are right, see `studies.uniformity`.
@@ -255,8 +255,8 @@ class Kind:
     options        Model of the options. None means that options are not checked.
     reads          Keys that rows read. None means that keys without effect are not refused.
     takes_options  Whether options are allowed.
-    memory         Function (setup, options) that returns the memory needed by a row, bytes. None
-                   means little memory.
+    memory         Function (setup, options) that returns the memory, bytes, that a row needs beyond
+                   that of its process. None means little memory.
     """
 
     name: str

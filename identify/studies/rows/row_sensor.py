@@ -132,10 +132,9 @@ def rms_um(errors: Array) -> float:
 
 
 def stated_um(covariances: Array) -> tuple[float, float]:
-    """Return the rms over poses and axes of the standard deviations of position, um, and
-    orientation, urad.
+    """Return the rms standard deviations of positions, um, and orientations, urad.
 
-    covariances (n, 6, 6): covariances of poses, m and rad.
+    Each rms is over poses and axes. covariances (n, 6, 6): covariances of poses, m and rad.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(

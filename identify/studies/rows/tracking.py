@@ -194,7 +194,7 @@ def _against(done: list[TrackingRun], start: list[TrackingRun], truth: list[Trac
     row: Row = {}
     for name, axes, unit in AXES:
         with_own, with_start, with_truth = (_rms(runs, axes) for runs in (done, start, truth))
-        # If the platform cannot move along these axes, their error is zero, and so has no ratio.
+        # If the platform cannot move along these axes, the errors are zero and have no ratio.
         if with_truth:
             row |= {
                 f"starting_{name}_excess_{unit}": with_start - with_own,
