@@ -124,7 +124,7 @@ def prepared(
             settings, drives=replace(settings.drives, law=known.drive, filter_time=filter_time)
         )
     model = Model(robot, known.parameters, settings.friction, known.doubt)
-    settled = feedback(loop.control, timing)
+    gains = feedback(loop.control, timing)
     usual = np.full(len(times), timing.latency_s)
     in_loop = chosen_law(
         Assignment(
@@ -132,7 +132,7 @@ def prepared(
             motion=motion.motion,
             frames=len(times),
             settings=settings,
-            feedback=settled,
+            feedback=gains,
             holding=plant.holding(desired[0]),
             latencies=usual if latencies is None else latencies,
             noise=seen.noise,
@@ -150,7 +150,7 @@ def prepared(
         )
     # The feedback of this law uses the model, so a wrong model can make it unstable.
     if law == "computed_torque":
-        check_torque_gains(model, settings, desired[0], settled)
+        check_torque_gains(model, settings, desired[0], gains)
     if isinstance(in_loop.controller, EveryFrame):
         return replace(in_loop, controller=EveryFrame(_plugin_law(law, in_loop.controller.command)))
     return replace(in_loop, controller=in_loop.controller and _plugin_law(law, in_loop.controller))
@@ -164,7 +164,6 @@ def _plugin_law(law: str, asked: Callable[..., Any]) -> Callable[..., Any]:
 def feedback(control: Control, timing: Timing) -> Feedback:
     """Return the bandwidth, damping and observer setting for computed_torque."""
     period = timing.frame_period_s
-    # The delay is the latency, half a frame of hold, and one frame of difference quotient.
     delay = timing.latency_s + 1.5 * period
     fastest = FASTEST / period if control.observer else FASTEST_UNSEEN / delay
     return Feedback(control.bandwidth_rad_s or fastest, control.damping, control.observer)

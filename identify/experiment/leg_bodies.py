@@ -69,9 +69,9 @@ def stated_mesh(stated: BodyMesh, name: str) -> trimesh.Trimesh:
 
 @lru_cache(maxsize=16)
 def _drawn(geometry: RobotGeometry) -> tuple[list[Part], tuple[str, ...], NDArray[np.int_]]:
-    """Return the parts of a geometry sorted by body, their names, and their indices (n,) in it."""
+    """Return the parts of a geometry sorted by body, their names, and their former indices (n,)."""
     parts = parts_of(geometry).all
-    order = sorted(range(len(parts)), key=lambda place: parts[place].body)
+    order = sorted(range(len(parts)), key=lambda index: parts[index].body)
     return (
         [parts[index] for index in order],
         tuple(parts[index].name for index in order),

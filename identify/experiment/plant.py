@@ -86,7 +86,7 @@ class Plant:
     nominal : Robot
         Robot that servo and estimator know.
     robot : Robot
-        True robot. It is the same object as `nominal` if the geometry has no error.
+        True robot. It is the same object as `nominal` if geometry and names of parameters agree.
     parameters : ndarray, shape (p,)
         True parameters, SI.
     settings : LoopSettings

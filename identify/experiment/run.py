@@ -110,8 +110,8 @@ def run_plant(
     load        Load on the platform.
     law         Name of the control law. It knows the scenario's initial guess and the stated load.
 
-    Raises TrajectoryError if the trajectory leaves the travel. This is checked before the run.
-    Raises ScenarioError if the law is not possible. Raises LoopFailure if the loop is unstable.
+    Raises TrajectoryError, before the run, if a pose is out of reach, beyond the travel or near a
+    singularity. Raises the errors of `prepared` for a law, and LoopFailure for an unstable loop.
     """
     runs = plant.runs
     times = runs.timing.frame_times(duration_s)
@@ -133,9 +133,9 @@ def run_plant(
         )
         model = guess.values + (0.0 if load is None else load.stated)
         in_loop = prepared(plant, law, KnownModel(model), motion, by_images(eye), latencies.known)
-    motions = plant.run(reference, eye.over(times), latencies.true, true_load, in_loop)
-    record = _record(plant, reference, motions, eye, seed, latencies.known)
-    truth = plant.truth(motions)
+    loop_run = plant.run(reference, eye.over(times), latencies.true, true_load, in_loop)
+    record = _record(plant, reference, loop_run, eye, seed, latencies.known)
+    truth = plant.truth(loop_run)
     if in_loop is not None:
         store_law(record, law, in_loop.drives)
     rng = np.random.default_rng(stream_seed(seed, ANCHOR))
@@ -143,10 +143,10 @@ def run_plant(
     if (
         isinstance(sensor, cmmsim.Sensor)
         and (not runs.rig.exact or sensor.method == "registration")
-        and motions.measured_ok.any()
+        and loop_run.measured_ok.any()
     ):
         # A late exposure shifts a pose in proportion to its rate, so rates are needed.
-        poses = without_gaps(motions.measured, motions.measured_ok)
+        poses = without_gaps(loop_run.measured, loop_run.measured_ok)
         rates = spline_derivatives(poses, runs.timing.frame_rate_hz)[0]
         common = sensor.common_errors(poses, rates)
         store_common_errors(record, CommonErrors(common.names, common.changes, common.covariance))

@@ -68,11 +68,9 @@ class SensorPlan:
     ) -> cmmsim.Sensor:
         """Make the sensor, with its rig errors and the legs of a robot in view.
 
-        A process should make only one sensor, because the sensor owns the renderer.
-
         robot   Robot whose legs are in view.
         seed    Seed of the sensor.
-        taught  Frames taught before.
+        taught  Frames that were taught before.
         known   Rig as the estimator knows it. The default is exact knowledge, or the rig of
                 `taught`.
 
@@ -251,7 +249,7 @@ class SensorInLoop:
     def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
         """Return the measured pose (6,) at a true pose and rate, or None if the platform is lost.
 
-        Only the renderer uses the true pose. The rate causes motion blur.
+        The sensor uses the true pose only to make its images. The rate causes motion blur.
         """
         # Computing the poses of the legs does not count as time of the sensor.
         bodies = robot_transforms(self._robot, pose) if self._sees_bodies else None
@@ -266,5 +264,4 @@ class SensorInLoop:
         return np.asarray(measured.pose, dtype=float)
 
     def _lose(self, frame: int, t: float, reason: str) -> None:
-        """Note why a frame is lost."""
         self.lost.append(f"frame {frame} (t = {t:.3f} s): {reason}")

@@ -94,7 +94,7 @@ def true_parameters(robot: Robot, switches: PlantSwitches) -> Array:
     # Only the values of this guess are used, so its standard deviation is arbitrary.
     values = starting_guess(robot, switches.parameters, 1.0, drive=switches.drive).values
     layout = robot.layout
-    # a view of the values, with one row per joint, or one row of shared gains
+    # A view of the values, with one row per joint, or one row of shared gains.
     gains = values[layout.joint_pid].reshape(-1, len(JOINT_PID))
     for name, gain in switches.drive_gains.items():
         gains[:, JOINT_PID.index(name)] = gain

@@ -35,8 +35,9 @@ IN_FILE = {
 class Timing(Section):
     """Sampling of the pose sensor and of the visual servo.
 
-    A value that a scenario does not state comes from the file of the sensor, except the hold. A
-    measured pose is the pose in the middle of its exposure, which is the time of its frame.
+    Frame rate, exposure, latency, jitter and dropout come from the file of the sensor unless the
+    scenario states them. A measured pose is the pose in the middle of its exposure, which is the
+    time of its frame.
     """
 
     frame_rate_hz: float = quantity(

@@ -183,8 +183,8 @@ def prepare(study: Study, given: Scenario | None = None) -> Shared:
     Raises
     ------
     StudyError
-        The scenario does not exist, or the changes contradict it. The kind, a key, an option, or a
-        figure or factor of a law is unknown (the message suggests valid names). A value is wrong,
+        The scenario does not exist, or the changes contradict it. The kind, a key, an option, a
+        figure, or a law's factor is unknown (the message suggests valid names). A value is wrong,
         rows of this kind do not read a key, or the statistical renderer was not validated for the
         sensor.
     ScenarioError

@@ -32,7 +32,7 @@ class Law(Section):
     per: str | None = Field(None, description="divisor: another figure of the same row")
     factor: str | None = Field(None, description="factor by dotted path")
     exponent: float | None = Field(
-        None, ge=-100, le=100, description="the figure grows as this power of the factor"
+        None, ge=-100, le=100, description="the rms is proportional to this power of the factor"
     )
     equals: str | None = Field(None, description="figure that has the same rms")
     order: list[Any] | None = Field(

@@ -146,7 +146,6 @@ def rows_beside(study: Study, folders: Iterable[Path]) -> list[tuple[str, pd.Dat
 
 
 def _rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
-    """Read name and finished rows of one study."""
     frame, other = read_table(folder / TABLE)
     if other.kind != study.kind or set(other.factors) != set(study.factors):
         ours, theirs = (

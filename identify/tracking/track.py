@@ -130,8 +130,8 @@ def known_model(plant: Plant, model: str) -> KnownModel:
 def model_of_run(plant: Plant, run_folder: Path, own: str) -> KnownModel:
     """Return the model that was identified in a run folder.
 
-    ``own`` is the name or the file of the plant's robot. Raises RecordError if the folder contains
-    no result with estimates, or if its run belongs to another robot.
+    ``own`` is the name or the file of the plant's robot. Raises OutputFolderError if the folder
+    lacks scenario or result, and RecordError if the result has no estimates or is of another robot.
     """
     path = run_folder / "result.json"
     RunFolder(run_folder).require("scenario.toml", "result.json")
@@ -275,9 +275,9 @@ def _shares(
 ) -> dict[str, Any]:
     """Return the fractions of the squared error by cause, for position and orientation.
 
-    A cause's fraction disappears with an exact sensor, an exact model or zero latency. The rest
-    completes the sum to one. All are NaN if a run failed. The measured poses of these runs are
-    drawn with the noise that the sensor stated.
+    A cause's fraction disappears with an exact sensor, with an exact model, or without latency and
+    dropout. The rest completes the sum to one. The measured poses of these runs are drawn with the
+    noise that the sensor stated.
     """
     base = _drawn(task, law, known, covariance, None, advance)
     fractions = {}

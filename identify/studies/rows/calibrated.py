@@ -192,10 +192,9 @@ def random_run(
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: CalibrationOptions) -> Row:
-    """Compute one row.
+    """Compute one row. Raises EstimationError, and the exceptions of experiment and sensor.
 
-    Raises StudyError if plant and model have different parameters, or if no drawn truth has a
-    stable loop. Raises EstimationError, and the exceptions of experiment and sensor.
+    Raises StudyError if plant and model differ in parameters, or if no truth has a stable loop.
     """
     setup = row_setup(scenario, stream_seed(seed, EXPERIMENT))
     settings = scenario.identification

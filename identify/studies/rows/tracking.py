@@ -172,7 +172,6 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
 
 
 def _model(setup: Setup, options: TrackingOptions) -> KnownModel:
-    """Return the model that the law knows."""
     plant = setup.plant
     if options.model_error is not None:
         start, truth = (known_model(plant, name) for name in ("initial", "true"))
