@@ -1,5 +1,7 @@
 """Force and mass matrix of a crank and a link with ten inertial parameters each (CasADi).
 
+The parts of the link are those of a link on a slider, too (`legs.pss`).
+
 The crank only rotates about its axis z. Let r be its length, theta its angle, x the axis along it,
 y = z x x, and g gravity. To the torque about z, the first moments m_x and m_y of the crank add
 
@@ -10,6 +12,7 @@ and only the components x and y of the moment do work.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -20,6 +23,20 @@ from dynamics.spatial_inertia import INERTIAL
 
 if TYPE_CHECKING:
     from dynamics.legs.rss import LegMotion, LegVectors
+
+
+@dataclass(frozen=True)
+class LinkMotion:
+    """Motion of a link from T to A, which does not spin about its own length.
+
+    `tip_acceleration` and `link_acceleration` (3,) are those of T, and of A relative to T, m/s^2.
+    `angular_velocity` and `angular_acceleration` (3,) are those of the link.
+    """
+
+    tip_acceleration: ca.SX
+    link_acceleration: ca.SX
+    angular_velocity: ca.SX
+    angular_acceleration: ca.SX
 
 
 def centred(bodies: Sequence[ca.SX]) -> bool:
@@ -46,22 +63,21 @@ def full_force(
     lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
     torque = mass * lever + izz * motion.crank_acceleration
     torque += mx * (leg.crank_length * motion.crank_acceleration - across) + my * along
-    push, moment_x, moment_y, axes = _link_load(leg, motion, _ten(bodies[1]), gravity)
-    pull = axes @ push / 2
-    turn = (moment_y * axes[:, 0] - moment_x * axes[:, 1]) * (1 / leg.link_length)
+    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
+    pull, turn = link_forces(axes, leg.link_length, motion, _ten(bodies[1]), gravity)
     return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
 
-def _link_load(
-    leg: "LegVectors", motion: "LegMotion", ten: ca.SX, gravity: ca.DM
-) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Force (3,) on the link, moments about x and y of its middle, and its axes (3, 3).
+def link_forces(
+    axes: ca.SX, length: float, motion: LinkMotion, ten: ca.SX, gravity: ca.DM
+) -> tuple[ca.SX, ca.SX]:
+    """Forces (3,) `pull` and `turn` by which a link is moved: pull + turn at A, pull - turn at T.
 
-    Components are in these axes: p, q of the angular velocity, u, v of the angular acceleration,
-    and x, y, z of the acceleration of the middle relative to gravity.
+    `axes` (3, 3) are those of the link. `ten` (10,) are its inertial parameters. Components are in
+    these axes: p, q of the angular velocity, u, v of the angular acceleration, and x, y, z of the
+    acceleration of the middle relative to gravity.
     """
     mass, sx, sy, sz, xx, yy, _, xy, xz, yz = ca.vertsplit(ten)
-    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
     p, q = (ca.dot(axes[:, k], motion.angular_velocity) for k in range(2))
     u, v = (ca.dot(axes[:, k], motion.angular_acceleration) for k in range(2))
     acceleration = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
@@ -76,28 +92,41 @@ def _link_load(
     spun = xz * p + yz * q
     moment_x = sy * z - sz * y + xx * u + xy * v + q * spun
     moment_y = sz * x - sx * z + xy * u + yy * v - p * spun
-    return push, moment_x, moment_y, axes
+    return axes @ push / 2, (moment_y * axes[:, 0] - moment_x * axes[:, 1]) * (1 / length)
 
 
 def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
     """Mass matrix (3, 3) of crank and link at A. For the arguments see `full_force`."""
     mass, mx, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
-    link_mass, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(_ten(bodies[1]))
+    link_mass = bodies[1][0]
     tangent = ca.cross(leg.axis, leg.crank)
     radius = leg.crank_length
     reflected = izz + mx * radius + (mass + link_mass) * (radius**2 / 4)
-    half = gradient @ (link_mass / 4 * tangent).T
-    total = reflected * (gradient @ gradient.T) + link_mass / 4 * ca.SX.eye(3) + half + half.T
-    # rows of the angular velocities p and q, and of the velocity of the middle, in the link's axes
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
-    by_crank = [ca.dot(tangent, axes[:, k]) for k in range(3)]
-    moving = [(axes[:, k] + by_crank[k] * gradient) / 2 for k in range(3)]
-    x, y = ((axes[:, k] - by_crank[k] * gradient) * (1 / leg.link_length) for k in range(2))
+    moving_with_it = link_mass_matrix(axes, leg.link_length, tangent, gradient, _ten(bodies[1]))
+    return symmetric_from_lower(reflected * (gradient @ gradient.T) + moving_with_it)
+
+
+def link_mass_matrix(
+    axes: ca.SX, length: float, tangent: ca.SX, gradient: ca.SX, ten: ca.SX
+) -> ca.SX:
+    """Mass matrix (3, 3) of a link at A, without the part of its mass that is reflected at T.
+
+    T moves by `tangent` (3,) times the rate of the coordinate, whose gradient (3,) is `gradient`.
+    The reflected part is gradient gradient^T times a quarter of the mass and of |tangent|^2.
+    """
+    mass, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(ten)
+    half = gradient @ (mass / 4 * tangent).T
+    total = mass / 4 * ca.SX.eye(3) + half + half.T
+    # rows of the angular velocities p and q, and of the velocity of the middle, in the link's axes
+    by_tip = [ca.dot(tangent, axes[:, k]) for k in range(3)]
+    moving = [(axes[:, k] + by_tip[k] * gradient) / 2 for k in range(3)]
+    x, y = ((axes[:, k] - by_tip[k] * gradient) * (1 / length) for k in range(2))
     p, q = -y, x
     total += xx * (p @ p.T) + yy * (q @ q.T)
     mixed = xy * (p @ q.T) + moving[2] @ (sy * p - sx * q).T
     mixed += sz * (moving[0] @ q.T - moving[1] @ p.T)
-    return symmetric_from_lower(total + mixed + mixed.T)
+    return total + mixed + mixed.T
 
 
 def _ten(body: ca.SX) -> ca.SX:

@@ -6,12 +6,20 @@ does not rotate, and only its mass does work.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
 from pydantic import Field
 
+from dynamics.expressions import symmetric_from_lower
+from dynamics.legs.crank_and_link import (
+    LinkMotion,
+    centred,
+    link_forces,
+    link_mass_matrix,
+)
 from dynamics.legs.leg import (
     Body,
     Direction,
@@ -123,6 +131,50 @@ class PssLeg(Leg):
             ca.SX.zeros(3),
             self._spin(self.link(position), self._link_rate(position, velocity)),
         ]
+
+    def force(
+        self,
+        position: ca.SX,
+        velocity: ca.SX,
+        acceleration: ca.SX,
+        bodies: Sequence[ca.SX],
+        gravity: ca.DM,
+    ) -> ca.SX:
+        slider, ten = bodies
+        if centred([ten]) or self._link_spins:
+            return super().force(position, velocity, acceleration, bodies, gravity)
+        gradient = self.gradient(position)
+        link = self.link(position)
+        link_rate = self._link_rate(position, velocity)
+        of_slider = self.acceleration(position, velocity, acceleration) * self.slider_axis
+        of_link = acceleration - of_slider
+        motion = LinkMotion(
+            tip_acceleration=of_slider,
+            link_acceleration=of_link,
+            angular_velocity=self._spin(link, link_rate),
+            angular_acceleration=self._spin(link, of_link),
+        )
+        axes = link_axes(self.across_from, link * (1 / self.link_length))
+        pull, turn = link_forces(axes, self.link_length, motion, ten, gravity)
+        thrust = slider[0] * (of_slider - gravity) + pull - turn
+        return pull + turn + gradient * ca.dot(self.slider_axis, thrust)
+
+    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+        slider, ten = bodies
+        if centred([ten]) or self._link_spins:
+            return super().mass(position, bodies)
+        gradient = self.gradient(position)
+        axes = link_axes(self.across_from, self.link(position) * (1 / self.link_length))
+        moving_with_it = link_mass_matrix(
+            axes, self.link_length, ca.SX(self.slider_axis), gradient, ten
+        )
+        reflected = (slider[0] + ten[0] / 4) * (gradient @ gradient.T)
+        return symmetric_from_lower(reflected + moving_with_it)
+
+    @property
+    def _link_spins(self) -> bool:
+        """True if the link turns about its own length."""
+        return "Izz" in self.bodies[1].moments
 
     def segments(self) -> list[Segment]:
         origin = np.zeros(3)

@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.crank_and_link import centred, full_force, full_mass
+from dynamics.legs.crank_and_link import LinkMotion, centred, full_force, full_mass
 from dynamics.legs.leg import (
     EXACT,
     ROUNDED,
@@ -58,20 +58,10 @@ class LegVectors:
 
 
 @dataclass(frozen=True)
-class LegMotion:
-    """Motion of crank and link.
-
-    `crank_acceleration` is an angular acceleration, rad/s^2. `tip_acceleration` and
-    `link_acceleration` (3,) are the second time derivatives of the crank and link vectors, m/s^2.
-    `angular_velocity` and `angular_acceleration` (3,) are those of the link, which does not spin
-    about its own axis.
-    """
+class LegMotion(LinkMotion):
+    """Motion of crank and link. `crank_acceleration` is an angular acceleration, rad/s^2."""
 
     crank_acceleration: ca.SX
-    tip_acceleration: ca.SX
-    link_acceleration: ca.SX
-    angular_velocity: ca.SX
-    angular_acceleration: ca.SX
 
 
 class RssLeg(Leg):
@@ -365,11 +355,11 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
     link_acceleration = acceleration - tip_acceleration
     per_square = 1 / leg.link_length**2
     return LegMotion(
-        crank_acceleration,
         tip_acceleration,
         link_acceleration,
         ca.cross(leg.link, link_rate) * per_square,
         ca.cross(leg.link, link_acceleration) * per_square,
+        crank_acceleration,
     )
 
 

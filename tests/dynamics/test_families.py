@@ -248,15 +248,16 @@ def test_joint_coordinates_are_nan_exactly_where_a_leg_cannot_reach(robot):
     assert 50 < (reach > 0).sum() < reach.size - 50
 
 
+@pytest.mark.parametrize("count", [4, 10], ids=["centred", "full"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind):
+def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind, count):
     """Closed forms are those of `Leg` to 1e-12 where the leg can move; the force at rest, mass
     acceleration and C velocity add up to the force."""
     name = {"rss": "rss6", "parallelogram": "delta3", "rrr": "rrr3"}.get(kind, f"{kind}6")
     robot, rng = dynamics.load_robot(name), np.random.default_rng(4)
     leg, at_home = robot.geometry.legs[1], robot.geometry.joints_at(robot.home_pose)[1]
     symbols = [ca.SX.sym(label, 3) for label in ("position", "velocity", "acceleration")]
-    own, gravity = [ca.SX.sym("rigid", 4), ca.SX.sym("rigid", 4)], ca.DM([0.4, -0.3, -9.81])
+    own, gravity = [ca.SX.sym("rigid", count) for _ in range(2)], ca.DM([0.4, -0.3, -9.81])
     at, moving, _ = symbols
     outputs = [
         *(leg.force(*symbols, own, gravity), Leg.force(leg, *symbols, own, gravity)),
@@ -268,7 +269,7 @@ def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind):
     for _ in range(50):
         position = at_home + 0.02 * planar * rng.standard_normal(3)
         velocity, acceleration = planar * rng.standard_normal((2, 3))
-        found = function(position, velocity, acceleration, *rng.uniform(0.1, 1, (2, 4)))
+        found = function(position, velocity, acceleration, *rng.uniform(0.1, 1, (2, count)))
         force, by_work, mass, mass_by_work, coriolis, holding = (np.array(value) for value in found)
         grown = holding[:, 0] + mass @ acceleration + coriolis @ velocity
         ours, other, of_parts = (planar * part for part in (force[:, 0], by_work[:, 0], grown))

@@ -19,7 +19,11 @@ from dynamics.pseudo_inertia import (
     nearest_body,
     pseudo_inertia,
 )
-from dynamics.rigid_body.equation_of_motion import equation_of_motion, motion_derivatives
+from dynamics.rigid_body.equation_of_motion import (
+    equation_of_motion,
+    motion_derivatives,
+    stop_derivatives,
+)
 from dynamics.rigid_body.passive_friction import SLOW
 from tests.dynamics.conftest import SLOW_ROBOTS
 
@@ -318,11 +322,21 @@ def test_full_bodies_of_a_robot_file(load_changed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "delta3",
+        "pss6",
+        *(
+            pytest.param(name, marks=pytest.mark.thorough)
+            for name in ("rrr3", "rss6", "rus6", "pus6", "ups6")
+        ),
+    ],
+)
 def test_full_bodies_cost_few_more_operations_than_centred_ones(name):
     """At most 1.6 times as many, in the equation of motion and in its derivatives."""
     robot = dynamics.load_robot(name)
     full = robot.with_full_bodies(["all"])
-    for function in (equation_of_motion, motion_derivatives):
+    for function in (equation_of_motion, motion_derivatives, stop_derivatives):
         ours, theirs = (function(one.geometry).whole.n_instructions() for one in (full, robot))
         assert ours <= 1.6 * theirs, function.__name__
