@@ -125,8 +125,8 @@ class Plant(_Side):
     values: dict[str, float] = Field(
         {},
         description="true values of single parameters, instead of those of the parameter set, SI; "
-        "a body with a first moment or a product of inertia is a full body, and a passive joint "
-        "with friction has it; "
+        "a stated first moment or product of inertia makes a body full, and stated friction of a "
+        "passive joint exists; "
         '{ "platform.mcz" = 0.7 }, or with gains = "each" { "joint3.lp" = 11 }',
     )
     drive: DriveName = Field(
@@ -174,7 +174,7 @@ class Plant(_Side):
     command_limits_rad: list[float] | None = Field(
         None,
         description="lowest and highest command that the drives take, rad, the same for all "
-        "joints; they cut commands beyond",
+        "joints; commands beyond are clipped",
         min_length=2,
         max_length=2,
         json_schema_extra={"unit": "rad"},
@@ -210,7 +210,7 @@ class Plant(_Side):
         ge=0,
         le=1e-2,
     )
-    geometry_seed: int = quantity(0, "1", "seed of these errors", ge=0)
+    geometry_seed: int = quantity(0, "1", "seed of the drawn geometry and joint zeros", ge=0)
     joint_stiffness_N_m_rad: float | None = quantity(
         None,
         "N m/rad",

@@ -134,7 +134,7 @@ class Rig(Section):
     right_later_std_s: float = quantity(
         0.0,
         "s",
-        "standard deviation of that delay, which the estimator assumes to be zero",
+        "standard deviation of that delay, whose expected value is zero",
         ge=0,
         le=0.1,
     )
@@ -235,7 +235,11 @@ class Identification(Section):
         1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1
     )
     qr_threshold: float = quantity(
-        1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", ge=1e-15, le=1
+        1e-3,
+        "1",
+        "diagonal entries of R above this value count in base_rank (section 4.2)",
+        ge=1e-15,
+        le=1,
     )
 
     @model_validator(mode="after")
