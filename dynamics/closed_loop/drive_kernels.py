@@ -1,9 +1,11 @@
-"""Kernels of the drives: the joint PID, its torque limit, and its conditional integration.
+"""Kernels of the drives: the received command, the joint PID, and its limits.
 
 `drives` has the formula (eq. 31) and the laws.
 """
 
-from dynamics.compiled.kernel import Record, kernel
+import numpy as np
+
+from dynamics.compiled.kernel import Array, Record, kernel
 
 
 @kernel
@@ -63,3 +65,26 @@ def winds_up(task: Record, at: Record, joint: int) -> bool:
         return False
     growth = task.li[joint] * at.error[joint] - task.lx[joint] * at.velocity[joint]
     return bool(growth * at.torque[joint] > 0)
+
+
+@kernel
+def received(task: Record, command: float, joint: int) -> float:
+    """Command that a drive receives if `command` is sent. See `drives`."""
+    if task.command_step > 0:
+        command = task.command_step * np.rint(command / task.command_step)
+    command = min(max(command, task.command_low), task.command_high)
+    return task.command_scale * command + task.joint_zero[joint]
+
+
+@kernel
+def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
+    """Turn derivatives of sent commands (n,) into those of received commands, by their scale.
+
+    The derivatives of a command that is cut at a limit are zero. Rounding to steps is ignored.
+    """
+    for i in range(len(rows)):
+        inside = task.command_low <= sent[i] <= task.command_high
+        scale = task.command_scale if inside else 0.0
+        if scale != 1.0:
+            for k in range(width):
+                rows[i, k] *= scale

@@ -1,8 +1,8 @@
 """Execution of a run: the kernels process its frames in the memory that is set up here.
 
-The kernels run compiled. Tests also run the same code as plain Python, to compare both. If a sensor
-or a controller is a Python function, the kernels process one frame at a time. They return a status,
-which the error of a run that ends early puts into words.
+The kernels run compiled. Tests run them as plain Python, too, to compare both. If a sensor or a
+controller is a Python function, they process one frame at a time. They return a status, which the
+error of a run that ends early puts into words.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ import numpy as np
 
 from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
-from dynamics.closed_loop.frame_kernels import measure_ideally, run_frames
+from dynamics.closed_loop.frame_kernels import run_frames
 from dynamics.closed_loop.lane_kernels import run_lanes
 from dynamics.closed_loop.loop_settings import IDEAL, EveryFrame, IdealSensor, RateSensor
 from dynamics.closed_loop.motion_kernels import (
@@ -30,6 +30,7 @@ from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure, saturated_frame
 from dynamics.closed_loop.run_memory import Memory, Plan, empty, empty_memory, empty_record
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent, whole_vectors
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
+from dynamics.closed_loop.visual_servo_kernels import measure_ideally
 from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import DynamicsError, SimulationError

@@ -1,19 +1,12 @@
-"""Kernels for the frames of a run: measurement, command and record.
+"""Kernels that run the frames of a run: its start, the commands that act, and its record.
 
-Without given commands, the visual servo computes the command at a measured frame. At a lost frame,
-it repeats its previous command. The feedforward is added at every frame. The arguments `task`,
-`now`, `at`, `d`, `plan` and `record` are explained in `run_memory`.
+At the beginning of a frame, `visual_servo_kernels.issue_command` measures the pose and computes the
+command. The arguments `task`, `now`, `at`, `d`, `plan` and `record` are explained in `run_memory`.
 """
 
-import numpy as np
-
-from dynamics.closed_loop.linear_algebra_kernels import (
-    add,
-    copy,
-    copy_rows,
-    fill,
-)
-from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
+from dynamics.closed_loop.drive_kernels import received, scale_received
+from dynamics.closed_loop.linear_algebra_kernels import copy, copy_rows
+from dynamics.closed_loop.motion_kernels import OK
 from dynamics.closed_loop.stick_slip_kernels import (
     NO_MARGIN,
     begin_span,
@@ -21,7 +14,7 @@ from dynamics.closed_loop.stick_slip_kernels import (
     next_step,
     try_step,
 )
-from dynamics.closed_loop.visual_servo_kernels import serve
+from dynamics.closed_loop.visual_servo_kernels import issue_command
 from dynamics.compiled.kernel import Array, Record, entry, invoke, kernel
 
 
@@ -96,76 +89,9 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
 
 
 @kernel
-def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
-    """Measure the pose of a frame as the ideal sensor does."""
-    row = now.first_row + k
-    seen = len(plan.lost) == 0 or not plan.lost[k]
-    measured = record.measured[row]
-    record.measured_ok[row] = seen
-    copy(now.state[: len(measured)], measured)
-    if not seen:
-        fill(measured, np.nan)
-    if len(plan.noise) > 0:
-        add(plan.noise[row], measured)
-
-
-@kernel
-def issue_command(
-    task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
-) -> int:
-    """Measure the pose, unless Python has done so, and record the command that is issued.
-
-    Returns MEASURED_OUT_OF_REACH if the command is not finite.
-    """
-    if not task.measured:
-        measure_ideally(now, plan, record, k)
-    now.elapsed += task.period
-    row = now.first_row + k
-    if len(plan.commands) > 0:
-        copy(plan.commands[k], now.last_command[:])
-    elif record.measured_ok[row]:
-        serve(task, now, d, plan, record.measured[row], k)
-    copy(now.last_command[:], record.command[row])
-    if len(plan.feedforward) > 0:
-        add(plan.feedforward[k], record.command[row])
-    if task.sensitivities:
-        issued = d.issued[k % (len(d.issued) - 1)]
-        copy_rows(d.last_command[:], issued, now.width)
-        if len(plan.directions) > 0:
-            for i in range(len(now.mode)):
-                for j in range(plan.directions.shape[2]):
-                    issued[i, now.parameters + j] += plan.directions[k, i, j]
-        scale_received(task, record.command[row], issued, now.width)
-    return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
-
-
-@kernel
 def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
     """Command of a joint by number. -1 is the newest command from before the start."""
     return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
-
-
-@kernel
-def received(task: Record, command: float, joint: int) -> float:
-    """Command that a drive receives if `command` is sent. See `drives`."""
-    if task.command_step > 0:
-        command = task.command_step * np.rint(command / task.command_step)
-    command = min(max(command, task.command_low), task.command_high)
-    return task.command_scale * command + task.joint_zero[joint]
-
-
-@kernel
-def scale_received(task: Record, sent: Array, rows: Array, width: int) -> None:
-    """Turn derivatives of sent commands (n,) into those of received commands, by their scale.
-
-    The derivatives of a command that is cut at a limit are zero. Rounding to steps is ignored.
-    """
-    for i in range(len(rows)):
-        inside = task.command_low <= sent[i] <= task.command_high
-        scale = task.command_scale if inside else 0.0
-        if scale != 1.0:
-            for k in range(width):
-                rows[i, k] *= scale
 
 
 @kernel

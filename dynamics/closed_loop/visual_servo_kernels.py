@@ -4,13 +4,69 @@ The joint command is U = J_theta [kp e + kd e_dot + ki integral(e)]. J_theta is 
 joints, and e is the desired minus the measured pose of the frame. The measured pose rate is the
 difference of the newest two measurements divided by the time between them. The start state has the
 measurement before the first frame. The integral is the sum of the errors, up to this frame, times
-the frame period. At a lost frame, `issue_command` in `frame_kernels` does not call the servo: its
-last measurement, integral and command stay as they are.
+the frame period. At a lost frame the servo does not run: its last measurement, integral and command
+stay as they are. The feedforward is added at every frame.
 """
 
-from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, dot
+import numpy as np
+
+from dynamics.closed_loop.drive_kernels import scale_received
+from dynamics.closed_loop.linear_algebra_kernels import (
+    add,
+    add_product,
+    clear,
+    copy,
+    copy_rows,
+    dot,
+    fill,
+)
+from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
 from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
 from dynamics.compiled.kernel import Array, Record, call, kernel
+
+
+@kernel
+def issue_command(
+    task: Record, now: Record, d: Record, plan: Record, record: Record, k: int
+) -> int:
+    """Measure the pose, unless Python has done so, and record the command that is issued.
+
+    Returns MEASURED_OUT_OF_REACH if the command is not finite.
+    """
+    if not task.measured:
+        measure_ideally(now, plan, record, k)
+    now.elapsed += task.period
+    row = now.first_row + k
+    if len(plan.commands) > 0:
+        copy(plan.commands[k], now.last_command[:])
+    elif record.measured_ok[row]:  # a lost frame repeats the command before
+        serve(task, now, d, plan, record.measured[row], k)
+    copy(now.last_command[:], record.command[row])
+    if len(plan.feedforward) > 0:
+        add(plan.feedforward[k], record.command[row])
+    if task.sensitivities:
+        issued = d.issued[k % (len(d.issued) - 1)]
+        copy_rows(d.last_command[:], issued, now.width)
+        if len(plan.directions) > 0:
+            for i in range(len(now.mode)):
+                for j in range(plan.directions.shape[2]):
+                    issued[i, now.parameters + j] += plan.directions[k, i, j]
+        scale_received(task, record.command[row], issued, now.width)
+    return OK if all_finite(record.command[row : row + 1]) else MEASURED_OUT_OF_REACH
+
+
+@kernel
+def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
+    """Measure the pose of a frame as the ideal sensor does."""
+    row = now.first_row + k
+    seen = len(plan.lost) == 0 or not plan.lost[k]
+    measured = record.measured[row]
+    record.measured_ok[row] = seen
+    copy(now.state[: len(measured)], measured)
+    if not seen:
+        fill(measured, np.nan)
+    if len(plan.noise) > 0:
+        add(plan.noise[row], measured)
 
 
 @kernel
