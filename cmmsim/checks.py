@@ -53,8 +53,8 @@ def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> NDAr
     message begins with ``wanted``, a sentence that states what is required.
     """
     try:
-        found = np.asarray(values)
-        numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
+        array = np.asarray(values)
+        numbers = array.astype(float) if array.dtype.kind in "fiubO" else None
     except (TypeError, ValueError, OverflowError):  # ragged lists, or objects that are not numbers
         numbers = None
     if numbers is None:
@@ -142,9 +142,9 @@ def checked(model: type[M], content: dict[str, Any], source: str, error_class: t
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        found = error.errors()
-        said = [_explain(details, model) for details in found[:MOST_COMPLAINTS]]
-        more = len(found) - len(said)
+        problems = error.errors()
+        said = [_explain(details, model) for details in problems[:MOST_COMPLAINTS]]
+        more = len(problems) - len(said)
         said += [f"and {more} more"] if more else []
         raise error_class(f"{source}: {'; '.join(said)}") from error
 

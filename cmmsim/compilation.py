@@ -100,9 +100,9 @@ def _ours_alone(folder: Path, source: Path) -> bool:
         if source.stat().st_mode & OTHERS:
             return True
         trusted.add(source.stat().st_uid)
-    for place in (folder.parent, folder):
-        if _is_open(place) and place.stat().st_uid == os.geteuid():
-            place.chmod(stat.S_IMODE(place.stat().st_mode) & ~OTHERS)
+    for directory in (folder.parent, folder):
+        if _is_open(directory) and directory.stat().st_uid == os.geteuid():
+            directory.chmod(stat.S_IMODE(directory.stat().st_mode) & ~OTHERS)
     for file in folder.glob("*.nb?"):
         if _is_open(file) and file.lstat().st_uid == os.geteuid():
             file.unlink(missing_ok=True)

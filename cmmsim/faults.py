@@ -149,8 +149,8 @@ class FaultGenerator:
         require_kind(
             rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)"
         )
-        found = getattr(self, f"_{kind}")(checked_pose(pose), rng)
-        return found if isinstance(found, Fault) else Fault(kind, tuple(found))
+        drawn = getattr(self, f"_{kind}")(checked_pose(pose), rng)
+        return drawn if isinstance(drawn, Fault) else Fault(kind, tuple(drawn))
 
     def _outlines(
         self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0

@@ -71,8 +71,8 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
     half_movement = 0.5 * camera.exposure * rates
     # The platform is assumed at its expected pose in mid-exposure. Its movement is the true one.
     to_expected = expected @ invert(transforms_of(poses))
-    first = to_expected @ transforms_of(poses - half_movement)
-    last = to_expected @ transforms_of(poses + half_movement)
+    at_start = to_expected @ transforms_of(poses - half_movement)
+    at_end = to_expected @ transforms_of(poses + half_movement)
     half_period_movement = 0.5 * frames.period * rates
     before = to_expected @ transforms_of(poses - half_period_movement)
     after = to_expected @ transforms_of(poses + half_period_movement)
@@ -80,7 +80,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
 
     def block(part: slice) -> MeasuredExposures:
         images = camera.look_many(poses[part], rngs[part], frames.obstacles, rates[part])
-        ends = (first[part], last[part]), (before[part], after[part])
+        ends = (at_start[part], at_end[part]), (before[part], after[part])
         return measure_exposures(estimator, images, expected[part], *ends)
 
     return on_all_cores(block, parts, camera.formation.renderer)

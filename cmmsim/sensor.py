@@ -318,9 +318,9 @@ class Sensor(Instrument):
         placed = self.true_cameras.placed(obstacles)
         if isinstance(camera, VirtualStereoCamera):
             blocks = measure_frames(camera, self._frames(pose_values, rates, search_poses, placed))
-            found = MeasuredPoses.of([each.found for each in blocks])
+            measured = MeasuredPoses.of([each.found for each in blocks])
         elif isinstance(tracker := self._new_tracker(), Tracker):
-            found = MeasuredPoses.of_each(
+            measured = MeasuredPoses.of_each(
                 measure_without_images(
                     camera, self._frames(pose_values, rates, search_poses, placed)
                 )
@@ -328,10 +328,10 @@ class Sensor(Instrument):
         else:
             rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
             self._frame += len(pose_values)
-            found = tracker.measure_many(
+            measured = tracker.measure_many(
                 camera, camera.exposed(pose_values, rates), camera.placed(placed), rng
             )
-        return found.without(self._dropout_rng.random(len(pose_values)) < self.timing.dropout)
+        return measured.without(self._dropout_rng.random(len(pose_values)) < self.timing.dropout)
 
     def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
         """Measure a platform at rest in many frames, without dropouts.

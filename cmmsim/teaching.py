@@ -158,8 +158,8 @@ class Teacher:
         except LostError as error:
             raise TeachingError(f"teaching failed: {error}") from error
         base_from_camera = invert(camera_from_base)
-        found = platform_frame(self.platform, seen, self._constant(seen[0].points))
-        places, place_covariances, platform_covariance = found
+        constellation = platform_frame(self.platform, seen, self._constant(seen[0].points))
+        places, place_covariances, platform_covariance = constellation
         return Taught(
             sensor_name,
             base_from_camera,

@@ -283,8 +283,8 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
     error, divided by 6.
     """
     measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
-    turn = rotation_log(measured[:3, :3] @ FIRST_FROM_SECOND[:3, :3].T)
-    error = np.concatenate([measured[:3, 3] - FIRST_FROM_SECOND[:3, 3], turn])
+    rotation_error = rotation_log(measured[:3, :3] @ FIRST_FROM_SECOND[:3, :3].T)
+    error = np.concatenate([measured[:3, 3] - FIRST_FROM_SECOND[:3, 3], rotation_error])
     distance = float(np.linalg.norm(measured[:3, 3]) - np.linalg.norm(FIRST_FROM_SECOND[:3, 3]))
     covariance = relative_covariance(first, second)
     return error, distance, float(error @ np.linalg.solve(covariance, error)) / 6.0
@@ -307,6 +307,6 @@ def _small_covariance(measurement: Measurement) -> Array:
 
     It is computed from the measurement's covariance, which is for Euler angles.
     """
-    turn = np.eye(6)
-    turn[3:, 3:] = euler_rates_matrix(measurement.pose)
-    return np.asarray(turn @ measurement.covariance @ turn.T)
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] = euler_rates_matrix(measurement.pose)
+    return np.asarray(jacobian @ measurement.covariance @ jacobian.T)

@@ -51,15 +51,15 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
         :, : len(values)
     ]
     limits = {
-        k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
-        for k, v in _mean_rms_p95(values[drawn]).items()
+        key: np.percentile(resampled, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
+        for key, resampled in _mean_rms_p95(values[drawn]).items()
     }
     by_name = {name: float(value) for name, value in _mean_rms_p95(values).items()}
     return Statistics(
         len(values),
         **by_name,
         maximum=float(values.max()),
-        interval={k: (float(a), float(b)) for k, (a, b) in limits.items()},
+        interval={key: (float(low), float(high)) for key, (low, high) in limits.items()},
     )
 
 

@@ -174,14 +174,14 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
         )
     points = apply(camera_from_volume, corners)
     pixels, valid = rig.project(points)
-    for camera, name, spots, ahead in zip(
+    for camera, name, corner_pixels, ahead in zip(
         rig.cameras, ("left", "right"), pixels, valid, strict=True
     ):
-        inside = ahead & camera.shows(spots, MARGIN_PX)
+        inside = ahead & camera.shows(corner_pixels, MARGIN_PX)
         if not inside.all():
             k = int(np.flatnonzero(~inside)[0])
             corner = ", ".join(f"{1e3 * v:+.0f}" for v in corners[k])
-            x, y = spots[k]
+            x, y = corner_pixels[k]
             return (
                 f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, "
                 f"whose image has {camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of "

@@ -255,10 +255,14 @@ def _minimise(
     """
     damping = 1e-4
     normal = build(state)
-    k = free.shape[1]
+    free_count = free.shape[1]
     for step in range(1, MOST_STEPS + 1):
         common, boards = normal.step(damping)
-        trial = state.moved(common[: 2 * k].reshape(2, k) @ free.T, common[2 * k :], boards)
+        trial = state.moved(
+            common[: 2 * free_count].reshape(2, free_count) @ free.T,
+            common[2 * free_count :],
+            boards,
+        )
         attempt = build(trial)
         if attempt.cost < normal.cost:
             gain = (normal.cost - attempt.cost) / normal.cost
@@ -297,14 +301,14 @@ def _normal_equations(
         # Sightings are sorted by view, so that each view is a slice.
         edges = np.searchsorted(seen.view, np.arange(views + 1))
         for v, (first, last) in enumerate(pairwise(edges)):
-            jc = by_common[first:last].reshape(-1, common)
-            e = error[first:last].ravel()
-            jb = by_board[first:last].reshape(-1, POSE)
-            matrix[v, COMMON, COMMON] += jc.T @ jc
-            matrix[v, COMMON, BOARD] += jc.T @ jb
-            matrix[v, BOARD, BOARD] += jb.T @ jb
-            rhs[v, COMMON] += jc.T @ e
-            rhs[v, BOARD] += jb.T @ e
+            common_part = by_common[first:last].reshape(-1, common)
+            error_part = error[first:last].ravel()
+            board_part = by_board[first:last].reshape(-1, POSE)
+            matrix[v, COMMON, COMMON] += common_part.T @ common_part
+            matrix[v, COMMON, BOARD] += common_part.T @ board_part
+            matrix[v, BOARD, BOARD] += board_part.T @ board_part
+            rhs[v, COMMON] += common_part.T @ error_part
+            rhs[v, BOARD] += board_part.T @ error_part
     cost = float(sum(np.sum(r**2) for r in residuals))
     return _Normal(matrix, rhs, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf)
 
@@ -317,7 +321,7 @@ def _predict(
     The derivatives are with respect to the common unknowns (m, 2, c) and to the pose of the view's
     board (m, 2, 6).
     """
-    k = free.shape[1]
+    free_count = free.shape[1]
     left_from_board = state.left_from_boards[seen.view]
     turned = np.einsum("mij,mj->mi", left_from_board[:, :3, :3], points[seen.point])
     camera_points = turned + left_from_board[:, :3, 3]
@@ -335,9 +339,9 @@ def _predict(
     )
     # A step that puts a board behind a camera must not count as an improvement.
     pixels[~ahead] = np.inf
-    by_common = np.zeros((len(camera_points), 2, 2 * k + POSE))
-    by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
+    by_common = np.zeros((len(camera_points), 2, 2 * free_count + POSE))
+    by_common[:, :, side * free_count : (side + 1) * free_count] = by_intrinsics @ free
     if side == 1:
-        by_common[:, :, 2 * k : 2 * k + 3] = by_point
-        by_common[:, :, 2 * k + 3 :] = by_point @ -skew(turned)
+        by_common[:, :, 2 * free_count : 2 * free_count + 3] = by_point
+        by_common[:, :, 2 * free_count + 3 :] = by_point @ -skew(turned)
     return pixels, by_common, by_point @ point_by_board

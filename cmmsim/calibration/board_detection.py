@@ -98,29 +98,29 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     """Return the view of the board in a grey image, or the reason why there is none, as a text."""
     radius: float | None = None
     if board.kind == "chessboard":
-        found = find_chessboard(grey, board.columns, board.rows)
+        pixels = find_chessboard(grey, board.columns, board.rows)
     elif board.kind == "charuco":
-        found = find_charuco(grey, board)
+        pixels = find_charuco(grey, board)
     else:
-        found, radius = find_dots(grey, board) or (None, None)
-    if found is None and board.kind == "charuco":
+        pixels, radius = find_dots(grey, board) or (None, None)
+    if pixels is None and board.kind == "charuco":
         count = len(find_tags(grey, board.markers, "none"))
         return (
             f"no charuco of {board.columns} x {board.rows} corners found, but {count} markers of "
             f"{board.dictionary}"
         )
-    if found is None:
+    if pixels is None:
         squares = board.kind == "chessboard" and counts_squares(grey, board.columns, board.rows)
         hint = ", but one with a corner less in each row and column: count inner corners"
         return f"no {board.kind} of {board.columns} x {board.rows} found{hint if squares else ''}"
-    measured = np.isfinite(found).all(axis=1)
-    fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(found)
+    measured = np.isfinite(pixels).all(axis=1)
+    fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(pixels)
     if measured.sum() < fewest:
         other = radius_differs(radius, board.radius)
         why = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" if other else ""
-        return f"only {measured.sum()} of {len(found)} points are sharp and whole{why}"
+        return f"only {measured.sum()} of {len(pixels)} points are sharp and whole{why}"
     return _as_seen_from_the_front(
-        board, BoardView(np.flatnonzero(measured), found[measured], radius)
+        board, BoardView(np.flatnonzero(measured), pixels[measured], radius)
     )
 
 
@@ -200,15 +200,15 @@ def _refine(
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     fine = np.full_like(rough, np.nan)
     ratios = np.full(len(rough), np.nan)
-    spread = None
+    psf_px = None
     for size in np.unique(sizes)[::-1]:
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
         windows = cut_windows(bright, corners, int(size))
         isolated = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
-        spread = _point_spread(isolated[:PROBED], corners[:PROBED]) if spread is None else spread
+        psf_px = _point_spread(isolated[:PROBED], corners[:PROBED]) if psf_px is None else psf_px
         fits = fit_ellipses(
-            isolated, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread
+            isolated, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, psf_px
         )
         moved = np.linalg.norm(fits.centres - rough[chosen], axis=1)
         clean = fits.good & (moved < np.maximum(LARGEST_MOVE * largest[chosen], 0.5))

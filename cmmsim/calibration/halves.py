@@ -247,13 +247,13 @@ def compare_halves(
     for _ in range(splits):
         order = rng.permutation(len(pairs))
         chosen = [[pairs[k] for k in sorted(part)] for part in (order[:half], order[half:])]
-        found = []
+        calibrations = []
         for part in chosen:
-            found.append(calibrate(board, part, size, options))
+            calibrations.append(calibrate(board, part, size, options))
             advance()
-        squares.append(squared_differences(found[0].known, found[1].known))
-        used = [_seen_by_both(one, part) for one, part in zip(found, chosen, strict=True)]
-        distances += [measured_distances(found[k], used[k], used[1 - k]) for k in range(2)]
+        squares.append(squared_differences(calibrations[0].known, calibrations[1].known))
+        used = [_seen_by_both(one, part) for one, part in zip(calibrations, chosen, strict=True)]
+        distances += [measured_distances(calibrations[k], used[k], used[1 - k]) for k in range(2)]
     return Halves(np.array(squares), distances)
 
 

@@ -161,9 +161,9 @@ def _drawn_numbers(
 
     ``first`` is the index of the first of these tries for the pose of the given ``number``.
     """
-    turn = (4 + 2 * number) % CELLS**2
+    own_cell = (4 + 2 * number) % CELLS**2
     if first < TRIES // 2:
-        return np.full(count, turn), rng.random((count, 6))
+        return np.full(count, own_cell), rng.random((count, 6))
     drawn = [(int(rng.integers(CELLS**2)), rng.random(6)) for _ in range(count)]
     return np.array([cell for cell, _ in drawn]), np.array([numbers for _, numbers in drawn])
 
@@ -174,9 +174,9 @@ def _poses_of(
     """Return poses left_from_board (n, 4, 4) that show the middle (3,) of a board in given cells.
 
     ``cells`` (n,) are cells of the image of camera ``side``, and ``depth`` is the mean depth, m.
-    Numbers (n, 6) from 0 to 1 determine the exact depth, the pixel and the tilt. The front first
-    faces the middle of the baseline. Then the board is turned within its plane, and tilted about a
-    random axis in that plane.
+    Numbers (n, 6) from 0 to 1 determine the exact depth, the pixel, the tilt and the turn. The
+    front first faces the middle of the baseline. Then the board is turned within its plane, and
+    tilted about a random axis in that plane.
     """
     camera = rig.cameras[side]
     from_left = rig.from_camera[side]

@@ -61,10 +61,10 @@ def find_charuco(grey: NDArray[np.uint8], board: Board) -> Array | None:
         corners, index, markers, _ = detector.detectBoard(grey)
         if index is not None and len(index) >= FEWEST_CORNERS:
             seen = np.ravel(index)
-            found = np.full((board.rows * board.columns, 2), np.nan)
+            pixels = np.full((board.rows * board.columns, 2), np.nan)
             rough = np.asarray(corners, dtype=float).reshape(-1, 2)
-            found[seen] = _refined(grey, board, rough, seen, np.reshape(markers, (-1, 4, 2)))
-            return found
+            pixels[seen] = _refined(grey, board, rough, seen, np.reshape(markers, (-1, 4, 2)))
+            return pixels
     return None
 
 

@@ -137,8 +137,8 @@ def _require_variety(
 def _distance(a: BoardView, b: BoardView) -> float:
     """Return the rms distance of the points that both views show, px; inf if they share none."""
     _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
-    gap: Array = a.pixels[in_a] - b.pixels[in_b]
-    return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
+    difference: Array = a.pixels[in_a] - b.pixels[in_b]
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=1)))) if len(difference) else np.inf
 
 
 def _with_agreeing_orders(
@@ -192,13 +192,13 @@ def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
     """Return the rigid motion (4, 4) in the board's plane that moves points[order] onto points."""
     points = board.points
     renamed = board.points[order]
-    a = renamed[1] - renamed[0]
-    b = points[1] - points[0]
-    angle = np.arctan2(b[1], b[0]) - np.arctan2(a[1], a[0])
-    turn = np.array(
+    renamed_side = renamed[1] - renamed[0]
+    side = points[1] - points[0]
+    angle = np.arctan2(side[1], side[0]) - np.arctan2(renamed_side[1], renamed_side[0])
+    rotation = np.array(
         [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
     )
-    return rigid(turn, points[0] - turn @ renamed[0])
+    return rigid(rotation, points[0] - rotation @ renamed[0])
 
 
 def _nearly_equal(places: Array) -> Array:
@@ -207,8 +207,8 @@ def _nearly_equal(places: Array) -> Array:
     The transforms ``places`` are (n, 4, 4).
     """
     shifts = places[:, :3, 3]
-    gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
-    near = gap < ALIKE_SHIFT * np.linalg.norm(shifts, axis=1)[:, None]
+    distances = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
+    near = distances < ALIKE_SHIFT * np.linalg.norm(shifts, axis=1)[:, None]
     return np.asarray(near & (_angles(places, places[:, :3, :3]) < ALIKE_ANGLE))
 
 
@@ -236,14 +236,14 @@ def _stereo(
     left_views = views_of(pairs, 0)
     right_views = views_of(pairs, 1)
     for k in sorted(left_views.keys() & right_views.keys()):
-        a = left_views[k]
-        b = right_views[k]
-        index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+        left_view = left_views[k]
+        right_view = right_views[k]
+        index, in_a, in_b = np.intersect1d(left_view.index, right_view.index, return_indices=True)
         if len(index) < FEWEST_COMMON:
             continue
         points.append(board.points[index].astype(np.float32))
-        left.append(a.pixels[in_a].astype(np.float32))
-        right.append(b.pixels[in_b].astype(np.float32))
+        left.append(left_view.pixels[in_a].astype(np.float32))
+        right.append(right_view.pixels[in_b].astype(np.float32))
     lenses = [(camera_matrix(values), values[4:]) for values in cameras]
     try:
         results = cv2.stereoCalibrate(

@@ -89,12 +89,12 @@ def candidates(spots: Spots, observer: Observer) -> Candidates:
     ideal = []
     limits = observer.settings.limits
     for camera, fits in zip(observer.rig.cameras, spots, strict=True):
-        pixels, found = camera.undistort(fits.centres)
+        pixels, valid = camera.undistort(fits.centres)
         # In images that are noisier than stated, the limit grows with the typical misfit.
         typical = max(1.0, float(np.median(fits.misfits[fits.good]))) if fits.good.any() else 1.0
         allowed = replace(limits, largest_misfit=typical * limits.largest_misfit)
-        found &= fits.within(allowed, observer.upright).good
-        good.append(np.flatnonzero(found))
+        valid &= fits.within(allowed, observer.upright).good
+        good.append(np.flatnonzero(valid))
         ideal.append(pixels[good[-1]])
     off_line = LINE_TOLERANCE_PX + LINE_STDS * observer.settings.line_error_px
     pairs, points = candidate_pairs(observer.rig.ideal, ideal[0], ideal[1], off_line)
@@ -163,7 +163,7 @@ def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
     near = cKDTree(flat).query_ball_point(flat, STANDING_PX)
     pairs_near = np.array([len(set(owner[own])) for own in near], dtype=int)
     free = np.ones(len(flat), dtype=bool)
-    found = []
+    points = []
     for k in np.argsort(-pairs_near, kind="stable").tolist():
         own = np.array([j for j in near[k] if free[j]], dtype=int)
         if pairs_near[k] < 2:
@@ -175,8 +175,8 @@ def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
         order = np.argsort(-np.linalg.norm(flat[own] - np.median(flat[own], axis=0), axis=1))
         members[owner[own[order]]] = number[own[order]]
         free[own] = False
-        found.append(members)
-    return np.array(found, dtype=int).reshape(-1, len(pairs))
+        points.append(members)
+    return np.array(points, dtype=int).reshape(-1, len(pairs))
 
 
 def places_of(pairs: Sequence[Candidates], members: NDArray[np.int_]) -> Array:
@@ -343,7 +343,7 @@ def match(
     pose, stickers, own = named(base, stood)
     lost = _missing(base, pose, stickers, places, briefly, names)
     stays = np.tile(np.eye(4), (len(pairs), 1, 1)), np.ones(len(pairs), dtype=bool)
-    found = [FoundBody(stickers, shown[own], stood[own], *stays, {}).with_missing(lost)]
+    bodies = [FoundBody(stickers, shown[own], stood[own], *stays, {}).with_missing(lost)]
     try:
         # Standing stickers that do not belong to the base are left out as well.
         moved = moving(pairs, _free(pairs, np.concatenate([still, shown[own]])), platform.name)
@@ -353,7 +353,7 @@ def match(
     pose, stickers, own = named(platform, moved.places)
     lost = _missing(platform, pose, stickers, moved.places, moved.members, names)
     body = FoundBody(stickers, moved.members[own], moved.places[own], moved.moves, moved.seen, {})
-    return [*found, body.with_missing(lost)]
+    return [*bodies, body.with_missing(lost)]
 
 
 def _missing(

@@ -73,19 +73,19 @@ class MeasuredPair:
     @property
     def row(self) -> list[str]:
         """Cells of the columns `COLUMNS`; cells of a missing pose are empty."""
-        found = self.measurement
+        measurement = self.measurement
         numbers = [
-            *found.pose,
-            *(found.covariance[entry] for entry in ENTRIES),
-            *(found.common_covariance[entry] for entry in ENTRIES),
+            *measurement.pose,
+            *(measurement.covariance[entry] for entry in ENTRIES),
+            *(measurement.common_covariance[entry] for entry in ENTRIES),
         ]
         return [
             self.name,
             repr(float(self.time)),
             *(repr(float(number)) if np.isfinite(number) else "" for number in numbers),
-            str(len(found.target_ids)),
-            str(int(found.ok)),
-            found.reason,
+            str(len(measurement.target_ids)),
+            str(int(measurement.ok)),
+            measurement.reason,
         ]
 
     def picture(self) -> NDArray[np.uint8]:
@@ -123,13 +123,13 @@ def measure_pairs(
     no pose is found in the first pair until its images are exchanged.
     """
     tracker = Tracker(estimator)
-    for number, one in enumerate(photographs):
-        found = tracker.measure(one.images)
-        if not found.ok:
+    for number, photograph in enumerate(photographs):
+        measurement = tracker.measure(photograph.images)
+        if not measurement.ok:
             if number == 0:
-                _require_order(one, estimator)
-            found = lost_measurement(found.reason + _hint(one, estimator))
-        yield MeasuredPair(one.name, one.time, found, one.images)
+                _require_order(photograph, estimator)
+            measurement = lost_measurement(measurement.reason + _hint(photograph, estimator))
+        yield MeasuredPair(photograph.name, photograph.time, measurement, photograph.images)
 
 
 def _hint(lost: Photograph, estimator: PoseEstimator) -> str:

@@ -143,10 +143,10 @@ def teach_from(
     names = []
     spots = []
     doubt = ""
-    for one in photographs:
-        spots.append(spots_in(one.images, observer))
-        doubt = doubt or light_doubt(one, spots[-1], observer)
-        names.append(one.name)
+    for photograph in photographs:
+        spots.append(spots_in(photograph.images, observer))
+        doubt = doubt or light_doubt(photograph, spots[-1], observer)
+        names.append(photograph.name)
         advance()
     if len(spots) < FEWEST_PAIRS:
         raise TeachingError(f"teaching failed: {len(spots)} pairs, at least {FEWEST_PAIRS} needed")
@@ -156,7 +156,7 @@ def teach_from(
         spots = [spots[k] for k in chosen]
         names = [names[k] for k in chosen]
     try:
-        found = _taught(spots, names, observer, (base, platform), name, known)
+        teaching = _taught(spots, names, observer, (base, platform), name, known)
     except LostError as error:
         cause = cause_of(error, spots, names, observer, base, platform)
         raise TeachingError(f"teaching failed: {cause}") from error
@@ -165,7 +165,7 @@ def teach_from(
         warnings.append(
             f"{left_out} pairs are not used: {MOST_PAIRS} pairs, spread over all, are enough"
         )
-    return replace(found, warnings=(*warnings, *found.warnings))
+    return replace(teaching, warnings=(*warnings, *teaching.warnings))
 
 
 def _taught(

@@ -105,9 +105,9 @@ def taught_frames(
     places = bundle.state.places
     split = 3 * seen.base
     count = places.size
-    spread = bundle.covariance
-    of_base = _frame_of(base, spread[:split, :split])
-    of_platform = _frame_of(platform, spread[split:count, split:count])
+    covariance = bundle.covariance
+    of_base = _frame_of(base, covariance[:split, :split])
+    of_platform = _frame_of(platform, covariance[split:count, split:count])
     base_points, platform_points = places[: seen.base], places[seen.base :]
     base_from_camera = invert(of_base(base_points, base_points[None])[0])
     body_from_model = invert(of_platform(platform_points, platform_points[None])[0])
@@ -179,5 +179,5 @@ def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> A
 
 def _small_error(moved: Array, other: Array) -> Array:
     """Return the small movement [dt, dphi] (6,) that turns transform ``other`` into ``moved``."""
-    turn = moved[:3, :3] @ other[:3, :3].T
-    return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])
+    rotation = moved[:3, :3] @ other[:3, :3].T
+    return np.concatenate([moved[:3, 3] - rotation @ other[:3, 3], rotation_log(rotation)])

@@ -163,10 +163,12 @@ def _movement(mine: Observations, state: BundleState, names: Sequence[str]) -> s
     positions = positions[order]
     # The best split in time leaves the least scatter about the mean positions before and after.
     splits = [(positions[:k], positions[k:]) for k in range(1, len(positions))]
-    scatter = [sum(float(np.sum((one - one.mean(axis=0)) ** 2)) for one in two) for two in splits]
+    scatter = [
+        sum(float(np.sum((part - part.mean(axis=0)) ** 2)) for part in parts) for parts in splits
+    ]
     if scatter:
         k = int(np.argmin(scatter))
-        jump = float(np.linalg.norm(np.subtract(*(one.mean(axis=0) for one in splits[k]))))
+        jump = float(np.linalg.norm(np.subtract(*(part.mean(axis=0) for part in splits[k]))))
         if jump > CLEAR_JUMP * np.sqrt(scatter[k] / len(positions)):
             before, after = (names[mine.pair[order][j]] for j in (k, k + 1))
             return f"moved by {1e3 * jump:.2f} mm between {before} and {after}"

@@ -308,9 +308,9 @@ class _View:
     def by_delay(self, poses: Array, rates: Array) -> Array:
         """Return small errors (N, 6, 1) of base_from_platform per s of the right camera's delay."""
         spin = (euler_rates_matrix(poses) @ rates[:, 3:, None])[..., 0]
-        turn = self.camera_from_base[:3, :3]
-        velocities = (rates[:, :3] @ turn.T)[:, None] + np.cross(
-            (spin @ turn.T)[:, None], self.arms
+        rotation = self.camera_from_base[:3, :3]
+        velocities = (rates[:, :3] @ rotation.T)[:, None] + np.cross(
+            (spin @ rotation.T)[:, None], self.arms
         )
         pixels = np.zeros((*self.slopes.shape[:-1], 1))
         pixels[1, ..., 0] = np.einsum("nmij,nmj->nmi", self.slopes[1], velocities)
@@ -394,5 +394,5 @@ def _small_error(moved: Array, other: Array) -> Array:
 
     A point p of the output frame moves by dt + dphi x p.
     """
-    turn = moved[:3, :3] @ other[:3, :3].T
-    return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])
+    rotation = moved[:3, :3] @ other[:3, :3].T
+    return np.concatenate([moved[:3, 3] - rotation @ other[:3, 3], rotation_log(rotation)])

@@ -155,16 +155,17 @@ def stacked(rows: list[Rows], centres: tuple[int, ...]) -> Rows:
 
     ``centres`` is the number of stickers of each body. Each body has its own columns of offsets.
     """
-    sizes = [one.residuals.shape for one in rows]
+    sizes = [body_rows.residuals.shape for body_rows in rows]
     first = 0
     before = 0
     offsets = np.zeros((sizes[0][0], sum(size for _, size in sizes), 4 * sum(centres)))
-    for one, (_, size), count in zip(rows, sizes, centres, strict=False):
-        offsets[:, first : first + size, 4 * before : 4 * (before + count)] = one.by_offsets
+    for body_rows, (_, size), count in zip(rows, sizes, centres, strict=False):
+        offsets[:, first : first + size, 4 * before : 4 * (before + count)] = body_rows.by_offsets
         first = first + size
         before = before + count
     parts = {
-        name: np.concatenate([getattr(one, name) for one in rows], axis=1) for name in NOT_OFFSETS
+        name: np.concatenate([getattr(body_rows, name) for body_rows in rows], axis=1)
+        for name in NOT_OFFSETS
     }
     return Rows(**parts, by_offsets=offsets)
 
