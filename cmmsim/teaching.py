@@ -181,8 +181,8 @@ class Teacher:
         if exact and parting > LARGEST_PARTING:
             warnings.warn(
                 f"taught by {self.base.name}: the two rays of a sticker pass each other at "
-                f"{parting:.1f} times their noise, at most {LARGEST_PARTING:g} are explained by "
-                "cameras and stickers as stated; poses err by more than is stated",
+                f"{parting:.1f} times their noise, but at most {LARGEST_PARTING:g} are explained "
+                "by cameras and stickers as stated; poses err by more than is stated",
                 TeachingWarning,
                 stacklevel=2,
             )
@@ -284,7 +284,8 @@ class Teacher:
             worst = self.platform.sticker_ids[distances.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {distances.max() * 1e6:.0f} um off its "
-                f"expected position, at most {limit * 1e6:.0f} um is possible; is it partly hidden?"
+                f"expected position, but at most {limit * 1e6:.0f} um is allowed; is it partly "
+                "hidden?"
             )
 
 

@@ -101,7 +101,7 @@ def estimate_latency(
         if squared_speed.min() < 1e-8:
             raise ShapeError(
                 "latency needs a motion without standstill: its lowest speed is "
-                f"{1e3 * np.sqrt(squared_speed.min()):.3g} mm/s, at least 0.1 mm/s is needed"
+                f"{1e3 * np.sqrt(squared_speed.min()):.3g} mm/s, but at least 0.1 mm/s is needed"
             )
         residuals = positions - motion(times) - offset
         # one common delay and the offset are estimated first, then each delay separately
@@ -127,7 +127,7 @@ def require_room(volume: MeasuringVolume) -> None:
     if np.any(needed > volume.size):
         raise AcceptanceError(
             f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} "
-            f"mm across the line of sight, the volume has {volume}"
+            f"mm across the line of sight, but the volume has {volume}"
         )
 
 

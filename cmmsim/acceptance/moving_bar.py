@@ -134,7 +134,7 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
         if path.reach.min() <= 0.0:
             needed = " x ".join(f"{2e3 * v:.0f}" for v in room_of_bar(path.along))
             raise AcceptanceError(
-                f"{path.name}: the bar needs {needed} mm, the volume has {volume}"
+                f"{path.name}: the bar needs {needed} mm, but the volume has {volume}"
             )
     return paths
 

@@ -124,7 +124,7 @@ def common_volume(place: Rig) -> MeasuringVolume:
     if low < SMALLEST_SIZE:
         raise AcceptanceError(
             "nothing is visible to both cameras around their target: the largest common cube has "
-            f"sides of {1e3 * low:.1f} mm, at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
+            f"sides of {1e3 * low:.1f} mm, but at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
         )
     return MeasuringVolume(frame, np.full(3, np.floor(1e3 * low) / 1e3), distance)
 
@@ -234,13 +234,15 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
     The message names the line, the value and the limit.
     """
     if len(lines) < FEWEST_LINES:
-        raise AcceptanceError(f"{len(lines)} measuring lines, at least {FEWEST_LINES} are needed")
+        raise AcceptanceError(
+            f"{len(lines)} measuring lines, but at least {FEWEST_LINES} are needed"
+        )
     for line in lines:
         different = len(np.unique(np.round(line.lengths, 6)))
         if different < FEWEST_LENGTHS:
             raise AcceptanceError(
-                f"line {line.name}: {different} different test lengths, at least {FEWEST_LENGTHS} "
-                "are needed"
+                f"line {line.name}: {different} different test lengths, but at least "
+                f"{FEWEST_LENGTHS} are needed"
             )
         longest = line.lengths.max()
         limit = SMALLEST_LENGTH_RATIO * volume.diagonal

@@ -61,7 +61,7 @@ class Board(Section):
         given = (self.marker, self.dictionary)
         if self.kind != "charuco":
             if given != (None, None):
-                raise ValueError(f"{self.kind} have no markers, remove marker and dictionary")
+                raise ValueError(f"{self.kind} have no markers; remove marker and dictionary")
             return self
         if self.marker is None or self.dictionary is None:
             raise ValueError("marker (side, m) or dictionary is missing, charuco needs both")
@@ -82,7 +82,7 @@ class Board(Section):
         """Raise ValueError for dots that nearly touch, or for a radius that is missing or extra."""
         if self.has_squares:
             if self.radius is not None:
-                raise ValueError(f"a {self.kind} has no dots, remove radius")
+                raise ValueError(f"a {self.kind} has no dots; remove radius")
         elif self.radius is None:
             raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
         elif self.radius > 0.4 * self.nearest:

@@ -117,7 +117,7 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(pixels)
     if measured.sum() < fewest:
         other = radius_differs(radius, board.radius)
-        why = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" if other else ""
+        why = f"; dots measure {radius:.3g} m in radius, not {board.radius:g} m" if other else ""
         return f"only {measured.sum()} of {len(pixels)} points are sharp and whole{why}"
     return _as_seen_from_the_front(
         board, BoardView(np.flatnonzero(measured), pixels[measured], radius)

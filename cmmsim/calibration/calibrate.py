@@ -123,8 +123,9 @@ def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> No
     if good < options.min_images:
         reasons = some([f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both])
         raise CalibrationError(
-            f"both cameras see the board in {good} of {len(pairs)} pairs, {options.min_images} are "
-            "needed" + (f"; pairs without it: {reasons}" if good < len(pairs) else "")
+            f"both cameras see the board in {good} of {len(pairs)} pairs, but "
+            f"{options.min_images} are needed"
+            + (f"; pairs without it: {reasons}" if good < len(pairs) else "")
         )
 
 

@@ -78,7 +78,7 @@ def _one_camera(
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(
             f"the {SIDES[side]} camera sees the board in {len(views)} images, "
-            f"{FEWEST_VIEWS} are needed"
+            f"but {FEWEST_VIEWS} are needed"
         )
     _require_variety(list(views.values()), board.symmetries, SIDES[side])
     # two radial terms are enough for start values; the adjustment frees the other terms
@@ -129,7 +129,7 @@ def _require_variety(
         places = "one place" if len(different) == 1 else f"{len(different)} places"
         raise CalibrationError(
             f"the {len(views)} pictures of the {camera} camera are alike: they show the board in "
-            f"{places} only (within {ALIKE_PX:g} px), at least {FEWEST_VIEWS} are needed; move "
+            f"{places} only (within {ALIKE_PX:g} px), but at least {FEWEST_VIEWS} are needed; move "
             "and tilt the board from picture to picture"
         )
 

@@ -192,6 +192,6 @@ def _require_on_surface(
         if deep or away > radius:
             words = f"{height:.4g} m below" if deep else f"{away:.4g} m away from"
             raise SensorFileError(
-                f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, at most "
+                f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, but at most "
                 f"{LARGEST_DEPTH if deep else radius:g} m is possible{remedy}"
             )

@@ -201,8 +201,8 @@ def require_corner(body: MarkedBody) -> None:
     if volume < SMALLEST_CORNER:
         raise TeachingError(
             f"{body.name}: planes A, B and C do not meet in one point, so no frame can be taught: "
-            f"their unit normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is "
-            "needed"
+            f"their unit normals span a volume of {volume:.1g}, but at least {SMALLEST_CORNER:g} "
+            "is needed"
         )
 
 

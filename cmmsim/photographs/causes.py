@@ -70,9 +70,9 @@ def cause_of(
         if count > 2 and works(list(zip(first, second, strict=True))):
             side = "left" if shift > 0 else "right"
             return (
-                f"the images do not belong together: they do if the first {abs(shift)} of the "
-                f"{'right' if shift > 0 else 'left'} folder, from {names[0]} on, are left out; "
-                f"did the {side} camera start later?"
+                f"the images do not belong together, but do without the first {abs(shift)} of the "
+                f"{'right' if shift > 0 else 'left'} folder, from {names[0]} on; did the {side} "
+                "camera start later?"
             )
     typical = int(np.median(counts))
     if typical < len(platform.sticker_ids) or works(spots):

@@ -176,7 +176,7 @@ class Photographs:
         for number, left in enumerate(lefts):
             right = next(rights, None)
             if right is None:
-                raise PhotographError(f"the left camera has image {number}, the right has none")
+                raise PhotographError(f"the left camera has image {number}, but the right has none")
             names = f"left image {number}", f"right image {number}"
             frame = self.format.frame(np.asarray(left), np.asarray(right), names)
             yield Photograph(str(number), number / self.format.frame_rate, frame)
@@ -210,7 +210,9 @@ class _Video:
         self._capture = cv2.VideoCapture(str(path))
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         if not self._capture.isOpened() or not self.rate > 0.0:
-            raise PhotographError(f"cannot read video {path}: OpenCV knows no such format")
+            raise PhotographError(
+                f"cannot read video {path}: OpenCV finds no frames or no frame rate"
+            )
 
     def read(self) -> NDArray | None:
         """Return the next image, or None at the end."""

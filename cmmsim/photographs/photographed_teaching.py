@@ -149,7 +149,9 @@ def teach_from(
         names.append(photograph.name)
         advance()
     if len(spots) < FEWEST_PAIRS:
-        raise TeachingError(f"teaching failed: {len(spots)} pairs, at least {FEWEST_PAIRS} needed")
+        raise TeachingError(
+            f"teaching failed: {len(spots)} pairs, but at least {FEWEST_PAIRS} needed"
+        )
     left_out = max(len(spots) - MOST_PAIRS, 0)
     if left_out:
         chosen = np.linspace(0, len(spots) - 1, MOST_PAIRS).astype(int).tolist()

@@ -90,7 +90,7 @@ def require_planes(body: MarkedBody) -> None:
     for plane, count in zip(PLANE_NAMES, counts, strict=True):
         if count < FEWEST_STICKERS:
             raise LostError(
-                f"{body.name}: plane {plane} has {count} stickers that can be used, at least "
+                f"{body.name}: plane {plane} has {count} stickers that can be used, but at least "
                 f"{FEWEST_STICKERS} are needed"
             )
 

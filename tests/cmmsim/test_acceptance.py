@@ -110,7 +110,7 @@ def test_broken_rules_are_named(volume):
     first, *others = seven_lines(volume)
     long = others[1]
     for changed, message in (
-        ([], "6 measuring lines, at least 7"),
+        ([], "6 measuring lines, but at least 7"),
         (
             [replace(first, lengths=first.lengths[[0, 1, 2, 4]])],
             "line space 1: 4 different test lengths",

@@ -167,13 +167,13 @@ def test_a_plane_with_fewer_than_three_stickers_is_named(sensor, good):
         )
         pairs.append(without(pair, sensor.rig.project(places)[0][1]))
     said = cause(sensor, pairs)
-    assert "platform: plane C has 2 stickers that can be used, at least 3 are needed" in said
+    assert "platform: plane C has 2 stickers that can be used, but at least 3 are needed" in said
     assert "C1 of the platform found in 0 of 8 pairs near its rough position" in said
 
 
 def test_images_without_spots_and_a_platform_that_stands_are_reported(sensor, good):
     nothing = without(good[0], good[0][1].centres)
     assert "no bright spots in both images of any of 3 pairs" in cause(sensor, [nothing] * 3)
-    assert "2 pairs, at least 3 needed" in cause(sensor, good[:2])
+    assert "2 pairs, but at least 3 needed" in cause(sensor, good[:2])
     still = spots(sensor, [sensor.home] * 4, sensor.observer)
     assert any("the platform moves by at most 0." in one for one in teach(sensor, still).warnings)

@@ -172,7 +172,7 @@ MIXED = [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13
         (
             PLAIN[:2] + UNSEEN[2:5],
             3,
-            r"2 of 5 pairs, 3 are needed; pairs without it: 02.png \(both: no ch",
+            r"2 of 5 pairs, but 3 are needed; pairs without it: 02.png \(both: no ch",
         ),
         (PLAIN[:5], 12, "12 are needed"),
         (UNSEEN, 3, r"02.png \(both: no chessboard of 8 x 7 found\) and 9 more$"),

@@ -40,7 +40,7 @@ def test_board_file_is_read_back(tmp_path, board):
         ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
         ("rows", "is not TOML"),
         ('kind = "chessboard"', "a chessboard has no dots"),
-        ("marker = 0.02", "dots have no markers, remove marker and dictionary"),
+        ("marker = 0.02", "dots have no markers; remove marker and dictionary"),
     ],
 )
 def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):

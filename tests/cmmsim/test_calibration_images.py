@@ -270,7 +270,7 @@ def test_far_too_small_a_radius_is_the_reason_given():
     said = find_board(frames[0].left, DOTS.model_copy(update={"radius": 0.002}))
     assert (
         said
-        == "only 0 of 63 points are sharp and whole, its dots measure 0.0125 m in radius, not 0.002"
+        == "only 0 of 63 points are sharp and whole; dots measure 0.0125 m in radius, not 0.002 m"
     )
 
 

@@ -61,7 +61,7 @@ def test_sources_that_make_no_pairs_are_refused(tmp_path):
         (first, damaged, "cannot read video .*c.avi"),
         (first, FRAMES[1], "both be paths, or both be arrays"),
         (tmp_path / "no", tmp_path / "none", "no folder .*no; give one folder"),
-        (FRAMES[0], FRAMES[1, :2], "the left camera has image 2, the right has none"),
+        (FRAMES[0], FRAMES[1, :2], "the left camera has image 2, but the right has none"),
         (FRAMES[0, :2], FRAMES[1], "the right camera has more images"),
         (FRAMES[0], FRAMES[0], "left image 0 and right image 0 are the same image"),
     ):

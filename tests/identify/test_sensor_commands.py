@@ -148,7 +148,7 @@ def test_pictures_of_another_size_and_too_few_of_the_board_are_one_line_and_leav
 ):
     """The size is refused before the board is looked for, which takes minutes."""
     few = (
-        "both cameras see the board in 0 of 8 pairs, 9 are needed; pairs without it: 000.png (both: "
+        "both cameras see the board in 0 of 8 pairs, but 9 are needed; pairs without it: 000.png (both: "
         "nothing found)"
     )
     for options, find, said in (
