@@ -208,6 +208,7 @@ def _explain(error: Any, model: type[BaseModel]) -> str:
 
 
 def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:
+    """Return the valid keys of the section of ``model`` to which the keys ``section`` lead."""
     for part in section:
         if isinstance(part, int):
             continue

@@ -49,7 +49,7 @@ KINDS = (
 )
 STICKER_RADIANCE = 228.0 / 255.0
 DARK_RADIANCE = 60.0 / 255.0
-SATURATING = 1.5
+SATURATING = 1.5  # radiance above that of white
 
 
 def fault_bodies() -> dict[str, trimesh.Trimesh]:
@@ -174,6 +174,7 @@ class FaultGenerator:
         return rng.choice(count, rng.integers(1, largest + 1), replace=False)
 
     def _hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
+        """Cover stickers with opaque plates."""
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
@@ -200,6 +201,7 @@ class FaultGenerator:
                 yield PlateMark(side, centres[side, k] + away * normal, half, angle, DARK_RADIANCE)
 
     def _obstacles(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """Place boxes between stickers and cameras."""
         names = list(fault_bodies())
         base_from_bodies = {}
         for number in rng.choice(len(names), rng.integers(1, len(names) + 1), replace=False):

@@ -44,7 +44,7 @@ from cmmsim.uncertainty.known_rig import KnownRig
 from cmmsim.uncertainty.print_errors import known_errors
 from cmmsim.without_images.drawn_stickers import StatisticalStereoCamera
 
-TEACHING_STREAM = 0
+TEACHING_STREAM = 0  # separates the random numbers of teaching from those of runs
 
 
 class Instrument:

@@ -26,7 +26,7 @@ from cmmsim.without_images.drawn_stickers import STATISTICAL, DrawnStickers, Sta
 if TYPE_CHECKING:
     from cmmsim.without_images.statistical_tracker import StatisticalTracker
 
-RUN_STREAM = 1
+RUN_STREAM = 1  # separates the random numbers of exposures from those of dropouts
 DROPOUT_STREAM = 2
 
 

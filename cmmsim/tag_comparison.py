@@ -73,6 +73,7 @@ class Found(NamedTuple):
     seconds: float
 
 
+# Pose and covariance of a lost frame.
 LOST = (np.full(6, np.nan), np.full((6, 6), np.nan))
 
 

@@ -29,6 +29,7 @@ from cmmsim.measuring.observation import DetectionSettings, faces_camera
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.sensor import Sensor
 
+# Stickers nearer to an edge of an image do not count as visible.
 EDGE_PX = DetectionSettings().window_size
 
 

@@ -23,7 +23,7 @@ from cmmsim.radiometry.stereo_images import StereoImages
 from cmmsim.sensor import Sensor
 
 H = TypeVar("H", bound=HalfSpace)
-SLOPE = np.deg2rad(15.0)
+SLOPE = np.deg2rad(15.0)  # angle between side A and each of sides B and C
 # Half the width of side A, m.
 HALF_RIDGE = 0.020
 # Width of sides B and C, m.

@@ -27,7 +27,7 @@ from cmmsim.errors import AcceptanceError, ShapeError
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.tracker import Tracker
 
-STREAM = 201
+STREAM = 201  # number that selects the random noise
 # Radius of the circle in m, and time of one revolution in s. The speed is 0.31 m/s.
 RADIUS = 0.05
 PERIOD = 1.0

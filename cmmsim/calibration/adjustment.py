@@ -26,6 +26,7 @@ from cmmsim.errors import CalibrationError, UnknownOptionError
 from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
 
+# Free distortion terms of each model of distortion, by its name.
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
 DEFAULT_DISTORTION = "brown5"
 # Number of steps after which the adjustment fails.

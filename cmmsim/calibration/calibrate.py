@@ -30,6 +30,7 @@ from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 
+# Smallest number of pairs in which both cameras see the board.
 FEWEST_PAIRS = 3
 # An image is rejected if its rms residual exceeds this multiple of the median over all images.
 LARGEST_RMS_RATIO = 4.0
@@ -297,6 +298,7 @@ def _units(board: Board, state: RigState) -> list[str]:
 
 
 def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
+    """Return a line if too many pairs have an unused image."""
     unused = [pair for pair in pairs if not pair.both]
     if len(unused) <= LARGEST_UNUSED * len(pairs):
         return []

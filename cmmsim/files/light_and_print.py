@@ -51,6 +51,7 @@ class Lens(Section):
 
     @model_validator(mode="after")
     def _drawable(self) -> Lens:
+        """Raise ValueError for a point spread or a ghost that cannot be drawn."""
         if 0.0 < self.psf_px < NARROWEST_PSF:
             raise ValueError(f"psf_px {self.psf_px:g} must be 0 or at least {NARROWEST_PSF:g} px")
         if any(offset != round(offset) for offset in self.ghost_offset_px):
@@ -73,6 +74,7 @@ class Lamp(Section):
 
     @model_validator(mode="after")
     def _one_place(self) -> Lamp:
+        """Raise ValueError unless the lamp has either a position or a direction, which is not zero."""
         if (self.place is None) == (self.direction is None):
             raise ValueError("a lamp needs either place or direction")
         if self.direction is not None and not any(self.direction):

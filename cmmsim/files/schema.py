@@ -164,6 +164,7 @@ class Rig(Section):
 
     @model_validator(mode="after")
     def _at_its_distance(self) -> Rig:
+        """Move ``position`` to the stated distance from ``target``."""
         if self.distance is not None:
             away = unit(np.subtract(self.position, self.target))
             self.__dict__["position"] = tuple(
@@ -200,6 +201,7 @@ class Camera(Section):
 
     @model_validator(mode="after")
     def _black_below_white(self) -> Camera:
+        """Raise ValueError for a black level that is not below white."""
         if self.black_level >= 2**self.bit_depth - 1:
             raise ValueError(
                 f"black_level {self.black_level:g} must lie below the largest grey value of "
@@ -209,6 +211,7 @@ class Camera(Section):
 
     @model_validator(mode="after")
     def _noise_of_white(self) -> Camera:
+        """Set ``dark_noise`` to the value that ``grey_noise_percent`` states."""
         if self.grey_noise_percent is not None:
             white = (2**self.bit_depth - 1) / self.gain
             self.__dict__["dark_noise"] = self.grey_noise_percent / 100 * white
@@ -254,6 +257,7 @@ class Stickers(Section):
 
     @model_validator(mode="after")
     def _disc_in_ring(self) -> Stickers:
+        """Raise ValueError for stickers that cannot be detected, or impossible distances."""
         if self.ring_radius < self.radius:
             raise ValueError(
                 f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "

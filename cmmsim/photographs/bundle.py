@@ -27,8 +27,8 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 MOST_STEPS = 12
 # The adjustment ends when a step changes all coordinates of stickers by less than this, m.
 CONVERGED = 1e-9
-POSE = 6
-RIG = len(PARAMETER_NAMES)
+POSE = 6  # number of unknowns of a pose
+RIG = len(PARAMETER_NAMES)  # number of parameters of a rig
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from cmmsim.photographs.pairs import Photograph
 from cmmsim.radiometry.stereo_images import StereoFrame, readable
 from cmmsim.tracker import Tracker
 
+# Coordinates of a pose and their units, as in the names of columns.
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
 # Entries (row, column) on and above the diagonal of a covariance (6, 6).

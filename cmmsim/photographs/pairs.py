@@ -73,6 +73,7 @@ class Format:
         return frame
 
     def _grey(self, image: NDArray, name: str, width: int, height: int) -> GreyImage:
+        """Return an image as grey values. Raises PhotographError for another format."""
         if image.ndim == 3:
             image = self._without_colour(image, name)
         if image.shape != (height, width):

@@ -37,6 +37,7 @@ from cmmsim.photographs.rejection import Judged, adjust_robustly
 from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import KnownRig
 
+# Teaching fails with fewer pairs.
 FEWEST_PAIRS = 3
 # Largest number of pairs that are used. If there are more, this many are selected evenly.
 MOST_PAIRS = 500

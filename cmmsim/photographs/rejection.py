@@ -25,6 +25,8 @@ from cmmsim.photographs.bundle import Bundle, BundleState, Observations, adjust
 
 # Probability that a good observation counts as an outlier.
 CHANCE = 1e-5
+# Limit and median of the squares of good observations. Their distribution is chi-square with four
+# degrees of freedom.
 LARGEST_SQUARE = float(chdtri(4, CHANCE))
 MEDIAN_SQUARE = float(chdtri(4, 0.5))
 # A centre counts as nearly the worst of its sticker if its squared residual exceeds this fraction

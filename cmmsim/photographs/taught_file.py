@@ -84,6 +84,7 @@ def read_taught(path: str | Path) -> Taught:
 
 
 def _taught(content: dict[str, Any]) -> Taught:
+    """Return the result of teaching that the content of a file states."""
     setup = content["setup"]
     rig = content["rig"]
     by_rig = content["by_rig"]

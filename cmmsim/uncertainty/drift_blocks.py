@@ -28,7 +28,7 @@ PLACES_OF_RIG = tuple(f"camera_from_base.{name}" for name in PLACE_NAMES)
 # Standard deviation, px, whose square is added to the stated variance of a centre. The stated
 # variance can be too small.
 SMALLEST_STD_PX = 5e-4
-RIG = len(PARAMETER_NAMES)
+RIG = len(PARAMETER_NAMES)  # number of parameters of a rig
 
 
 @dataclass(frozen=True)

@@ -191,6 +191,7 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _begin_block(self, measurement: Measurement, base: StickerObservation | None) -> None:
+        """Begin a block of frames that show the same stickers as a frame."""
         taught = self.geometry.taught
         self._platform_ids = measurement.target_ids
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
@@ -210,6 +211,7 @@ class DriftWatch:
             self._evaluate_blocks()
 
     def _evaluate_blocks(self) -> None:
+        """Update the evidence with all ended blocks, and note the first one above the limit."""
         # with more than one thread, BLAS takes ten times as long for these small matrices
         with self._threads.limit(limits=1, user_api="blas"):
             for block, products in zip(self._blocks, self._products(), strict=True):
