@@ -74,7 +74,7 @@ class Lamp(Section):
 
     @model_validator(mode="after")
     def _one_place(self) -> Lamp:
-        """Raise ValueError unless the lamp has either a position or a direction, which is not zero."""
+        """Raise ValueError unless the lamp has either a position or a direction, not zero."""
         if (self.place is None) == (self.direction is None):
             raise ValueError("a lamp needs either place or direction")
         if self.direction is not None and not any(self.direction):
