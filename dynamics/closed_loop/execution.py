@@ -225,8 +225,7 @@ def _consult(
 
 def _with_noise(problem: LoopProblem, noise: np.ndarray) -> LoopProblem:
     """Problem with another noise (rows, 6) of its ideal sensor."""
-    ideal = problem.ideal or IDEAL
-    return replace(problem, sensor=IdealSensor(ideal.lost, noise))
+    return replace(problem, sensor=IdealSensor((problem.ideal or IDEAL).lost, noise))
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:

@@ -177,8 +177,8 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
             with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as name:
                 yield Path(name)
                 for path in sorted(Path(name).iterdir()):
+                    path.rename(folder / path.name)
                     moved.append(folder / path.name)
-                    path.rename(moved[-1])
     except BaseException:  # Ctrl-C as well
         for path in moved:
             shutil.rmtree(path, ignore_errors=True)

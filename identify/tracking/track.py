@@ -286,8 +286,7 @@ def _shares(
         # A component without motion has no error, and a failed run has NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
             remaining = [
-                np.nansum(exact[part]) / np.nansum(base[part])
-                for part in (slice(0, 3), slice(3, 6))
+                exact[part].sum() / base[part].sum() for part in (slice(0, 3), slice(3, 6))
             ]
         fractions[what] = dict(zip(PARTS, (1 - np.array(remaining)).tolist(), strict=True))
     rest = {part: 1 - sum(fraction[part] for fraction in fractions.values()) for part in PARTS}

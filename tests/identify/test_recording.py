@@ -12,10 +12,10 @@ import xarray as xr
 
 from dynamics import load_robot
 from identify import pipeline
-from identify.errors import EstimationError, RecordError
+from identify.errors import EstimationError, RecordError, WriteError
 from identify.estimation.identification import identify
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
-from identify.files.atomic import write_files, write_text
+from identify.files.atomic import atomic_contents, write_files, write_text
 from identify.files.dataset import group_names, write_groups
 from identify.files.run_folder import load_result, save_result
 from identify.model.from_record import identified_model
@@ -176,6 +176,14 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, recor
     assert (tmp_path / "folder" / "a.txt").stat().st_mode == (tmp_path / "b.txt").stat().st_mode, (
         "the usual rights"
     )
+
+
+def test_contents_that_find_a_folder_of_their_name_leave_it_as_it_was(tmp_path):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "kept").write_text("x")
+    with pytest.raises(WriteError), atomic_contents(tmp_path) as new:
+        (new / "old").mkdir()
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["kept", "old"]
 
 
 @pytest.mark.slow

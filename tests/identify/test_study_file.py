@@ -373,6 +373,7 @@ def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refus
 
 
 KP, NOISE = "scenario.servo.kp", "sensor.camera.noise"
+ZERO = "scenario.plant.joint_zero_error_rad"
 ALONE = {
     "scenario.name", "scenario.description", "scenario.sensor_note", "sensor.name", "sensor.note", "scenario.robot",
     *(f"scenario.{side}.{name}" for side in ("plant", "model") for name in (
@@ -500,6 +501,8 @@ def test_what_a_held_pose_reads_acts_on_its_rows():
         ({"kind": "closed_loop", "factors": {"scenario.plant.geometry_seed": [0, 1]}}, ["geometry_error_m is 0"],
          {"factors": {"scenario.plant.geometry_seed": {"low": 0, "high": 9},
                       "scenario.plant.geometry_error_m": {"low": 0, "high": 1e-4}}, "sample": 4}),
+        ({"kind": "closed_loop", "factors": {"scenario.plant.geometry_seed": [0, 1]},
+          "changes": {ZERO: [1e-3] * 6}}, ["other errors that are drawn"], {"changes": {ZERO: 1e-3}}),
     ],
 )  # fmt: skip
 def test_what_does_nothing_is_refused_before_any_row_and_taken_where_it_acts(

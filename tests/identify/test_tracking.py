@@ -335,6 +335,17 @@ def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
     assert (out / "scenario.toml").is_file()
 
 
+def test_a_cause_whose_exact_run_fails_has_no_share(monkeypatch):
+    failed = np.full(6, np.nan)
+    monkeypatch.setattr(
+        tracking, "_drawn", lambda task, law, known, covariance, exact, advance:
+        failed if exact == "latency" else np.full(6, 0.5 if exact else 1.0),
+    )  # fmt: skip
+    shares = tracking._shares(None, "pid", None, None, None)
+    assert shares["sensor"]["position"] == shares["model"]["orientation"] == 0.5
+    assert np.isnan([shares["latency"]["position"], shares["rest"]["position"]]).all()
+
+
 def test_a_robot_that_no_law_keeps_on_its_motion_is_no_success(tmp_path, monkeypatch, capsys):
     """Nor is it identified for `pid`, which knows no model."""
     monkeypatch.setattr(SensorPlan, "untaught", lambda *given: Sensor(NOISE))

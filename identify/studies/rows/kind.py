@@ -120,10 +120,17 @@ PLANT = (
     IneffectiveKeys(
         ("scenario.plant.geometry_seed",),
         {
-            f"scenario.plant.{name}": lambda error: error == 0
-            for name in ("geometry_error_m", "length_error_m", "axis_error_rad")
+            # A list states the error of each joint, and nothing is drawn.
+            f"scenario.plant.{name}": lambda error: error == 0 or isinstance(error, list)
+            for name in (
+                "geometry_error_m",
+                "length_error_m",
+                "axis_error_rad",
+                "joint_zero_error_rad",
+                "joint_zero_error_m",
+            )
         },
-        "scenario.plant.geometry_error_m is 0, and so are the other geometry errors",
+        "scenario.plant.geometry_error_m is 0, and so are the other errors that are drawn",
     ),
     IneffectiveKeys(
         ("scenario.plant.joint_damping_N_m_s_rad", "scenario.plant.motor_inertia_kg_m2"),
