@@ -41,9 +41,9 @@ LARGEST_TILT = 0.75
 DEPTH_RANGE = (0.8, 1.2)
 # Each image is divided into CELLS x CELLS cells, in which the board appears in turn.
 CELLS = 3
-# Smallest cosine of the angle between the board's z axis and the view direction of either camera.
+# Smallest cosine of the angle between the board's z axis and the line to either camera.
 GRAZING = 0.35
-# Largest number of poses tried for one image, and number of poses that are examined together.
+# Largest number of poses tried for one pair, and number of poses that are examined together.
 TRIES = 4000
 AT_ONCE = 200
 # Samples per pixel and axis in the images of dots.
@@ -97,7 +97,7 @@ def _squares(board: Board) -> Print:
 def default_board(rig: StereoRig) -> Board:
     """Return a board of 13 x 9 dots.
 
-    At the depth at which the optical axes meet, it fills a third of the left image's width.
+    Where the optical axes meet, its dots span about a third of the left image's width.
     """
     spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
     return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))
@@ -206,7 +206,7 @@ def _right_eye(rig: StereoRig) -> Array:
 def _facing(towards: Array) -> Array:
     """Return rotations (n, 3, 3) of boards whose fronts face along ``towards`` (n, 3).
 
-    Their x axes are horizontal in the left image.
+    Their x axes are perpendicular to the y axis of the left camera.
     """
     z = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)

@@ -288,5 +288,6 @@ def _check_images(
     shape = (len(views), height, width)
     wanted = f"{part} must return finite radiance {shape}"
     if not isinstance(found, np.ndarray) or found.dtype.kind != "f":
-        raise CmmError(f"{wanted} of float32, got {type(found).__name__}")
+        got = getattr(found, "dtype", type(found).__name__)
+        raise CmmError(f"{wanted} of floats, got {got}")
     finite_array(found, shape, wanted)

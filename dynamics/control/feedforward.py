@@ -4,13 +4,15 @@ The drives need not accept torques. While a command U acts, the torque of a driv
 
     lp (U - theta) + ld (c U_dot - theta_dot) + li z - lx theta,    z_dot = U - theta
 
-as in `closed_loop.drives`. Along the desired motion, everything except U is known, and each command
-follows from the previous one. With the zero hold, the mean torque of the drive while a command acts
-is equal to the mean torque of the inverse dynamics. With the linear hold, the torque of the drive
-at the end of the ramp is equal to it. The servo adds its correction.
+with c and lx as in `closed_loop.drives`. The filter of the law `pid_filtered` is ignored. Along the
+desired motion, everything except U is known, and each command follows from the previous one. With
+the zero hold, the mean torque of the drive while a command acts is equal to the mean torque of the
+inverse dynamics. With the linear hold, the torque at the end of the ramp is equal to this mean, if
+the joint moves with its mean velocity. The servo adds its correction.
 
-Before the motion, the robot is in equilibrium, and the integral z provides the torque of the model
-at rest. A constant error of the modelled torque thus has no effect.
+Before the motion, the robot is in equilibrium. With an integral, z provides the torque of the model
+at rest, and only changes of the modelled torque since then matter: a constant error of it has no
+effect. Without an integral, the command provides the torque at rest.
 """
 
 from dataclasses import replace

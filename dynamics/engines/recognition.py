@@ -44,9 +44,9 @@ ROUNDING = 1e-9
 # singular, because alpha and gamma turn about the same axis.
 MOST_TILT = 0.9
 
-# Natural frequency, rad/s, of the joint with the least inertia, if a file states no joint PID.
+# Natural frequency, rad/s, of the joint with the largest inertia, if a file states no joint PID.
 DEFAULT_FREQUENCY = 2 * np.pi * 3
-# Damping ratio of the joint with the least inertia, if a file states no joint PID.
+# Damping ratio of the joint with the largest inertia, if a file states no joint PID.
 DEFAULT_DAMPING = 0.7
 DEFAULT_TRAVEL = 0.5  # travel beyond the home coordinates if a file states no joint ranges, rad
 # Ratio of the travel of sliding actuators beyond home to the distance between the ends of the
@@ -103,7 +103,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
         gains = _gains(geometry, dynamic[layout.rigid])
         notes.append(
             "the file has no joint PID: gains are chosen for a natural frequency of 3 Hz at the "
-            "joint with the least inertia"
+            "joint with the largest inertia at home"
         )
     geometry = replace(geometry, own_gains=len(gains) > len(JOINT_PID))
     robot = RobotDescription(plain.name, geometry, {"guess": ParameterSet(dynamic, gains)})
@@ -277,10 +277,11 @@ def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Char
 def _travel(
     plain: Mechanism, mechanism_legs: list[MechanismLeg], legs: list[Leg], notes: list[str]
 ) -> float:
-    """Travel limit, rad or m, from the ranges in the file, or a default about home with a note.
+    """Travel limit, rad or m, from the ranges in the file.
 
-    Raises RobotFileError for a range that does not extend beyond the home coordinate on both sides
-    of zero.
+    Without ranges it is the largest home coordinate plus a default margin, and a note says so.
+    Raises RobotFileError for a range that does not contain both the home coordinate and its
+    negative.
     """
     limits = []
     for mechanism_leg in mechanism_legs:
@@ -290,8 +291,9 @@ def _travel(
             limits.append(min(-span[0], span[1]))
             if limits[-1] <= abs(at_home):
                 raise RobotFileError(
-                    f"{mechanism_leg.actuated.name} has the range {span[0]:g} to {span[1]:g}; zero "
-                    f"and home ({at_home:g}) must be well inside"
+                    f"{mechanism_leg.actuated.name} has the range {span[0]:g} to {span[1]:g}, "
+                    f"which must contain both {abs(at_home):g}, its size at home, and the negative "
+                    "of it: travel is symmetric about zero"
                 )
     if limits:
         return float(min(limits))
@@ -307,7 +309,7 @@ def _travel(
 
 
 def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
-    """Gains lp, li, ld (3,) with the default frequency at the joint of least inertia at home."""
+    """Gains lp, li, ld (3,) with the default frequency at the joint of largest inertia at home."""
     home = ca.SX(geometry.home_pose)
     basis = geometry.chart.basis
     jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ basis

@@ -10,8 +10,9 @@ moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 and the triangle inequality of the moments is equivalent to J >= 0. A search in J instead of I
 therefore needs only bounds, see Traversaro et al., "Identification of fully physical consistent
 inertial parameters" (IROS 2016). A full body is possible if its pseudo-inertia is positive
-definite. The search then uses log-Cholesky coordinates of the body (see `dynamics.pseudo_inertia`),
-with a bound that keeps it from becoming so flat that the logarithms have no effect.
+definite; it has all ten inertial parameters. The search then uses log-Cholesky coordinates of the
+body (see `dynamics.pseudo_inertia`). A bound keeps it from becoming so flat that changes of these
+coordinates no longer change it.
 """
 
 from dataclasses import dataclass
@@ -35,11 +36,11 @@ from identify.estimation.prior import StartingGuess
 # Lower bound of parameters that must be above zero, as a fraction of the initial guess. Examples
 # are the platform's mass and the integral gain.
 SMALLEST_SHARE = 1e-3
-# Twice the smallest second moment of a full body at the start of a search, as a fraction of the sum
-# of its second moments. The logarithms of a flat body are infinite.
+# At the start of a search, each second moment of a full body is at least half this fraction of
+# their sum. The logarithms of a flat body are infinite.
 INSIDE = 1e-3
-# Smallest second moment of a full body in a search, as a fraction of the sum of the second moments
-# of the initial guess.
+# Smallest square of a diagonal entry of the Cholesky factor of a full body in a search, times the
+# guessed mass, as a fraction of the sum of the second moments of the initial guess.
 FLATTEST = 1e-4
 # Matrix that maps (J_x, J_y, J_z) to (Ixx, Iyy, Izz).
 MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
@@ -189,7 +190,7 @@ def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
     for body, own, full in zip(layout.bodies, layout.body_slices, layout.full, strict=True):
         if full and physical:
             # With the mass m and the coordinate d of an axis of the Cholesky factor, the second
-            # moment along this axis is m exp(2 d).
+            # moment along this axis is at least m exp(2 d).
             axes = slice(own.start + 1, own.start + 4)
             second = guess.values[own][4:7].sum() / 2  # sum of the second moments
             lower[axes] = np.log(max(FLATTEST * second / guess.values[own.start], SMALLEST)) / 2

@@ -50,12 +50,12 @@ PREDICTED: Variables = {
     "std_position": (
         ("time", "axis"),
         "m",
-        "predicted standard deviation of the plant's position from the identified model",
+        "predicted standard deviation of the difference between plant and model, position",
     ),
     "std_orientation": (
         ("time", "angle"),
         "rad",
-        "predicted standard deviation of the plant's orientation from the identified model",
+        "predicted standard deviation of the difference between plant and model, orientation",
     ),
 }
 
@@ -72,8 +72,8 @@ def build_model_run(
     initial_pose, identified_pose (N, 6)
                                     Poses of the models, m and rad. Poses of a diverged model that
                                     are not finite become NaN.
-    std (N, 6)                      Predicted standard deviations of the plant's poses from the
-                                    identified model.
+    std (N, 6)                      Predicted standard deviations of the difference between the
+                                    poses of plant and identified model.
 
     Raises RecordError if a shape is wrong.
     """
