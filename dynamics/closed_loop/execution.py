@@ -15,7 +15,13 @@ from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
 from dynamics.closed_loop.frame_kernels import run_frames
 from dynamics.closed_loop.lane_kernels import run_lanes
-from dynamics.closed_loop.loop_settings import IDEAL, EveryFrame, IdealSensor, RateSensor
+from dynamics.closed_loop.loop_settings import (
+    IDEAL,
+    EveryFrame,
+    IdealSensor,
+    RateSensor,
+    ideal_poses,
+)
 from dynamics.closed_loop.motion_kernels import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
@@ -159,14 +165,8 @@ def _poses(problem: LoopProblem, recorded: dict[str, Any], measured: np.ndarray)
         "measured": measured,
     }
     if problem.ideal is not None:
-        noise = problem.ideal.noise
-        poses["measured"] = chart.pose(recorded["measured"])
+        poses["measured"] = ideal_poses(problem.ideal, chart, recorded["measured"])
         poses["measured"][~recorded["measured_ok"]] = np.nan
-        # noise in directions in which the platform cannot move is not among the coordinates
-        if noise is not None and problem.sizes.coordinates < 6:
-            poses["measured"] += chart.forbidden(
-                chart.pose(np.zeros(problem.sizes.coordinates)) + noise
-            )
     for name in ("pose_sensitivity", "start_sensitivity", "command_sensitivity"):
         if recorded[name] is not None:
             poses[name] = chart.lifted(recorded[name], axis=1)
@@ -185,11 +185,11 @@ def _consult(
     """Measure the pose of a frame, and call the controller, if there is one, for the command."""
     sensor = problem.sensor
     size = problem.sizes.coordinates
-    time = frame * problem.period
+    time = float(problem.frame_times[frame])
     chart = problem.robot.geometry.chart
     if isinstance(sensor, IdealSensor):
         plain(measure_ideally)(now, plan, record, frame)
-        measured[frame] = chart.pose(record.measured[frame])
+        measured[frame] = ideal_poses(sensor, chart, record.measured[frame], frame)
     else:
         # access to an attribute of a record takes five times as long as access to an item
         state = now["state"]

@@ -10,6 +10,7 @@ from dynamics.checks import check_choice, check_type, floats, real, whole
 from dynamics.closed_loop.drives import PID, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
+from dynamics.kinematics.platform import Chart
 
 MAX_DELAY_FRAMES = 60  # largest latency of a command, frames
 MAX_STEPS_PER_FRAME = 10_000  # largest number of integration steps in a frame
@@ -68,6 +69,17 @@ IDEAL = IdealSensor()
 """Sensor that measures every true pose without noise."""
 
 Sensor = IdealSensor | PoseSensor | RateSensor
+
+
+def ideal_poses(
+    sensor: IdealSensor, chart: Chart, coordinates: np.ndarray, frames: int | slice = slice(None)
+) -> np.ndarray:
+    """Poses (..., 6) that an ideal sensor measures at frames, from noisy coordinates (..., m).
+
+    Noise in directions in which the platform cannot move is not among the coordinates.
+    """
+    poses = chart.pose(coordinates)
+    return poses if sensor.noise is None else poses + chart.forbidden(poses + sensor.noise[frames])
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ class LoopProblem:
         """Inverse of the frame rate, s. Ramps, command rates and steps use it with `times`, too."""
         return 1.0 / self.settings.timing.frame_rate_hz
 
-    @property
+    @cached_property
     def frame_times(self) -> np.ndarray:
         """Times (frames,) of the frames, s."""
         return np.arange(self.frames) * self.period if self.times is None else self.times

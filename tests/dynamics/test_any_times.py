@@ -93,6 +93,18 @@ def test_events_at_frames_and_arrivals_of_commands_repeat_the_run_on_the_grid(
     assert np.abs(along - moved.command_sensitivity).max() < 1e-9 * most
 
 
+def test_a_sensor_is_told_the_times_of_the_run(robot, parameters):
+    told = []
+    times = np.array([0.0, 0.01, 0.04, 0.045])
+    sent = np.tile(robot.inverse_kinematics(robot.home_pose), (4, 1))
+    settings = LoopSettings(SERVO, FrameTiming(RATE_HZ))
+    sensor = lambda frame, time, pose: told.append(time)  # noqa: E731
+    simulate_commands(
+        robot, parameters, still(robot, 4), settings, sent, sensor=sensor, times=times
+    )
+    assert told == times.tolist()
+
+
 def test_commands_from_before_the_start_have_a_direction_of_their_own(robot, parameters):
     """The derivative is the difference of two runs, without friction of joints that stick."""
     smooth = FrictionLaw("smoothed", smoothing_velocity=0.1)

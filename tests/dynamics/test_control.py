@@ -13,6 +13,7 @@ from dynamics.closed_loop import (
     EveryFrame,
     FrameTiming,
     FrictionLaw,
+    IdealSensor,
     LoopFailure,
     LoopSettings,
     Reference,
@@ -326,6 +327,28 @@ def test_a_controller_of_every_frame_is_asked_where_the_measurement_is_lost(robo
         sensor,
     )
     assert asked == [False, True, True, False]
+
+
+def test_a_controller_sees_the_noise_of_the_record_where_the_platform_cannot_move():
+    robot = dynamics.load_robot("delta3")
+    seen = []
+
+    def command(frame, time, measured):
+        seen.append(measured)
+        return robot.inverse_kinematics(robot.home_pose)
+
+    poses = np.tile(robot.home_pose, (4, 1))
+    noise = np.random.default_rng(0).normal(0, 1e-5, (4, 6))
+    run = simulate_controller(
+        robot,
+        robot.parameter_sets["truth"].vector,
+        Reference(poses, 0 * poses),
+        LoopSettings(SERVO, FAST),
+        EveryFrame(command),
+        IdealSensor(noise=noise),
+    )
+    np.testing.assert_array_equal(seen, run.measured)
+    np.testing.assert_allclose(run.measured - run.pose, noise, atol=1e-15)
 
 
 @pytest.mark.thorough
