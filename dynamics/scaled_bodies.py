@@ -1,8 +1,10 @@
 """Bodies of a robot with other lengths than a given robot.
 
 Bodies keep their material. A platform is scaled as a plate of the same thickness, and the bodies of
-the legs as bars of the same section. A body of the legs whose inertias no rigid body can have, as
-those of cranks and links in the paper, becomes a uniform round rod of steel.
+the legs as bars of the same section. The moments of a centred body are those of a thin plate or
+bar, and a full body is stretched with its centre of mass. A body of the legs whose inertias no
+rigid body can have, as those of cranks and links in the paper, becomes a uniform round rod of
+steel.
 """
 
 from collections.abc import Mapping
@@ -11,6 +13,7 @@ import numpy as np
 
 from dynamics.inertia import physical_inertias
 from dynamics.parameters import ParameterLayout
+from dynamics.pseudo_inertia import inertial_parameters, pseudo_inertia
 from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
 
 # Moment of inertia of each body of a leg about the axis along its length.
@@ -62,10 +65,16 @@ def scaled_bodies(
             ratio = ratios.get(kind.name, 1.0)
             mass_factor, moment_factor = ratio, ratio**3
             along = MOMENT_ABOUT_LENGTH.get(kind.name)
-        bodies[row, 0] *= mass_factor
         if along is not None and kind.name in rods:
-            bodies[row, moments] = rod_moments(bodies[row, 0], rods[kind.name], along)
+            mass = mass_factor * bodies[row, 0]
+            bodies[row] = 0.0
+            bodies[row, 0] = mass
+            bodies[row, moments] = rod_moments(mass, rods[kind.name], along)
             continue
+        if layout.full[row]:
+            bodies[row] = _stretched(bodies[row], mass_factor, ratio, along)
+            continue
+        bodies[row, 0] *= mass_factor
         for column, moment in zip(moments, MOMENTS, strict=True):
             bodies[row, column] *= mass_factor if moment == along else moment_factor
     # rounded inertias can break Ix + Iy >= Iz again, by the size of the rounding
@@ -74,6 +83,13 @@ def scaled_bodies(
         bodies = physical_inertias(layout, values, allow_changes=True).values
     values[layout.rigid] = layout.rigid_of(bodies)
     return values
+
+
+def _stretched(body: np.ndarray, mass_factor: float, ratio: float, along: str | None) -> np.ndarray:
+    """Full body (10,) stretched along its length, or in the plane x y if `along` is None."""
+    stretch = np.ones(4)
+    stretch[[0, 1] if along is None else MOMENTS.index(along)] = ratio
+    return inertial_parameters(mass_factor * pseudo_inertia(body) * np.outer(stretch, stretch))
 
 
 def rounded(values: np.ndarray) -> np.ndarray:

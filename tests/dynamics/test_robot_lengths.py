@@ -7,6 +7,7 @@ import pytest
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import FrameTiming, LoopSettings, ServoGains, stability
 from dynamics.errors import RobotFileError
+from dynamics.pseudo_inertia import inertial_parameters
 from dynamics.robot_file import built_in_robots, parsed_robot, read_robot_file
 from dynamics.robot_lengths import _at_rest_at_home, lengths_of, robot_of_lengths
 from dynamics.robot_text import robot_text
@@ -114,6 +115,26 @@ def test_bodies_are_scaled_as_plates_and_bars():
     parts = (made / np.where(old, old, 1))[rows][:, [0, 4, 5, 6]]
     bars = [[3, 27, 27, 3], [0.5, 1 / 8, 1 / 8, 0.5]]
     np.testing.assert_allclose(parts, [[4, 16, 16, 16], *bars], rtol=5e-4)  # four digits
+
+
+def test_full_bodies_are_stretched_with_all_their_points():
+    """By bodies of eight points of mass."""
+    robot = load_robot("ups6").with_full_bodies(["platform", "rod"])
+    layout = robot.layout
+    points = np.random.default_rng(0).normal([0.02, -0.01, 0.03], 0.1, (8, 3))
+
+    def body(mass, places):
+        pseudo = np.c_[places, np.ones(8)]
+        return inertial_parameters(mass / 8 * pseudo.T @ pseudo)
+
+    given = robot.nominal_parameters.copy()
+    bodies = layout.bodies_of(given)
+    rows = [layout.bodies.index(name) for name in ("platform", "rod1")]
+    bodies[rows] = body(2.0, points)
+    given[layout.rigid] = layout.rigid_of(bodies)
+    made = scaled_bodies(layout, given, {"platform_radius": 2.0, "rod": 0.5}, {})
+    wanted = [body(8.0, points * [2, 2, 1]), body(1.0, points * [1, 1, 0.5])]
+    np.testing.assert_allclose(layout.bodies_of(made)[rows], wanted, rtol=5e-4)
 
 
 def test_links_and_cranks_whose_printed_inertias_no_body_has_become_rods():
