@@ -1,6 +1,6 @@
 """Model's side of a scenario: robot and loop as the estimator knows them."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import xarray as xr
 
@@ -71,8 +71,5 @@ def side_of_record(side: ModelSide, record: xr.Dataset) -> ModelSide:
     Raises RecordError if the record does not state its scenario.
     """
     own = recorded_scenario(record)
-    known = own.timing == side.timing and asdict(side.settings.servo) == own.servo.model_dump()
-    if known:
-        return side
     settings = loop_settings(side.robot, own.servo, own.timing, own.control, side.model)
     return replace(side, timing=own.timing, settings=settings)

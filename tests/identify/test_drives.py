@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from dynamics.closed_loop import stability
 from dynamics.closed_loop.drives import DRIVES, READS, cascade_gains
@@ -15,6 +16,7 @@ from identify.errors import EstimationError, ScenarioError
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.identification import identify, output_error_problem
 from identify.loop_parameters import settled_drive
+from identify.model.model_side import side_of_record
 from identify.progress import SilentProgress
 from identify.reporting.parameter_tables import drive_sentence, unidentified
 from identify.scenario.plant_sections import DRIVE_GAINS, DriveName
@@ -42,6 +44,12 @@ def under(law, seconds=5.0, gains=None, model=None, **more):
     stated = {name: chosen[name] for name in DRIVE_GAINS[law]}
     drives = {"plant.drive": law, "plant.drive_gains": stated, "model.drive": model or law}
     return quick(**drives, **{"excitation.duration_s": seconds}, **more)
+
+
+def test_a_further_record_has_its_own_torque_limit():
+    limited = quick(**{"control.torque_limit_N_m": 2.5})
+    record = xr.Dataset(attrs={"scenario": limited.to_toml()})
+    assert side_of_record(side_of(quick()), record).settings == side_of(limited).settings
 
 
 @pytest.mark.slow
