@@ -44,7 +44,7 @@ from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.model.loop_model import LoopModel
-from identify.record.stored_common_errors import LATENCY, SCALE, Marginal
+from identify.record.stored_common_errors import LATENCY, SCALE, ZERO, Marginal
 from identify.scenario import Filter
 
 # Fraction of the record left out at either end, where filtered derivatives are inaccurate.
@@ -157,14 +157,17 @@ def _moved_commands(stds: Mapping[str, float], command: Array, rate: Array) -> A
     """Return the changes (N, n, k) of commands (N, n) by one standard deviation of each error.
 
     The errors are those of the latency, of the scale, and of the zeros of the joints in their
-    order. rate (N, n): rate of the commands.
+    order. Errors of friction move no command: an offset of friction is part of the torques at the
+    start, and the other constants act at rest. rate (N, n): rate of the commands.
     """
     zeros = iter(np.eye(command.shape[1]))
-    changes = [
-        std * (rate if name == LATENCY else command if name == SCALE else 0 * command + next(zeros))
-        for name, std in stds.items()
-    ]
-    return np.stack(changes, axis=2)
+    changes = np.zeros((*command.shape, len(stds)))
+    for k, (name, std) in enumerate(stds.items()):
+        if name.startswith(ZERO):
+            changes[:, :, k] = std * next(zeros)
+        elif name in (LATENCY, SCALE):
+            changes[:, :, k] = std * (rate if name == LATENCY else command)
+    return changes
 
 
 def joint_balance(

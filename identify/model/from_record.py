@@ -102,6 +102,8 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
 
 
 REACH = 4.0  # largest offset of a clock that is tried, in its standard deviations
+# Smallest fraction of a record's duration over which motions are compared at every tried delay.
+COMPARED = 0.5
 DELAYS = 50  # number of delays of a clock, of either sign, that are tried first
 # Relative difference up to which the rate of commands counts as equal to the frame rate.
 SAME_RATE = 0.05
@@ -252,8 +254,10 @@ def _likely_delay(times: Array, model: Array, measured: Array, farthest: float) 
     """Return the delay, s, of measured poses (k, 6) behind those of a model at times (k,).
 
     It is the delay of at most `farthest`, of either sign, with the smallest squared difference.
+    In a short record, delays are smaller, so that the fraction COMPARED of it remains to compare.
     Each component is divided by its standard deviation over time.
     """
+    farthest = min(farthest, (1 - COMPARED) / 2 * float(times[-1] - times[0]))
     stds = measured.std(axis=0)
     moving = stds > 0
     scaled = [poses[:, moving] / stds[moving] for poses in (model, measured)]

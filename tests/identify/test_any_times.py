@@ -13,7 +13,7 @@ from identify.diagnosis.diagnose import diagnose
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.model.from_record import identified_model
+from identify.model.from_record import _likely_delay, identified_model
 from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes
 from identify.record.recording import is_timed, poses
@@ -240,3 +240,10 @@ def test_torque_commands_need_the_grid():
     torques = record.assign_attrs(law="computed_torque", torque_commands=1)
     with pytest.raises(EstimationError, match=r"torques, under .* on one frame grid"):
         identified_model(torques, side_of(scenario_of()))
+
+
+def test_the_delay_of_a_record_shorter_than_its_clock_is_uncertain_is_found():
+    """The farthest delay to try is twice the duration."""
+    times = np.linspace(0, 2, 121)
+    model, measured = (np.tile(np.sin(6 * (times - by))[:, None], 6) for by in (0, 0.05))
+    assert abs(_likely_delay(times, model, measured, 4.0) - 0.05) < 1e-3

@@ -8,6 +8,7 @@ from dynamics.errors import SimulationError
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.estimation.warm_start import linear_warm_start
 from identify.model.error_modes import error_modes
 from tests.identify.synthetic import (
     build_plant,
@@ -82,6 +83,18 @@ def test_their_modes_are_the_changes_of_the_poses():
         ]
         slope = (ends[0] - ends[1]) / 2e-3
         np.testing.assert_allclose(modes[:, :, place], slope, atol=0.05 * np.abs(slope).max())
+
+
+def test_the_linear_warm_start_takes_errors_of_friction_beside_zeros_as_no_zeros():
+    """It is the same as with exact friction."""
+    record, _ = run_plant(scenario_with(TRUE, TRUE), 0, duration_s=2.2)
+    found = [
+        linear_warm_start(problem_of([record], scenario_with(TRUE, TRUE | zeros | stds)))
+        for zeros in ({}, {"joint_zero_std_rad": 1e-3})
+        for stds in ({}, STDS | {"friction_offset_std_N_m": 0.1})
+    ]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found[3], found[2], rtol=1e-6, atol=1e-9)
 
 
 def test_constants_of_another_law_are_refused():
