@@ -28,6 +28,7 @@ direction of the robot file. It acts from its command_time_s on, or without that
 latency of [timing]. Between two commands, the drives take the rate of a command as its change in
 one period of timing.frame_rate_hz. In a row without a measured pose the measured columns are empty,
 and in a row in which no command was written, so that the last one was held, the command columns.
+The first row holds a command.
 
 If rows are one frame of timing.frame_rate_hz apart, if the record begins at rest at its first
 reference pose, and if the servo saw exactly the measured poses, a model can close its own loop.
@@ -78,7 +79,8 @@ def columns_of(robot: Robot) -> dict[str, Group]:
             "pose that the sensor measured, or empty",
         ),
         "command": Group(
-            tuple(f"command_{n}_{unit}" for n in joints), "joint command from this row on"
+            tuple(f"command_{n}_{unit}" for n in joints),
+            "joint command from this row on, or empty where the last one was held",
         ),
         "command_time": Group(
             ("command_time_s",),
@@ -109,24 +111,32 @@ class Table:
     lines: tuple[int, ...]
 
     def telemetry(self) -> Telemetry:
-        """Return the logs of the table. They share the times of its rows.
+        """Return the logs of the table. They share the times of its rows that hold a command.
 
-        Raises RecordError with the line if the times do not increase, or `measured_ok` is wrong.
+        Raises RecordError with the line if the times do not increase, `measured_ok` is wrong, or
+        the first row holds no command.
         """
         start = self.groups["time"][0, 0]
         time = self.groups["time"][:, 0] - start
         rows = Rows(str(self.path), self.lines)
         ok = self._measured_ok()
         written = self.groups.get("command_time")
+        # In all other rows, the last command was held.
+        commands = np.flatnonzero(np.isfinite(self.groups["command"]).any(axis=1))
+        if not len(commands) or commands[0]:
+            raise RecordError(
+                f"{self.path} line {self.lines[0]}: the command is empty, and no command before it "
+                "was held: the first row must hold one"
+            )
         # Poses in rows that are marked as lost are ignored.
         poses = np.where(ok[:, None], self.groups["measured"], np.nan)
         return Telemetry(
             PoseLog(time, poses, ok, rows, self._covariances()),
             CommandLog(
-                time,
-                self.groups["command"],
-                rows,
-                None if written is None else written[:, 0] - start,
+                time[commands],
+                self.groups["command"][commands],
+                Rows(str(self.path), [self.lines[row] for row in commands]),
+                None if written is None else written[commands, 0] - start,
             ),
             ReferenceLog(time, self.groups["reference"], rows, self.groups.get("rate"))
             if "reference" in self.groups
@@ -266,7 +276,7 @@ def _numbers(path: Path, number: int, header: list[str], cells: list[str]) -> li
             raise RecordError(
                 f"{path} line {number}: {name} is {cell[:40]!r}, which is not a number"
             ) from None
-        may_be_empty = name.startswith(("measured_", "covariance_", "command_time"))
+        may_be_empty = name.startswith(("measured_", "covariance_", "command_"))
         if np.isinf(values[-1]) or (np.isnan(values[-1]) and not may_be_empty):
             raise RecordError(
                 f"{path} line {number}: {name} is {cell or 'empty'}, must be a finite number"

@@ -124,6 +124,16 @@ def test_optional_columns_may_be_left_out(mine, record):
     )
 
 
+def test_commands_are_empty_where_the_last_one_was_held(mine):
+    """Of a controller with half the rate of the camera: the held ones are not logged again."""
+    table = pd.read_csv(mine)
+    table.loc[1::2, [name for name in table if name.startswith("command_")]] = np.nan
+    table.to_csv(mine, index=False)
+    (found,), _ = read_own_records([mine])
+    assert np.array_equal(found["command"], table.filter(regex=r"command_\d")[::2])
+    assert np.array_equal(found["acting"], table["command_time_s"][::2])
+
+
 def test_a_second_table_may_be_of_the_robot_under_a_known_load(mine, record):
     """Nothing is measured by a platform's balance then; the load stands with the second record
     alone.
@@ -234,6 +244,8 @@ def moved(column, factor=1.0, shift=0.0):
             lambda t: t.assign(command_1_rad=np.inf),
             "line 2: command_1_rad is inf, must be a finite",
         ),
+        (moved("command_", np.nan), "line 2: the command is empty, and no command before it was"),
+        (moved("command_1", np.nan), "line 2: the command of joint 1 is empty, and others are not"),
         (
             lambda t: t.assign(measured_x_m=np.inf),
             "line 2: measured_x_m is inf, must be a finite",
