@@ -11,7 +11,7 @@ Identification
     identify(record) -> IdentificationResult    `result.table(truth=record.truth)`, `result.robot`
     result.model() -> dynamics.RobotModel       torques, CasADi, MJCF and URDF of the result
     result.budget() -> Budget                   what each source adds to the parameters' uncertainty
-    diagnose(record, result) -> Diagnosis       causes why the model does not explain the record
+    diagnose(record, result) -> Diagnosis       reasons why the model does not explain the record
     setup.unseen_errors(result) -> UnseenErrors model against plant on validation trajectories
     unseen_errors(parameters, robot, scenario, seed) -> ndarray   the same for any parameters
 

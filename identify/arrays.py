@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-# Number of rows that are factored at once. A block with one column per parameter fits into the
-# cache of a processor.
+# Number of rows of a block. A matrix with up to twice as many rows is one block. A block with one
+# column per parameter fits into the cache of a processor.
 BLOCK = 600
 
 
@@ -33,13 +33,14 @@ def triangular_factor(*parts: Array) -> Array:
 
 
 def agreed(values: ArrayLike, bits: int = 27) -> Array:
-    """Round an array to `bits` bits of its largest entry, on which all processors agree.
+    """Round an array to about `bits` bits of its largest entry, so that processors agree.
 
-    The default has a relative resolution of about 1e-8. Kernels of BLAS and vectorised sines differ
-    in the last bits from processor to processor. A search that begins with rounded numbers takes
-    the same steps on all processors. The spacing of the grid is a power of two, so that rounding is
-    exact. Two processors disagree only if their values lie on both sides of the middle between two
-    grid points. This is very rare if the grid is much coarser than the differences.
+    The default resolution is about 1e-8 of the largest entry. Kernels of BLAS and vectorised sines
+    differ in the last bits from processor to processor. A search that begins with rounded numbers
+    takes the same steps on all processors. The spacing of the grid is a power of two, so grid
+    points are exact. Two processors disagree only if their values lie on different sides of the
+    middle between two grid points, which is very rare on a coarse grid. An array of zeros, or with
+    an entry that is not finite, is returned unchanged.
     """
     array = np.asarray(values, dtype=float)
     largest = float(np.abs(array).max(initial=0.0))

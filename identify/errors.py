@@ -1,16 +1,13 @@
-"""Errors that a user can cause or meet. Messages have the value, the limit and the valid names."""
+"""Errors that a user can cause or meet. Messages state value, limit and valid names."""
 
-LONGEST = 4000  # largest number of characters of a message
+LONGEST = 4000  # number of characters after which a message is cut
 
 
 class IdentifyError(Exception):
-    """Base of every error that the command line shows as one line. The message is one line."""
+    """Base of the errors of this package. The command line shows them as one line."""
 
     def __str__(self) -> str:
-        """Return the message on one line of at most `LONGEST` characters.
-
-        The limit is needed because a message can quote the content of a file.
-        """
+        """Return the message on one line, cut because it can quote the content of a file."""
         text = " ".join(super().__str__().splitlines())
         return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
@@ -20,11 +17,11 @@ class ScenarioError(IdentifyError):
 
 
 class TrajectoryError(IdentifyError):
-    """A trajectory that leaves the robot's reach or its travel, or cannot be read."""
+    """A trajectory that is malformed, that the robot cannot follow, or that cannot be read."""
 
 
 class FilterError(IdentifyError):
-    """A filter that does not fit the sampling rate or the length of the record."""
+    """A filter that does not fit the rate or length of a record, or a sample that is not finite."""
 
 
 class RecordError(IdentifyError):
@@ -32,7 +29,7 @@ class RecordError(IdentifyError):
 
 
 class OutputFolderError(IdentifyError):
-    """A run folder that already holds other files, or lacks a file of an earlier stage."""
+    """An output that would replace other files, or a folder that lacks an earlier stage's file."""
 
 
 class WriteError(IdentifyError):
@@ -44,7 +41,7 @@ class EstimationError(IdentifyError):
 
 
 class VerificationError(IdentifyError):
-    """A result beyond its limit, such as a difference from an independent engine."""
+    """A failed check or a missed goal, such as a difference from an independent engine."""
 
 
 class StudyError(IdentifyError):

@@ -1,8 +1,8 @@
 """Zero-phase Butterworth filter (section 4.2), derivatives of sampled signals, and filling of gaps.
 
-Forward and reverse filtering squares the magnitude. ``order`` is the order of one pass, as in
-Matlab's filtfilt, so the gain at the cutoff is 1/2. Modules of SciPy are loaded on first use,
-because every command reads a scenario, which uses only `padding_samples`.
+``order`` is the order of one pass, as in Matlab's filtfilt. Forward and reverse filtering squares
+the gain, so the gain at the cutoff is 1/2. SciPy loads its modules on first use. A command that
+reads a scenario needs only `padding_samples`, and thus does not wait for them.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from identify.arrays import Array
 from identify.errors import FilterError
 
-SPLINE_DEGREE = 5  # degree of the spline; its second derivative is still three times differentiable
+SPLINE_DEGREE = 5  # degree of the spline. Its second derivative is twice differentiable.
 
 
 def zero_phase_filter(
@@ -70,9 +70,10 @@ def zero_phase_filter(
 
 
 def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
-    """Return the number of samples by which a record is extended at both ends.
+    """Return the number of samples by which a record is extended at each end.
 
-    The extension covers three time constants of the filter's slowest pole.
+    The extension covers three time constants of the filter's slowest pole, and at least
+    3 (order + 1) samples.
     """
     # Butterworth poles lie on a circle. The slowest pole is nearest to the imaginary axis.
     slowest_decay = 2 * np.pi * cutoff_hz / rate_hz * np.sin(np.pi / (2 * order))
@@ -117,10 +118,13 @@ def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
 
 
 def interpolated(times: NDArray[Any], known: NDArray[Any], values: Array) -> Array:
-    """Interpolate values (k, ...) that are known at times (k,) linearly at other times (N,)."""
+    """Return values (N, ...) at `times` (N,), interpolated linearly between known values (k, ...).
+
+    The `known` times (k,) increase. Before the first and after the last, the value is constant.
+    """
     columns = values.reshape(len(values), -1).T
-    found = np.column_stack([np.interp(times, known, column) for column in columns])
-    return found.reshape(len(times), *values.shape[1:])
+    filled = np.column_stack([np.interp(times, known, column) for column in columns])
+    return filled.reshape(len(times), *values.shape[1:])
 
 
 def _finite(samples: ArrayLike) -> Array:

@@ -42,8 +42,8 @@ def loop_settings(
     """Return the settings of the loop around the plant or the model.
 
     The latency is the mean latency. Friction law, drive law and integration steps come from `side`,
-    the plant or the model. A model takes more steps if the robot needs them. Only the torque limit
-    comes from `control`.
+    the plant or the model. A model takes more steps than it states if the robot needs them. The
+    torque limit comes from `control`.
 
     Raises ScenarioError if only the key for sliding actuators is set but the robot's actuators
     turn, or the reverse.
@@ -59,7 +59,7 @@ def loop_settings(
     )
 
 
-# Longest integration step of a model, as a multiple of the time constant of its fastest motion.
+# Longest integration step of a model, as a fraction of the time constant of its fastest motion.
 LONGEST_STEP = 0.3
 
 
@@ -179,7 +179,7 @@ def in_form(robot: Robot, side: Plant | Model) -> Robot:
 
 
 def carrying(robot: Robot, load: Payload, anchor: str) -> Robot:
-    """Return the robot with a full platform if it carries a load off the origin of its frame.
+    """Return the robot, with a full body as platform if the load is off the platform's origin.
 
     anchor: scale anchor. There is a load only with the anchor payload.
     """
@@ -213,10 +213,10 @@ def _with_gains(robot: Robot, side: Plant | Model) -> Robot:
 
 
 def known_value(values: Mapping[str, float], name: str) -> float | None:
-    """Return the value of a parameter by name, also of a robot whose parameters have another form.
+    """Return the value of a parameter by name, also if `values` have another form of parameters.
 
     A first moment or product of inertia without a value is zero. If a gain or a passive friction of
-    one joint has no value, the shared value is returned. If a shared one has no value, the mean
+    one joint has no value, the shared value is returned. If the shared one has no value, the mean
     over the joints is returned. Without any value, a passive friction is zero. In all other cases
     without a value, the result is None.
     """
@@ -225,19 +225,19 @@ def known_value(values: Mapping[str, float], name: str) -> float | None:
     owner, _, entry = name.rpartition(".")
     if may_be_absent(name):
         of_all = of_all_legs(name)
-        own = sum(float(value) for one, value in values.items() if of_all_legs(one) == name)
-        legs = sum(one.startswith("joint") and one.endswith(".coulomb") for one in values)
-        return float(values.get(of_all, own / max(legs, 1)))
+        total = sum(float(value) for one, value in values.items() if of_all_legs(one) == name)
+        count = sum(one.startswith("joint") and one.endswith(".coulomb") for one in values)
+        return float(values.get(of_all, total / max(count, 1)))
     if entry not in JOINT_PID:
         return None
     if owner != "joint_pid":
         shared = values.get(f"joint_pid.{entry}")
         return None if shared is None else float(shared)
-    each = [float(value) for one, value in values.items() if one.rpartition(".")[2] == entry]
-    if not each:
+    of_joints = [float(value) for one, value in values.items() if one.rpartition(".")[2] == entry]
+    if not of_joints:
         return None
     # the mean of equal numbers can differ from them in the last digit
-    return each[0] if len(set(each)) == 1 else float(np.mean(each))
+    return of_joints[0] if len(set(of_joints)) == 1 else float(np.mean(of_joints))
 
 
 def is_gain(name: str) -> bool:
@@ -295,18 +295,18 @@ def parameter_column(identification: Any, column: str, names: Sequence[str]) -> 
     Raises RecordError if a parameter is missing or is not a finite number. The message names it.
     """
     entries = parameter_entries(identification)
-    found: dict[str, Any] = {
+    given: dict[str, Any] = {
         n: one.get(column) if isinstance(one := entries.get(n), dict) else None for n in names
     }
-    absent = [name for name, value in found.items() if value is None]
+    absent = [name for name, value in given.items() if value is None]
     if absent:
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
         raise RecordError(f"there is no {column} of {', '.join(absent[:3])}{more}")
-    for name, value in found.items():
+    for name, value in given.items():
         # bool is a subclass of int.
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and abs(value) <= sys.float_info.max):
             raise RecordError(
                 f"{column} of {name} is {json.dumps(value):.60}, must be a finite number"
             )
-    return list(found.values())
+    return list(given.values())

@@ -55,7 +55,7 @@ def check_choice(
 
     what      Noun for the error message, such as "law".
     built_in  Built-in parts by name.
-    error     Exception to be raised. Its message has the valid names.
+    error     Exception to be raised. Its message lists the valid names.
     """
     if given not in built_in and not is_plugin_name(given):
         raise error(f"unknown {what} {given!r}; valid: {', '.join(built_in)}, or module:function")
@@ -64,7 +64,8 @@ def check_choice(
 def chosen(given: str, what: str, built_in: Mapping[str, str]) -> Callable[..., Any]:
     """Return the built-in part with a name, or a user's own part.
 
-    For the arguments see `check_choice`. Raises ScenarioError if there is no such part.
+    For the arguments see `check_choice`. Raises ScenarioError if there is no such part, or for the
+    reasons that `own_function` states.
     """
     check_choice(given, what, built_in)
     if given not in built_in:
@@ -81,7 +82,7 @@ def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[.
     error  Exception to be raised.
 
     Raises `error` if the module is not allowed to run (the message states how to allow it), the
-    module or the function does not exist, or the named object is not a function.
+    module cannot be imported, or it has no such function.
     """
     try:
         function = import_plugin(what, name)

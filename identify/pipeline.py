@@ -55,8 +55,8 @@ def run(planned: Setup, folder: Path, progress: Progress, workers: int | None = 
 def record(folder: Path, progress: Progress, setup: Setup | None = None) -> cmmsim.Taught:
     """Run the plant on the exciting trajectory, and return the taught frames of the sensor.
 
-    Writes experiment.nc, and payload.nc if the scale anchor is a payload. setup: setup of the run
-    with a taught sensor, if there is one already.
+    Writes experiment.nc, and payload.nc if the scale anchor is a payload. `setup` is the setup of
+    the run, with a sensor that has been taught. Without it, the sensor is taught here.
     """
     run_folder, opened, trajectories = open_run(folder, progress)
     began = time.perf_counter()
@@ -87,10 +87,10 @@ def report(
     run_began: float | None = None,
     seconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Draw the figures, and write report.html, and result.json with the duration of all stages.
+    """Draw the figures, and write them with report.html and with the durations in result.json.
 
     run_began: time at which a whole run began, from `time.perf_counter`. seconds: durations of
-    earlier stages.
+    earlier stages that are added to result.json.
     """
     from identify.reporting.report import (
         write_report,

@@ -30,7 +30,7 @@ class Progress(Protocol):
     """Interface by which a stage reports its progress."""
 
     def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
-        """Open a stage of ``total`` steps; the context yields ``advance(n=1)``."""
+        """Open a stage of ``total`` steps. The context yields ``advance(n=1)``."""
         ...
 
 
@@ -43,13 +43,14 @@ class SilentProgress:
         yield lambda n=1: None
 
 
-LINE_S = 60.0  # interval between the lines of a stage if the output is not a terminal, seconds
+LINE_S = 60.0  # least time, s, between two lines of a stage if the output is not a terminal
 
 
 class RichProgress:
     """Progress as bars with elapsed and remaining time.
 
-    If the output is not a terminal, a stage prints a plain line once per minute and at its end.
+    If the output is not a terminal, a stage prints a plain line at most once per minute, and one at
+    its end.
     """
 
     def __init__(self, console: Console | None = None, rate: str = "") -> None:
@@ -153,8 +154,9 @@ def print_table(
                  aligned right.
     title, note  Lines above and below the table.
 
-    On a narrow terminal, words are folded, those of the first column last. Numbers and single words
-    are never cut: a table that needs more columns than the terminal has is printed wider.
+    On a narrow terminal, columns of words are folded, and the first column only if the others do
+    not suffice. Numbers and single words are never cut. A table that is then still wider than the
+    terminal is printed in full.
     """
     console = Console(markup=False, emoji=False)
     cells = [list(row) for row in rows]
@@ -173,17 +175,17 @@ def print_table(
 def _column_widths(
     lines: Sequence[Sequence[str]], words: Sequence[bool], available: int
 ) -> list[int]:
-    """Return the width of each column, in letters.
+    """Return the width of each column, in cells of the terminal.
 
-    Columns of words are reduced down to their longest word, until the table has the available
-    width. The first column is reduced if the others do not suffice.
+    Columns of words are narrowed until the table has the available width, but not below their
+    longest word. The first column is narrowed if the others do not suffice.
     """
     columns = list(zip(*lines, strict=True))
     widths = [max(cell_len(part) for cell in one for part in cell.split("\n")) for one in columns]
     longest = [
         max(cell_len(word) for cell in one for word in cell.split() or [""]) for one in columns
     ]
-    # A gap of one letter stands between two columns.
+    # There is an empty cell between two columns.
     excess = sum(widths) + len(widths) - 1 - available
     for candidates in ([k for k in range(1, len(columns)) if words[k]], [0]):
         while excess > 0 and (wide := [k for k in candidates if widths[k] > longest[k]]):

@@ -1,4 +1,4 @@
-"""Numbers of all random streams of this package. They make the streams of a seed independent.
+"""Numbers of the random streams of this package, which make the streams of a seed independent.
 
 Streams of an experiment are children of its seed, `SeedSequence(seed, spawn_key=(stream, ...))`.
 Streams of a single run append the number of the run. The search of a trajectory and the teaching
@@ -38,7 +38,7 @@ EXPOSURES = 25  # true delay of the right camera's exposure
 NOISE = 4  # noise of the sensor
 LATENCY = 5  # latency of the frames
 PREDICTION = 6  # noise of the predicted poses
-TRACKED = 24  # poses drawn for the shares of the error of a tracked motion
+TRACKED = 24  # poses drawn for the contributions to the error of a tracked motion
 
 # Mixed with a seed, or the same for every seed.
 UNCERTAINTY = 5  # with a record's seed: repeated experiments behind the standard deviations
@@ -65,7 +65,7 @@ def stream_seed(seed: int | np.random.SeedSequence, *stream: int) -> int:
 
 
 def integer_seed(seed: int | np.random.SeedSequence) -> int:
-    """Return the integer seed of an experiment, also from the sequence of a study's row."""
+    """Return the integer seed of an experiment, given as such or as a sequence of a study's row."""
     if isinstance(seed, np.random.SeedSequence):
         return int(seed.generate_state(1)[0])
     return seed

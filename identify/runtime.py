@@ -30,10 +30,11 @@ _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 
 
 def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield what a function returns for each item, in their order, computed in `threads()` threads.
+    """Yield what a function returns for each item, computed in `threads()` threads.
 
-    Threads are enough for runs of the compiled loop, which does not hold Python's lock. The
-    function must not call CasADi, which is not safe in threads.
+    The results come in the order of the items. Threads are enough for runs of the compiled loop,
+    which does not hold Python's global lock. The function must not call CasADi, which is not safe
+    in threads.
     """
     if threads() == 1:
         yield from map(function, items)
@@ -55,15 +56,15 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
 def cores() -> int:
     """Return the number of cores that this process is allowed to use.
 
-    Systems other than Linux do not report this. There it is the number of cores of the machine.
+    On systems that do not report this, all cores of the machine are counted.
     """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def threads() -> int:
-    """Return the number of threads for computations: one per core, or fewer by OMP_NUM_THREADS.
+    """Return the number of threads for computations: one per core, or OMP_NUM_THREADS if fewer.
 
-    A process of a study has this variable, because there are as many processes as cores.
+    Studies set this variable for their processes, of which there are as many as cores.
     """
     most = os.environ.get("OMP_NUM_THREADS", "")
     return min(max(int(most), 1), cores()) if most.isdecimal() else cores()
@@ -92,7 +93,8 @@ class InterruptHandler:
 def record_interrupts() -> Iterator[InterruptHandler]:
     """Record Ctrl-C while the block runs, for `raise_interrupt`.
 
-    A nested block uses the handler of the outer block, so Ctrl-C is recorded in both.
+    A nested block uses the handler of the outer block, so Ctrl-C is recorded in both. In a thread
+    that cannot handle Ctrl-C, nothing is recorded.
     """
     old = signal.getsignal(signal.SIGINT)
     handler = old if isinstance(old, InterruptHandler) else InterruptHandler()
@@ -107,10 +109,7 @@ def record_interrupts() -> Iterator[InterruptHandler]:
 
 
 def raise_interrupt() -> None:
-    """Raise KeyboardInterrupt again if Ctrl-C came since the `record_interrupts` block began.
-
-    It is called before long work begins.
-    """
+    """Raise KeyboardInterrupt again if Ctrl-C came since the `record_interrupts` block began."""
     handler = signal.getsignal(signal.SIGINT)
     if isinstance(handler, InterruptHandler) and handler.came:
         raise KeyboardInterrupt
@@ -118,11 +117,11 @@ def raise_interrupt() -> None:
 
 @contextmanager
 def interruptible_imports() -> Iterator[None]:
-    """Raise KeyboardInterrupt at each import in the block, once `record_interrupts` saw Ctrl-C.
+    """Raise KeyboardInterrupt at each import in the block after `record_interrupts` saw Ctrl-C.
 
-    Libraries that look for optional libraries can swallow the exception. All further libraries
-    would then be loaded before the command ends, which takes a minute on a busy machine. Clean-up
-    code with imports does not belong in the block.
+    Libraries that look for optional libraries can swallow the first exception. All further
+    libraries would then be loaded before the command ends, which takes a minute on a busy machine.
+    Clean-up code with imports does not belong in the block.
     """
     finder = _InterruptingFinder()
     sys.meta_path.insert(0, finder)
@@ -141,10 +140,9 @@ class _InterruptingFinder:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """After Ctrl-C, leave the block with KeyboardInterrupt.
+    """Leave the block with KeyboardInterrupt after Ctrl-C.
 
-    This holds even if code of a library has swallowed the exception or turned it into another
-    error.
+    This holds even if a library has swallowed the exception or turned it into another error.
     """
     with record_interrupts() as handler:
         try:
@@ -173,7 +171,7 @@ def delay_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, old)
-        if came:  # now for the handler from before the block
+        if came:  # the handler from before the block gets the signal now
             signal.raise_signal(signal.SIGINT)
 
 
@@ -181,8 +179,8 @@ def delay_interrupts() -> Iterator[None]:
 def shield_children() -> Iterator[None]:
     """Block Ctrl-C in the threads and processes that start in the block, and in their children.
 
-    Only the main process handles Ctrl-C, and ends the others. Windows has no such signal mask, and
-    there the block has no effect.
+    Only the main process handles Ctrl-C, and ends the others. On Windows, which has no such signal
+    mask, this has no effect.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -215,10 +213,10 @@ def mapped(
     *tasks: Iterable[Any],
     start: Callable[[], object] | None = None,
 ) -> Iterator[Iterator[R]]:
-    """Yield the results of a function for each task, in their order, computed in new processes.
+    """Yield an iterator over the results of a function for each task, computed in new processes.
 
-    Ctrl-C is blocked in the processes. They end at once when an exception such as Ctrl-C leaves the
-    block, or when this process has ended.
+    The results come in the order of the tasks. Ctrl-C is blocked in the processes. They end at once
+    when an exception such as KeyboardInterrupt leaves the block, or when this process has ended.
 
     count     Number of processes. None means one process per core.
     function  Function that is called with one item of each of the `tasks`.
@@ -230,8 +228,8 @@ def mapped(
     with ProcessPoolExecutor(count, get_context("spawn"), _begin, (start,)) as pool:
         try:
             with shield_children():  # the pool starts its processes when it gets the tasks
-                found = pool.map(function, *tasks)
-            yield found
+                outputs = pool.map(function, *tasks)
+            yield outputs
         except BaseException:
             with delay_interrupts():
                 for process in set(active_children()) - others:
@@ -246,10 +244,9 @@ def _begin(start: Callable[[], object] | None) -> None:
 
 
 def _can_handle_interrupts() -> bool:
-    """Return whether this thread can handle Ctrl-C.
+    """Return whether this thread can handle Ctrl-C, which only the main thread can.
 
-    Only the main thread can. The signal can also be turned off, for example by nohup, or by the
-    shell for a background command of a script.
+    nohup, or the shell for a background command of a script, turns the signal off.
     """
     in_main = threading.current_thread() is threading.main_thread()
     return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)

@@ -113,21 +113,21 @@ class Setup:
     def on_this_machine(self) -> Setup:
         """Return a copy with the renderer of this machine in place of "auto".
 
-        Without OpenGL, a warning is given.
+        Warns if OpenGL is missing and "auto" therefore means the analytic renderer.
         """
         renderer = choose_renderer(self.scenario.renderer).name
         return replace(self, scenario=self.scenario.with_overrides({"renderer": renderer}))
 
     @cached_property
     def in_file(self) -> Robot:
-        """The robot as its file describes it, with a full platform if the load needs one."""
+        """The robot as its file describes it, with a full body as platform if the load needs it."""
         scenario = self.scenario
         robot = self.loaded or load_robot(scenario.robot)
         return carrying(robot, scenario.payload, scenario.identification.scale_anchor)
 
     @cached_property
     def nominal(self) -> Robot:
-        """The robot of the file, with full and centred bodies and gains as in the model."""
+        """The robot of the file, with bodies, passive friction and gains as the model states."""
         return in_form(self.in_file, self.scenario.model)
 
     @cached_property
@@ -238,8 +238,8 @@ class Setup:
             Display of the progress.
         payload : bool
             True if the platform carries the scenario's known load. A record with the load and a
-            record without it determine the scale. The record holds the stated load, and the truth
-            holds the load that was drawn from the standard deviations.
+            record without it determine the scale. The record holds the stated load. The truth holds
+            the actual load, which is drawn with the load's standard deviations.
 
         Returns
         -------
@@ -322,7 +322,7 @@ def set_up(
     Raises
     ------
     ScenarioError
-        The argument is not a Scenario, or its plant or sensor cannot be made.
+        The argument is not a Scenario, or the plant or sensor of the scenario cannot be made.
     cmmsim.CmmError, dynamics.DynamicsError
         The files of sensor or robot are not valid.
 
@@ -369,8 +369,8 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
 
     Both run on the scenario's validation trajectories for this seed, each with its own friction law
     and integration steps. An ideal sensor closes both loops, so the errors are caused only by the
-    parameters (p,) and by effects that the model lacks. They are NaN if, and only if, the model's
-    loop is unstable.
+    parameters (p,) and by effects that the model lacks. The errors of a run are NaN if, and only
+    if, the model's loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
     range. Raises TrajectoryError if no validation trajectory is within the robot's limits.

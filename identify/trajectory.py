@@ -31,6 +31,8 @@ from identify.files.digest import json_with_digest, json_without_digest
 class FourierTrajectory:
     """Trajectory of m coordinates as a Fourier series.
 
+    Raises TrajectoryError for arrays of another shape or with numbers that are not finite.
+
     Attributes
     ----------
     chart : Chart
@@ -124,7 +126,6 @@ def random_trajectory(
     Normally distributed coefficients are projected onto the conditions of a smooth start. Then each
     coordinate is scaled so that it reaches the edge of the box.
 
-    rng                             Source of the coefficients.
     chart                           Coordinates of the platform.
     fundamental_hz                  Frequency of the first harmonic.
     harmonics                       Number of harmonics, at least two.
@@ -136,11 +137,11 @@ def random_trajectory(
     """
     if harmonics < 2:
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
-    order = np.arange(1, harmonics + 1)
+    multiples = np.arange(1, harmonics + 1)
     freedoms = len(chart.freedoms)
     # Conditions of a smooth start: sum_l s_l = 0 and sum_l l c_l = 0.
     sine = _without(rng.standard_normal((freedoms, harmonics)), np.ones(harmonics))
-    cosine = _without(rng.standard_normal((freedoms, harmonics)), order.astype(float))
+    cosine = _without(rng.standard_normal((freedoms, harmonics)), multiples.astype(float))
     # With a home of zero, poses are distances from home.
     shape = from_home(replace(chart, home=(0.0,) * 6), fundamental_hz, sine, cosine)
     box = box_of(chart, position_amplitude_m, orientation_amplitude_rad)
@@ -166,17 +167,15 @@ def check_travel(
     least_leverage: float = LEAST_LEVERAGE,
     most_condition: float = MOST_CONDITION,
 ) -> float:
-    """Check that a robot can follow a trajectory within its limits.
+    """Check that a trajectory stays within the limits of a robot.
 
-    robot                           Robot that shall follow the trajectory.
-    trajectory                      Trajectory of the platform.
-    t (N,)                          Times at which it is checked [s].
+    t (N,)                          Times at which the trajectory is checked [s].
     margin                          Margin to the travel limit of the joints, rad or m.
     least_leverage, most_condition  Limits that keep the robot away from singularities.
 
-    Returns the largest joint coordinate of the trajectory, rad or m. Raises TrajectoryError if a
-    pose is out of reach, beyond the travel limit less the margin, or near a singularity. The
-    message names time, leg, value and limit.
+    Returns the largest magnitude of a joint coordinate, rad or m. Raises TrajectoryError if a pose
+    is out of reach, beyond the travel limit less the margin, or near a singularity. The message
+    names time, leg, value and limit.
 
     See Also
     --------
@@ -199,8 +198,8 @@ def _without(rows: Array, direction: Array) -> Array:
     return rows - np.outer(rows @ unit, unit)
 
 
-FREE = "free"  # chart for files without an entry for it
-HOME = (0.0,) * 6  # home for files without an entry for it. The chart "free" does not use it.
+FREE = "free"  # chart of files that state none
+HOME = (0.0,) * 6  # home of files that state none. The chart "free" does not use it.
 
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = (
@@ -257,7 +256,8 @@ def trajectories_json(trajectories: TrajectorySet) -> str:
 def load_trajectories(path: Path | str) -> TrajectorySet:
     """Read a file with the text of `trajectories_json`.
 
-    Raises TrajectoryError if the file cannot be read, is of another format, or is incomplete.
+    Raises TrajectoryError if the file cannot be read, is of another format, or is incomplete or
+    damaged. Raises RecordError if the content does not fit its digest.
     """
     try:
         data = json_without_digest(path, dict(json.loads(Path(path).read_text(encoding="utf-8"))))

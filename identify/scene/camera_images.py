@@ -24,12 +24,12 @@ class Found:
     ids
         Names (k,).
     centres
-        Centres (2, k, 2) in the whole images, in px.
+        Detected centres (2, k, 2) in the whole images, in px.
     shapes
         Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px. None if the
         detector does not return ellipses.
     expected
-        Projections (2, k, 2) of the true places into the images, in px.
+        Projections (2, k, 2) of the true positions into the images, in px.
     points, covariances
         Triangulated points (k, 3), in m, and their covariances (k, 3, 3), in m², in the base frame.
     """
@@ -46,8 +46,9 @@ class Found:
 class StereoView:
     """Camera images of one pose (6,) [m, rad], drawn with noise.
 
-    ``images`` (2, h, w) are parts of the whole images. ``corners`` (2, 2) are the places (x, y) of
-    their first pixels. ``found`` maps the bodies "platform" and "base" to their detected stickers.
+    ``images`` (2, h, w) are parts of the whole images, in 8 bits. ``corners`` (2, 2) are the
+    coordinates (x, y) of their first pixels in the whole images. ``found`` maps "platform" and
+    "base" to the detected stickers of these bodies.
     """
 
     pose: Array
@@ -59,7 +60,7 @@ class StereoView:
 class ImagingSensor:
     """Sensor of a workcell that draws images at given poses, and detects the stickers in them.
 
-    The sensor is not taught, so a sticker is searched near its nominal place.
+    The sensor is not taught, so a sticker is searched near its nominal position.
 
     seed      Seed of the noise.
     renderer  "analytic", which needs no OpenGL, or "pyrender".
@@ -110,9 +111,9 @@ class ImagingSensor:
         """Find the stickers of the platform (0) or the base (1)."""
         body = self._cell.bodies[number]
         nominal = self._cell.marked(body.name)
-        place = self._camera_from_base @ (pose_to_transform(pose) if number == 0 else np.eye(4))
+        transform = self._camera_from_base @ (pose_to_transform(pose) if number == 0 else np.eye(4))
         seen = self._sensor.observer.observe(
-            images, place, nominal.nominal, nominal.sticker_normals
+            images, transform, nominal.nominal, nominal.sticker_normals
         )
         base_from_camera = invert(self._camera_from_base)
         turn = base_from_camera[:3, :3]
@@ -120,7 +121,7 @@ class ImagingSensor:
             ids=tuple(body.ids[k] for k in seen.index),
             centres=np.stack([seen.left_pixels, seen.right_pixels]),
             shapes=None if seen.outlines is None else seen.outlines.shapes,
-            expected=self._rig.project(apply(place, body.places[seen.index]))[0],
+            expected=self._rig.project(apply(transform, body.places[seen.index]))[0],
             points=apply(base_from_camera, seen.points),
             covariances=turn @ seen.covariances @ turn.T,
         )
@@ -134,19 +135,19 @@ def stereo_view(
     The default pose (6,) is home. ``seed`` is the seed of the noise. The renderer "pyrender" needs
     OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
     """
-    at = cell.home if pose is None else np.asarray(pose, dtype=float)
-    return ImagingSensor(cell, seed, renderer, region_of(cell, [at])).look(at)
+    drawn_pose = cell.home if pose is None else np.asarray(pose, dtype=float)
+    return ImagingSensor(cell, seed, renderer, region_of(cell, [drawn_pose])).look(drawn_pose)
 
 
 def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
     """Return a square part of both images that shows both bodies at all poses (6,).
 
-    The returned values are its first pixels (2, 2) and its side, in px.
+    The returned values are the first pixels (2, 2) of the parts and their side, in px.
     """
     assert cell.rig is not None
     rig, camera_from_base = cell.rig
     platform, base = (body.vertices for body in cell.bodies)
-    # Both bodies are convex, so that their vertices bound their images.
+    # Both bodies are convex, so their vertices bound their images.
     points = np.vstack([base, *(apply(pose_to_transform(pose), platform) for pose in poses)])
     pixels = rig.project(apply(camera_from_base, points))[0]
     size = np.array([[camera.width, camera.height] for camera in rig.cameras])
@@ -172,7 +173,7 @@ class _CroppedImages:
     def windows(self, corners: NDArray[np.int_], size: int) -> NDArray:
         """Return the grey values (2, n, size, size) of windows.
 
-        Their first pixels ``corners`` (2, n, 2) are given in the whole images.
+        ``corners`` (2, n, 2) are the first pixels of the windows in the whole images.
         """
         sides = zip(self._images, corners, self._corners, strict=True)
-        return np.stack([cut_windows(image, at - first, size) for image, at, first in sides])
+        return np.stack([cut_windows(image, pixel - first, size) for image, pixel, first in sides])

@@ -72,8 +72,8 @@ def stereo_figure(
 ) -> Figure:
     """Draw both camera images with the detected ellipses, and each centre's error as an arrow.
 
-    ``size`` is in inches. ``arrows`` is the factor that enlarges the errors, which are detected
-    minus true centres; None draws no arrows.
+    ``size`` is in inches. An error is detected minus true centre, enlarged by the factor
+    ``arrows``. None draws no arrows.
     """
     figure = Figure(figsize=size, layout="constrained")
     for side, axes in enumerate(figure.subplots(1, 2, squeeze=False)[0]):
@@ -167,10 +167,7 @@ def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
 
 
 def show_image(axes: Axes, view: StereoView, side: int) -> None:
-    """Draw one image at its place in the whole image, in px.
-
-    The image is brightened, so that dark bodies are visible in print.
-    """
+    """Draw one image, brightened, at its position in the whole image, in px."""
     image = view.images[side]
     x, y = view.corners[side]
     height, width = image.shape
@@ -184,17 +181,14 @@ def show_image(axes: Axes, view: StereoView, side: int) -> None:
 
 
 def brightened(image: Array) -> Array:
-    """Return grey values (h, w) uint8 for a screen or for paper.
-
-    They are scaled square roots, which make dark parts visible.
-    """
+    """Return an image (h, w) as scaled square roots, uint8, in which dark parts are visible."""
     return np.asarray(np.sqrt(image / 255.0) * 255.0, dtype=np.uint8)
 
 
 def ellipse_points(centre: Array, shape: Array, count: int = 32) -> Array:
-    """Return points (count + 1, 2) [px] along a detected ellipse, closed.
+    """Return points (count + 1, 2) [px] along an ellipse, of which the last equals the first.
 
-    The ellipse has a centre (2,) and a shape (2, 2), in px.
+    ``centre`` (2,) is in px. ``shape`` (2, 2) maps the unit circle to the ellipse.
     """
     turn = np.linspace(0, 2 * np.pi, count + 1)
     return np.asarray(centre + np.column_stack([np.cos(turn), np.sin(turn)]) @ shape.T)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
 
-PIECE = 1 / 60  # longest edge of a piece, as a share of the size of the scene
+PIECE = 1 / 60  # longest edge of a piece, as a fraction of the size of the scene
 # Direction from the scene to the light, in the base frame. Its length does not matter.
 LIGHT = np.array([0.35, -0.55, 0.76])
 SHADE = 0.62  # brightness of a face without light. A face towards the light has the brightness one.
@@ -39,7 +39,8 @@ class Viewpoint:
 class Painter:
     """Painter that collects shapes and draws them into axes.
 
-    Centre (3,) and size of the scene are in m.
+    Centre (3,) and size of the scene are in m. A shape is drawn as if it were nearer by
+    ``towards``, in m.
     """
 
     def __init__(self, viewpoint: Viewpoint, centre: Array, size: float) -> None:
@@ -54,9 +55,9 @@ class Painter:
         self._pieces: list[tuple[float, Array, tuple, tuple, float]] = []
 
     def pixels(self, points: Array) -> Array:
-        """Project points (..., 3) to places (..., 2) on the paper.
+        """Project points (..., 3) to positions (..., 2) on the paper.
 
-        The places are in m at the middle of the scene.
+        The positions are in m, to scale at the distance of the middle of the scene.
         """
         seen = (points - self._eye) @ self._axes
         return np.asarray(self._far * seen[..., :2] / -seen[..., 2:], dtype=float)
@@ -66,8 +67,7 @@ class Painter:
     ) -> None:
         """Add the triangles (m, 3) of a closed body, shaded by the light.
 
-        The corners of a triangle run counter-clockwise, seen from outside. The triangles are drawn
-        as if they were nearer by ``towards``, in m.
+        The corners of a triangle run counter-clockwise, seen from outside.
         """
         # Large faces are divided, because they cannot be sorted by a single distance.
         corners, pieces = trimesh.remesh.subdivide_to_size(vertices, faces, self._piece)
@@ -81,8 +81,8 @@ class Painter:
         base = np.array(to_rgb(colour))
         # Closed triangles have an outline, which fills the seams between pieces.
         closed = self.pixels(triangles[facing])[:, [0, 1, 2, 0]]
-        for flat, middle, share in zip(closed, middles[facing], bright, strict=True):
-            self._add(middle, flat, (*(share * base), 1.0), None, 0.5, towards)
+        for flat, middle, brightness in zip(closed, middles[facing], bright, strict=True):
+            self._add(middle, flat, (*(brightness * base), 1.0), None, 0.5, towards)
 
     def edges(
         self, vertices: Array, faces: NDArray[np.int_], colour: str, width: float = 0.7
@@ -116,10 +116,10 @@ class Painter:
     ) -> None:
         """Add a straight line between two points (2, 3)."""
         count = int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / self._piece)) + 1
-        places = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
-        flat = self.pixels(places)
+        samples = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
+        flat = self.pixels(samples)
         for k in range(count - 1):
-            middle = 0.5 * (places[k] + places[k + 1])
+            middle = 0.5 * (samples[k] + samples[k + 1])
             self._add(middle, flat[k : k + 2], None, to_rgba(colour, alpha), width, towards)
 
     def paint(self, axes: Axes) -> None:

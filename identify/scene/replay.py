@@ -2,7 +2,7 @@
 
 The page shows the scene, the images and the curves. The copy of three.js in trimesh draws the
 scene, and the scripts in `replay_page/` move it. Poses are stored in the page in double precision,
-so that it shows the exact values of the files.
+so that it shows their exact values.
 
 The scene is a binary glTF file, which Blender and other programs can open, too. Its nodes have the
 names of bodies and legs. Lengths are in m, in the base frame with z up.
@@ -49,18 +49,18 @@ ABOVE_M = 0.0004
 
 
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
-    """Return a workcell as glTF, with its platform at a pose (6,), by default home.
+    """Return a workcell as glTF, with its platform drawn_pose a pose (6,), by default home.
 
     The nodes are "platform" and "base" with their stickers, each body of a leg, and "left camera"
     and "right camera". A body of a leg is a rod along its z axis from its origin. Raises
     dynamics.UnreachablePoseError or dynamics.ChartError.
     """
-    at = cell.home if pose is None else pose
+    drawn_pose = cell.home if pose is None else pose
     scene = trimesh.Scene()
-    for body, place in cell.placed(at):
+    for body, place in cell.placed(drawn_pose):
         _add(scene, body.name, body.vertices, body.faces, SOLIDS[body.name], place)
         _add_stickers(scene, body)
-    for part, ends in zip(cell.parts, cell.rods(at), strict=True):
+    for part, ends in zip(cell.parts, cell.rods(drawn_pose), strict=True):
         # A rod lies along the z axis of its node, so that the page can place it with one matrix.
         mesh = trimesh.creation.cylinder(part.segment.radius, segment=_upright(ends), sections=20)
         colour = leg_colour(cell, part.leg, part.body)
@@ -105,7 +105,7 @@ def _add(
 ) -> None:
     """Add a body without normals, so that a viewer shades each face separately."""
     # glTF has linear colours, and matplotlib has sRGB colours.
-    linear = [((share + 0.055) / 1.055) ** 2.4 for share in to_rgb(colour)]
+    linear = [((channel + 0.055) / 1.055) ** 2.4 for channel in to_rgb(colour)]
     material = PBRMaterial(
         baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=0.9, name=name
     )
@@ -118,13 +118,14 @@ def _add(
 PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
 
-KEY_FRAMES = 24  # number of frames with images. Images need most of the time and half of the file.
+# Largest number of frames with images. Images need most of the time and half of the file.
+KEY_FRAMES = 24
 # JPEG quality of the images. An image has about 30 kB. WebP would be half as large, but writing it
 # would take as long as rendering the image.
 IMAGE_QUALITY = 45
 # Radius of the ball with 95 % of a normal distribution in space, in standard deviations.
 CONFIDENCE = 2.7955
-# End of the libraries in the page that trimesh writes. The viewer of trimesh follows them.
+# End of the libraries in the page that trimesh writes. Behind it, the viewer of trimesh follows.
 LIBRARY_ENDS = "THREE.GLTFLoader=GLTFLoader;})();"
 
 
@@ -141,6 +142,8 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
         The robot cannot take a pose of the motion.
     cmmsim.CmmError
         The sensor cannot be made or cannot draw.
+    IdentifyError
+        The installed trimesh contains no known three.js.
     """
     check_writable(path)
     write_text(path, page(motion, progress or SilentProgress()), parents=True)
@@ -190,12 +193,12 @@ def three_js() -> str:
     """
     # The scene is arbitrary, because only the libraries of its page are used.
     whole = scene_to_html(trimesh.Scene(trimesh.creation.box()))
-    library, found, _ = whole.partition("<script>")[2].partition(LIBRARY_ENDS)
-    if not found:
+    library, end, _ = whole.partition("<script>")[2].partition(LIBRARY_ENDS)
+    if not end:
         raise IdentifyError(
             f"trimesh {trimesh.__version__} contains no three.js that this version of cmmsim knows"
         )
-    return library + found
+    return library + end
 
 
 def _has_images(motion: Motion) -> bool:
@@ -227,7 +230,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
         }
         for camera in cell.cameras
     ]
-    # Single precision is enough for drawings. Poses are also displayed as numbers.
+    # Single precision is enough for drawings. Poses and times are also displayed as numbers.
     return {
         "frames": len(motion.time),
         "time": _numbers(motion.time, "f8"),

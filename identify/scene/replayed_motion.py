@@ -63,21 +63,21 @@ class Motion:
     def drawn(self) -> Array:
         """Poses (N, 6) in which the robot is drawn.
 
-        The robot is drawn at the true poses. If the truth is unknown, it is drawn at the last
-        measured pose, projected to the robot's degrees of freedom.
+        These are the true poses. If the truth is unknown, they are the most recent measured poses,
+        projected to the robot's degrees of freedom.
         """
         if TRUE in self.poses:
             return self.poses[TRUE]
         measured = self.poses[MEASURED]
         robot = self.cell.robot
         good = np.asarray(np.isfinite(measured).all(axis=1))
-        # Each frame uses the last measured frame, or the first one if none was measured before.
-        last = np.maximum.accumulate(np.where(good, np.arange(len(good)), good.argmax()))
-        return measured[last] if robot is None else robot.pose(robot.coordinates(measured[last]))
+        # Frames before the first measured frame use that one.
+        rows = np.maximum.accumulate(np.where(good, np.arange(len(good)), good.argmax()))
+        return measured[rows] if robot is None else robot.pose(robot.coordinates(measured[rows]))
 
 
 def motion_at_home(cell: Workcell, renderer: str = "analytic") -> Motion:
-    """Return a workcell that stands still at home. ``renderer`` draws its images."""
+    """Return the motion of a workcell that stands still at home."""
     return Motion(
         cell, np.zeros(1), {TRUE: cell.home[None]}, renderer=renderer, title=cell.name.capitalize()
     )
@@ -97,8 +97,8 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
     OutputFolderError
         The folder contains no record.
     RecordError
-        A file is damaged or of an older version, there is no such motion, or the files are not of
-        one run.
+        A file is damaged or of an older version, there is no such motion, the files are not of one
+        run, or there is neither a truth nor a measured frame.
     dynamics.RobotFileError, EstimationError
         The robot's file is missing, or differs from the robot of the record.
     """
@@ -159,8 +159,8 @@ def _models(
 ) -> dict[str, Array]:
     """Return the poses (N, 6) of the identified model and of the initial guess.
 
-    If there are none, a note states the reason. Raises RecordError if the poses do not belong to
-    the record.
+    A model that diverges in the first frame is left out. If the run is not validated, there are
+    none, and a note states this. Raises RecordError if the poses do not belong to the record.
     """
     missing = "so no model is shown; this command adds it: cmmsim validate --out"
     if not run.model.is_file() or not run.result.is_file():
@@ -180,5 +180,4 @@ def _models(
         IDENTIFIED: poses(files.model[name], "identified"),
         STARTING: poses(files.model[name], "initial"),
     }
-    # A model that diverges in the first frame has no pose to show.
     return {kind: values for kind, values in found.items() if np.isfinite(values).any()}

@@ -1,7 +1,4 @@
-"""Workcell: a robot and the stereo sensor that looks at the robot, ready to be drawn.
-
-A workcell has bodies, stickers, legs and cameras.
-"""
+"""Workcell: a robot and the stereo sensor that looks at the robot, ready to be drawn."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -43,7 +40,7 @@ class Solid:
     ids
         Names (k,) of the stickers.
     places, normals
-        True places (k, 3) and outward normals (k, 3) of the stickers.
+        True positions (k, 3) and outward normals (k, 3) of the stickers.
     radius, ring_radius
         Radii of a sticker and of its ring.
     """
@@ -60,10 +57,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class ViewingCamera:
-    """Camera with its pose base_from_camera (4, 4).
-
-    Its axes are x right, y down and z forward.
-    """
+    """Camera with its pose base_from_camera (4, 4). Its axes are x right, y down and z forward."""
 
     name: str
     lens: PinholeCamera
@@ -157,10 +151,7 @@ class Workcell:
 
     @cached_property
     def frame(self) -> Array:
-        """Lines (n, 2, 3) between neighbouring base joints of the legs, in the base frame, m.
-
-        Without a robot, there are no lines.
-        """
+        """Lines (n, 2, 3) between neighbouring base joints of the legs, in the base frame, m."""
         if self.robot is None:
             return np.zeros((0, 2, 3))
         joints = self.robot.geometry.base_joints
@@ -186,14 +177,13 @@ class Workcell:
         )
 
     def seen(self, pose: Array) -> Array:
-        """Return the places (k, 3) of the platform's stickers that both cameras see, in the base
-        frame, m.
+        """Return the positions (k, 3) of the platform's stickers that both cameras see.
 
-        The platform is at a pose (6,). Occlusion by other bodies is neglected.
+        They are in the base frame, m, for a pose (6,). Occlusion by other bodies is neglected.
         """
         if self.rig is None or self.sensor is None:
             return np.zeros((0, 3))
-        # Visibility is decided at nominal places, but the true places are returned.
+        # Visibility is decided at nominal positions, but the true positions are returned.
         lines = SightLines(self.marked("platform"), *self.rig)
         return apply(pose_to_transform(pose), self.bodies[0].places[lines.visible(pose)])
 
@@ -211,10 +201,7 @@ class Workcell:
         return sensor
 
     def obstacles(self, pose: Array) -> Mapping[str, Array]:
-        """Return base_from_body (4, 4) of the legs' bodies by name, at a pose (6,).
-
-        These bodies can hide stickers.
-        """
+        """Return base_from_body (4, 4) of the legs' bodies, which can hide stickers, by name."""
         return {} if self.robot is None else robot_transforms(self.robot, pose)
 
 
@@ -232,7 +219,7 @@ def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Wo
 
 
 def _marked(name: str, file: SensorFile, stream: int) -> Solid:
-    """Return a body of a sensor file with its stickers at their true places."""
+    """Return a body of a sensor file with its stickers at their true positions."""
     section = getattr(file, name)
     stickers = file.stickers
     marked = marked_body(name, section)
