@@ -1,4 +1,4 @@
-"""Acceptance tests of one sensor, and their figures for ``acceptance.json``."""
+"""Acceptance tests of one sensor, and their results for ``acceptance.json``."""
 
 import math
 import time
@@ -45,8 +45,9 @@ BLOCK = 10  # number of neighbouring frames of the bar that are resampled togeth
 class AcceptanceRun:
     """Acceptance tests of a sensor and their results.
 
-    ``sensor`` is the sensor's name or file as it was typed. ``limit_um`` is the limit of the length
-    error. ``found`` holds the results and ``seconds`` the durations, by the name of the test.
+    ``sensor`` is the sensor's name or file as it was typed. ``standards`` are the names of the
+    tests to run. ``limit_um`` is the limit of the length error. ``found`` holds the results and
+    ``seconds`` the durations, by the name of the test.
     """
 
     sensor: str
@@ -70,12 +71,12 @@ class Standard:
     key
         Name in ``acceptance.json``.
     steps
-        Function that returns the number of steps in a volume. It refuses a volume without room for
-        the test.
+        Function that returns the number of steps of the test in a volume. It raises
+        AcceptanceError for a volume without room for the test.
     test
         Function that runs the test.
     figures
-        Function that returns the figures for ``acceptance.json``.
+        Function that returns the entry of ``acceptance.json``.
     """
 
     title: str
@@ -114,7 +115,7 @@ def prepare(
     ------
     CmmError
         The sensor, renderer or standard is unknown, the limit is not a positive number, or the
-        volume is not visible, violates a rule of the standard or has no room for the bar.
+        volume is not visible, violates a rule of a standard or has no room for a test.
     """
     if not (math.isfinite(limit_um) and limit_um > 0.0):
         raise AcceptanceError(
@@ -126,14 +127,14 @@ def prepare(
     file = read_sensor_file(sensor)
     under_test = SensorUnderTest(file, seed, renderer)
     if volume is None:
-        found = common_volume(file.rig)
+        chosen = common_volume(file.rig)
     else:
-        found = volume_of_size(file.rig, parse_volume(volume))
+        chosen = volume_of_size(file.rig, parse_volume(volume))
     # Counting the steps refuses a volume without room for the test.
     for name in standards:
-        STANDARDS[name].steps(found)
+        STANDARDS[name].steps(chosen)
     return AcceptanceRun(
-        str(sensor), under_test, under_test.renderer_name(), found, standards, limit_um
+        str(sensor), under_test, under_test.renderer_name(), chosen, standards, limit_um
     )
 
 
@@ -156,7 +157,7 @@ def parse_volume(text: str) -> np.ndarray:
 
 
 def do(run: AcceptanceRun, progress: Progress) -> None:
-    """Run the tests of a prepared run."""
+    """Run the tests of a prepared run, and store their results and durations in it."""
     for name in run.standards:
         standard = STANDARDS[name]
         start = time.perf_counter()
@@ -166,7 +167,7 @@ def do(run: AcceptanceRun, progress: Progress) -> None:
 
 
 def acceptance_entry(run: AcceptanceRun) -> dict[str, Any]:
-    """Return all figures of a run. A test that was not run is absent."""
+    """Return the content of ``acceptance.json``, without tests that were not run."""
     volume = run.volume
     return {
         "sensor": run.under_test.file.name,
@@ -237,16 +238,16 @@ def _why_too_long(test: LengthTest, run: AcceptanceRun) -> Advice:
     largest = test.largest
     exposures = len(largest.measured)
     std_um = 1e6 * largest.std / math.sqrt(exposures)
-    times = abs(1e6 * largest.error) / std_um
-    if times <= STDS:
-        half = "x".join(f"{side / 2:.3g}" for side in run.volume.size)
+    ratio = abs(1e6 * largest.error) / std_um
+    if ratio <= STDS:
+        sides = "x".join(f"{side / 2:.3g}" for side in run.volume.size)
         return Advice(
             f"The images are this noisy: the mean of {exposures} exposures of this length has a "
             f"stated standard deviation of {std_um:.2g} um. A smaller volume is nearer.",
-            f"cmmsim acceptance {run.sensor} --standard vdi --volume {half}",
+            f"cmmsim acceptance {run.sensor} --standard vdi --volume {sides}",
         )
     return Advice(
-        f"The error is {times:.2g} times its stated standard deviation of {std_um:.2g} um: the "
+        f"The error is {ratio:.2g} times its stated standard deviation of {std_um:.2g} um: the "
         "centres of the stickers are found with an error that no averaging removes.",
         f"cmmsim detectors {run.sensor}",
     )

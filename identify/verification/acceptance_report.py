@@ -1,6 +1,6 @@
 """Report of acceptance tests for ``acceptance.md``.
 
-Its tables show the results beside published figures. A text explains which figures are comparable.
+The report shows the results beside published figures, and explains which of them are comparable.
 """
 
 from typing import Any
@@ -80,18 +80,15 @@ def length_table(test: dict[str, Any]) -> Table:
 
 
 def bar_table(test: dict[str, Any]) -> Table:
-    """Return the statistics of the relative pose error of the bar's ends.
-
-    The rows are for the standing and the moving bar. Intervals are 95 % intervals.
-    """
+    """Return a table of the relative pose error of the bar's ends, standing and moving."""
     rows = []
     for state in ("standing", "moving"):
         for key, name in MAGNITUDES:
-            figures = test[state][key]
+            summary = test[state][key]
             values = [
-                number(figures[k]) + _interval(figures["interval"].get(k)) for k, _ in STATISTICS
+                number(summary[k]) + _interval(summary["interval"].get(k)) for k, _ in STATISTICS
             ]
-            rows.append((f"{state}, {name}", *values, str(figures["count"])))
+            rows.append((f"{state}, {name}", *values, str(summary["count"])))
     note = (
         f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up "
         f"to {test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in "
@@ -113,7 +110,7 @@ def bar_table(test: dict[str, Any]) -> Table:
 
 
 def latency_table(test: dict[str, Any]) -> Table:
-    """Return the latency of the reports."""
+    """Return a table of the latency of the sensor's reports."""
     low, high = test["mean_interval_ms"]
     rows = (
         ("mean", f"{test['mean_ms']:.4f} ({low:.4f} to {high:.4f})"),

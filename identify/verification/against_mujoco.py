@@ -47,7 +47,7 @@ EXCITATION = Excitation(
 GOAL_UM = 10.0
 GOAL_URAD = 20.0
 
-# Differences that the paper's figure 8 shows.
+# Differences in the paper's figure 8.
 PAPER = {
     "position_max_um": 1250.0,
     "angle_max_urad": 3250.0,
@@ -155,10 +155,7 @@ def compare_engines(
 
 
 def exciting_trajectory(robot: Robot) -> FourierTrajectory:
-    """Return the first random trajectory of eq. 37 that stays inside the travel.
-
-    It is always the same for the same robot.
-    """
+    """Return the first random trajectory of eq. 37 inside the travel, by a fixed seed."""
     period_s = 1 / EXCITATION.fundamental_hz
     return admissible_trajectories(robot, EXCITATION, period_s, 1, np.random.SeedSequence(0))[0]
 
@@ -201,10 +198,10 @@ def _mujoco_rows(
 class Verdict:
     """Largest differences between the engines.
 
-    Figures with "max" are for the whole run, and figures with "steady" from STEADY_FROM_S on. They
-    are distances of the platform [µm], norms of the vector of Euler angle differences [µrad] and
-    differences of actuator torque or force [N m, N]. Closure error [µm] and link spin [rad/s] are
-    those of MuJoCo. The tracking errors [µm, µrad] are the differences of this model from its
+    Entries with "steady" are for the time from STEADY_FROM_S on, and all others for the whole run.
+    They are distances of the platform [µm], norms of the vector of Euler angle differences [µrad]
+    and differences of actuator torque or force [N m, N]. Closure error [µm] and link spin [rad/s]
+    are those of MuJoCo. The tracking errors [µm, µrad] are the differences of this model from its
     reference.
     """
 
@@ -225,7 +222,7 @@ class Verdict:
 
 
 def judge(runs: EngineRuns) -> Verdict:
-    """Return the figures of a comparison."""
+    """Return the largest differences in a comparison."""
     position, angle = _lengths(runs.difference)
     tracking = _lengths(runs.model_pose - runs.reference)
     steady = runs.time >= STEADY_FROM_S
@@ -248,7 +245,7 @@ def _lengths(difference: Array) -> tuple[Array, Array]:
 
 
 def verification_entry(robot: Robot, typed: str, runs: EngineRuns) -> dict[str, Any]:
-    """Return the content of `verification.json`, for a robot whose name or file was typed."""
+    """Return the content of `verification.json`. `typed`: the robot's name or file as typed."""
     verdict = judge(runs)
     chosen = robot.parameter_sets[PARAMETER_SET]
     return {
@@ -299,7 +296,7 @@ def _why_different(robot: Robot, typed: str, verdict: Verdict) -> Advice:
 
 
 def _gains_entry(robot: Robot, gains: Array) -> dict[str, float | list[float]]:
-    """Return the gains by name, each one number or, if joints do not share it, one per joint."""
+    """Return the gains by name: one number if all joints share a gain, else a list over joints."""
     columns = robot.layout.each_gains(gains).T.tolist()
     own = robot.layout.own_gains
     return {

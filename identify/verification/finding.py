@@ -4,16 +4,17 @@ from dataclasses import asdict, dataclass, field
 from textwrap import shorten
 from typing import Any
 
-LONGEST = 160  # largest number of characters of a finding in a message, unless it holds a remedy
+LONGEST = 160  # largest number of characters of a finding in a message
 
 
 @dataclass(frozen=True)
 class Finding:
     """Result of one check.
 
-    ``ok`` is true if the value is within its limit, or if there is no limit. ``leg`` is the number
-    1..n of the leg concerned, or None if no single leg is concerned. ``text`` is a sentence. A good
-    value has this ``relation`` to its limit: a sign, or ``about`` for the middle of a range.
+    ``ok`` is false for a fault. ``value`` is None if it cannot be determined. ``limit`` is None if
+    there is none. ``relation`` is that of a good value to its limit: a sign, or ``about`` for the
+    middle of a range. ``leg`` is the number 1..n of the leg concerned, or None if no single leg is
+    concerned. ``text`` is a sentence.
     """
 
     check: str
@@ -27,7 +28,7 @@ class Finding:
 
     @property
     def brief(self) -> str:
-        """The text, without the end of a long list. A remedy is a command, and is never cut."""
+        """The text, cut after LONGEST characters unless it holds a command as a remedy."""
         if "cmmsim " in self.text:
             return self.text
         return shorten(self.text, LONGEST, placeholder=" …")

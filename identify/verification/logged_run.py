@@ -1,8 +1,8 @@
-"""Telemetry of a run with what is derived from it before anything is identified.
+"""Telemetry of a run, and quantities derived from it before anything is identified.
 
-The guessed model runs under the logged commands, from rest at the first measured pose. It is the
-initial guess, with ordinary friction where that has none: a robot without friction would swing at
-each command.
+The guessed model runs under the logged commands, from rest at the first measured pose. Its
+parameters are the initial guess, with ordinary friction where the guess has none: a robot without
+friction would swing at each command.
 """
 
 from dataclasses import dataclass
@@ -39,20 +39,20 @@ from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification
 
-# Largest ratio of the rows of commands to those of poses, if each command is logged once.
+# Ratio of the number of command rows to that of pose rows above which commands are repeated.
 ONCE = 1.5
 MOST_FRAMES = 10_000  # largest number of frames for which the model runs
 
 
 @dataclass(frozen=True)
 class LoggedRun:
-    """Telemetry with what an experimenter states about it.
+    """Telemetry, and what its experimenter states about it.
 
     telemetry    Poses and commands.
     side         Robot and loop as the estimator knows them.
     settings     Settings of the identification: its prior and its scale anchor.
-    stated (6,)  Stated standard deviations of a measured pose, m and rad.
-    suspicions   What is likely wrong with the units, frames and joints.
+    stated (6,)  Stated standard deviations of a measured pose, m and rad. None if none are stated.
+    suspicions   Likely errors in the units, frames and joints.
     """
 
     telemetry: Telemetry
@@ -68,7 +68,7 @@ class LoggedRun:
 
     @property
     def poses(self) -> Array:
-        """Measured poses (K, 6), m and rad, without those that were lost."""
+        """Measured poses (K, 6), m and rad, without lost ones."""
         return self.telemetry.poses.pose[self.telemetry.poses.ok]
 
     @cached_property
@@ -98,12 +98,12 @@ class LoggedRun:
 
     @cached_property
     def delay(self) -> ServoDelay | None:
-        """Delay from a pose to its command, or None if no servo was on these poses."""
+        """Delay from a pose to its command, or None if the commands show no noise of the poses."""
         return servo_delay(self.telemetry, self.side.robot)
 
     @property
     def repeats_commands(self) -> bool:
-        """Whether commands are logged more often than poses, each in several rows."""
+        """True if commands are logged more often than poses, each in several rows."""
         return len(self.telemetry.commands.time) > ONCE * len(self.telemetry.poses.time)
 
     @cached_property
@@ -114,14 +114,14 @@ class LoggedRun:
         return np.stack([self.time[:-1][wide], self.time[1:][wide]], axis=1)
 
     def commands_at(self, time: Array) -> Array:
-        """Return the commands (K, n) that were logged last at times (K,)."""
+        """Return the most recent commands (K, n) at times (K,), at first the first command."""
         commands = self.telemetry.commands
-        places = np.searchsorted(commands.time, time, side="right") - 1
-        return np.asarray(commands.command[np.maximum(places, 0)])
+        rows = np.searchsorted(commands.time, time, side="right") - 1
+        return np.asarray(commands.command[np.maximum(rows, 0)])
 
     @cached_property
     def grid(self) -> Array:
-        """Times (K,) of even frames over the poses, s."""
+        """Times (F,) of 2 to MOST_FRAMES even frames from the first pose on, s."""
         timing = self.side.timing
         count = int(np.ptp(self.time) * timing.frame_rate_hz) + 1
         steps = np.arange(max(min(count, MOST_FRAMES), 2))
@@ -129,7 +129,7 @@ class LoggedRun:
 
     @cached_property
     def model_run(self) -> ClosedLoopRun | DynamicsError:
-        """Run of the guessed model under the logged commands, or why it fails."""
+        """Run of the guessed model under the logged commands, or the error with which it fails."""
         robot = self.side.robot
         first = robot.pose(robot.coordinates(self.poses[0]))
         reference = Reference(np.tile(first, (len(self.grid), 1)), np.zeros((len(self.grid), 6)))
@@ -145,7 +145,7 @@ class LoggedRun:
             return error
 
     def commands_change(self, begin: float, end: float) -> bool:
-        """Return whether commands changed between two times, apart from those of the last pose."""
+        """Return whether commands differ between two times, without half a frame at both ends."""
         commands = self.telemetry.commands
         period = self.side.timing.frame_period_s
         inside = (commands.time > begin + period / 2) & (commands.time < end - period / 2)
@@ -153,7 +153,7 @@ class LoggedRun:
         return len(held) > 1 and bool(np.ptp(held, axis=0).any())
 
     def commands_are_missing(self, begin: float, end: float) -> bool:
-        """Return whether commands changed between two times without a row of commands between."""
+        """Return whether the command changed between two times without a row between them."""
         commands = self.telemetry.commands
         half = self.side.timing.frame_period_s / 2
         if ((commands.time > begin + half) & (commands.time < end - half)).any():
@@ -174,9 +174,9 @@ class LoggedRun:
         information = scaled.T @ scaled + np.eye(len(guess.std))
         anchor = self.settings.scale_anchor
         if anchor in MEASURING:
-            place = robot.layout.names.index(measured_parameter(anchor, robot.layout))
+            number = robot.layout.names.index(measured_parameter(anchor, robot.layout))
             known = self.settings.anchor_std or default_std(anchor, robot.layout)
-            information[place, place] += (guess.std[place] / known) ** 2
+            information[number, number] += (guess.std[number] / known) ** 2
         covariance = np.linalg.inv(information) * np.outer(guess.std, guess.std)
         rows_of_groups = group_rows(structure(robot).combinations, robot.layout)
         return identifiability(guess, robot).judge(rows_of_groups, covariance)
@@ -185,8 +185,7 @@ class LoggedRun:
 def read_logged_run(path: Path) -> LoggedRun:
     """Read a record, and what its description or its scenario states about it.
 
-    Raises the errors of `read_own_records`, except those of a motion or a clock that is not as it
-    should be.
+    Raises the errors of `read_own_records`, but accepts any motion and any clock.
     """
     if is_log(path):
         about = read_description(description_file(path), path)

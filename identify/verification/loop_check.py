@@ -49,7 +49,7 @@ class CheckSettings:
 def check_loop(
     robot: Robot, parameters: Array, settings: closed_loop.LoopSettings
 ) -> Iterator[Finding]:
-    """Check the stability of the loop, and name gains of the drives if it is unstable."""
+    """Check the stability of the loop. If it is unstable, advise stable gains of the drives."""
     timing = settings.timing
     home = robot.home_pose
     arguments = robot, parameters, settings, home
@@ -98,7 +98,7 @@ def check_loop(
 
 
 def _advised(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Finding:
-    """Return the gains of the drives with which the servo would be stable."""
+    """Return a finding with gains of the drives for which the loop is stable, if there are any."""
     layout = robot.layout
     try:
         made = design_drives(robot, [parameters[layout.dynamic]], [settings])
@@ -113,7 +113,7 @@ def _advised(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings
 
 
 def check_steps(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
-    """Check that the integration steps of the plant follow its fastest motion."""
+    """Check that the plant has enough integration steps for its fastest motion."""
     settings = around.settings
     try:
         needed = steps_needed(robot, parameters, settings.drives, 1 / settings.timing.frame_rate_hz)
@@ -187,7 +187,7 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
     known = limit if limit > 0 else None
     most = f"up to {limit:.3g} rad/s" if limit > 0 else "with no bandwidth"
     text = f"computed_torque is stable {most}"
-    # Commands come once per frame, so bandwidths above half the frame rate are not searched.
+    # The search for the largest stable bandwidth ends at half the frame rate.
     if limit == nyquist:
         text = f"computed_torque is stable up to {nyquist:.3g} rad/s, half the frame rate"
     yield Finding("torque bandwidth", w <= limit, w, text, limit=known, unit="rad/s")

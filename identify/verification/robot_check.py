@@ -1,8 +1,8 @@
 """Check of a robot before it is built or run. Each finding has a value and a limit.
 
-For checks over the travel, the pose for random joint coordinates within the travel limit is found
-by following the joints from home. The loop is checked at home, by its linear map from frame to
-frame, without dry friction.
+Checks over the travel use the poses at random joint coordinates within the travel limit, which a
+search from home finds. The loop is checked at home, by its linear map from frame to frame, without
+dry friction.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +28,7 @@ from identify.setup import Setup
 from identify.verification.finding import Finding
 from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
 
-SAMPLES = 2000  # number of random joint coordinates over the travel
+SAMPLES = 2000  # number of random vectors of joint coordinates over the travel
 # Largest ratio between the length of a mesh and the reach of its body, in either direction.
 MOST_MESH_RATIO = 20.0
 NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that counts as zero
@@ -66,8 +66,8 @@ def checked_in(
 ) -> tuple[str, list[Finding]]:
     """Return the name of a parameter set, and the findings about it in the loop of a setup.
 
-    The robot can be another one than that of the setup. The default set is the scenario's truth, or
-    the initial guess if the robot has no such set.
+    The robot can differ from that of the setup. The default set is the truth of the scenario, or
+    `NOMINAL` if the robot has no such set. Raises ScenarioError if the robot lacks the set.
     """
     scenario = setup.scenario
     truth = scenario.plant.parameters
@@ -87,7 +87,7 @@ def checked_in(
 
 
 def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
-    """Return one line if the check finds fault with the robot file of a setup, else None.
+    """Return one line if the check finds a fault in the robot file of a setup, else None.
 
     Built-in robots are not checked, because their documentation states their faults.
     """
@@ -114,7 +114,7 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
 
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
-    """Check the robot at home and over the travel, with the limits of `workspace.check_motion`."""
+    """Check reach, travel and singularities at home and over the travel."""
     unit = robot.layout.joint_unit
     limit = robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
@@ -124,13 +124,13 @@ def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     yield Finding("travel at home", most <= limit, most, text, limit=limit, unit=unit, leg=leg)
     travel = workspace.measure_travel(robot, SAMPLES)
     # Samples without a pose are left out of the measures.
-    share = len(travel.theta) / SAMPLES
+    fraction = len(travel.theta) / SAMPLES
     text = (
-        f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
+        f"{100 * fraction:.1f} % of {SAMPLES} random joint coordinates within the travel have a "
         "pose near home"
     )
-    yield Finding("travel closes", share > 0, share, text, limit=0.0, relation=">")
-    if share > 0:
+    yield Finding("travel closes", fraction > 0, fraction, text, limit=0.0, relation=">")
+    if fraction > 0:
         yield from _extremes("over the travel", travel, limits)
 
 
@@ -172,7 +172,7 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
         "leg the other way"
     )
     if len(modes) > 1:
-        # The first mode is home. The other modes are sorted by their distance from home.
+        # The first mode is home. The others follow in the order of their distance from home.
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
         text += (
             f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
@@ -256,12 +256,12 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
         f"the centre of mass of {body} is {off[worst]:.3g} m from where that of a centred body is; "
         f"its drawing reaches {reach[worst]:.3g} m"
     )
-    share = float(off[worst] / reach[worst])
-    yield Finding("centres of mass", share <= 1.0, share, text, limit=1.0, leg=leg)
+    ratio = float(off[worst] / reach[worst])
+    yield Finding("centres of mass", ratio <= 1.0, ratio, text, limit=1.0, leg=leg)
 
 
 def check_meshes(robot: Robot) -> Iterator[Finding]:
-    """Check that the meshes of the legs have about the sizes of their bodies."""
+    """Check that the meshes of the legs are about as long as their bodies reach."""
     name = "body meshes"
     if not robot.geometry.meshes:
         return

@@ -1,6 +1,4 @@
-"""Figures (PNG) of a sensor's acceptance tests, calibration and detectors, and of a teaching from
-photographs.
-"""
+"""Figures of a sensor's acceptance tests, calibration, detectors, and teaching by photographs."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -32,16 +30,13 @@ from identify.verification.acceptance import AcceptanceRun
 # Two corners of a box are connected by an edge if they differ in one coordinate.
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
 
-# Length of an arrow for a residual of three sigma, as a share of the image width.
+# Length of an arrow for a residual of three sigma, as a fraction of the image width.
 ARROW_SHARE = 0.06
 GRID = 25  # number of points along the width of the image in drawings of the distortion
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
-    """Return the figures of the tests that were run, by name.
-
-    There are two figures of the lengths, two of the bar and one of the latency.
-    """
+    """Return the figures of the tests that were run, by name."""
     figures = {}
     if length := run.found.get("vdi"):
         figures["measuring_lines"] = lines_figure(run.volume)
@@ -102,7 +97,7 @@ def _as_seen(points: np.ndarray) -> np.ndarray:
 def length_figure(test: LengthTest, limit_um: float) -> Figure:
     """Draw the error of the measured lengths against the length.
 
-    Dots are single exposures, and lines are the means of each length.
+    Dots are single exposures. Each point of a line is the mean of one length.
     """
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     axes = figure.subplots()
@@ -163,7 +158,7 @@ def bar_figure(test: BarTest) -> Figure:
 
 
 def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: str) -> None:
-    """Draw the share of frames below an error, with published figures as vertical lines."""
+    """Draw the fraction of frames below an error, with published values as vertical lines."""
     for moving, word in ((False, "standing"), (True, "moving")):
         magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, columns], axis=1))
         axes.plot(
@@ -172,7 +167,7 @@ def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: st
             label=f"this sensor, {word}",
         )
     for number, figure in enumerate([*published(f"{name}, static"), *published(f"{name}, moving")]):
-        # Published figures are in mm or degrees, and the axis is in µm or µrad.
+        # Published values are in mm or degrees, and the axis is in µm or µrad.
         value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
         state = figure.quantity.split(", ")[1]
         style = ":" if state == "static" else "-."
@@ -185,12 +180,12 @@ def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: st
 
 
 def latency_figure(test: LatencyTest) -> Figure:
-    """Draw the delay of each report and their distribution.
+    """Draw the latency of each report, and the distribution of the latencies.
 
-    Lines show the interval of the mean, and the latency that the sensor file states.
+    A band is the interval of the mean, and a line the latency that the sensor file states.
     """
     figure = Figure(figsize=(9, 4.5), layout="constrained")
-    series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    series, histogram = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     found = test.latency
     series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
     low, high = (1e3 * bound for bound in found.interval)
@@ -202,9 +197,9 @@ def latency_figure(test: LatencyTest) -> Figure:
         linewidth=1,
         label="stated in the sensor file",
     )
-    spread.hist(1e3 * found.delays, bins=30, orientation="horizontal")
+    histogram.hist(1e3 * found.delays, bins=30, orientation="horizontal")
     series.set(xlabel="time of the report [s]", ylabel="latency [ms]")
-    spread.set_xlabel("reports")
+    histogram.set_xlabel("reports")
     series.set_title(
         f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms"
     )
@@ -237,7 +232,7 @@ def residual_figure(found: Calibration) -> Figure:
 
 
 def coverage_figure(found: Calibration) -> Figure:
-    """Draw the board points of all used images. Without points the distortion is extrapolated."""
+    """Draw the board points of all used images, outside which the distortion is extrapolated."""
     figure, panels = _image_panels(found, "board points of all used images")
     for k, axes in enumerate(panels):
         seen = found.sightings[k]
@@ -259,7 +254,7 @@ def distortion_figure(found: Calibration) -> Figure:
         x, y = np.meshgrid(np.arange(0.0, camera.width, step), np.arange(0.0, camera.height, step))
         pixels = np.stack([x, y], axis=-1)
         ideal, known = camera.undistort(pixels)
-        # Far from the centre, the distortion can have no inverse.
+        # Far from the centre, some distortions have no inverse.
         moved = np.where(known[..., None], pixels - ideal, np.nan)
         length = np.linalg.norm(moved, axis=-1)
         shown = axes.pcolormesh(x, y, length, shading="nearest", cmap="viridis")
@@ -286,7 +281,7 @@ def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     """Draw the RMS error of the detectors against the noise, in logarithmic scales.
 
-    There is one panel for each radius, tilt and point spread. The working point comes first.
+    There is one panel for each combination of radius, tilt and point spread.
     """
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     figure, panels = panel_grid(len(views), 4.5, 3.2, above=0.8, sharey=True)
@@ -317,12 +312,12 @@ def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
         label="Cramer-Rao bound",
     )
     for name in dict.fromkeys(score.detector for score in scores):
-        mine = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
+        own = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
         # The error is infinite if every sticker was lost. Such points are not drawn.
-        error = np.array([s.rms_px for s in mine])
-        at = [100.0 * s.condition.noise for s in mine]
+        error = np.array([s.rms_px for s in own])
+        percent = [100.0 * s.condition.noise for s in own]
         axes.plot(
-            at,
+            percent,
             np.where(np.isfinite(error), error, np.nan),
             "o-",
             markersize=3,
@@ -335,7 +330,7 @@ def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
 
 
 def teaching_residuals(found: PhotographedTeaching) -> Figure:
-    """Draw the residuals, measured minus adjusted centres, as arrows at the centres."""
+    """Draw the residuals, measured minus computed centres, as arrows at the centres."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     panels = figure.subplots(1, 2)
     seen = found.observations

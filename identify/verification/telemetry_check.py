@@ -1,8 +1,8 @@
 """Check of the telemetry of a run before anything is identified from it.
 
 The findings concern the times, gaps and noise of the poses, the size and the frequencies of the
-motion, the clocks, and whether the motion can show the parameters. Two of them need the
-guessed model, which runs under the logged commands.
+motion, the commands, the units and frames, the clocks, and the parameters that the motion can show.
+The last one needs the guessed model, which runs under the logged commands.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,17 +23,17 @@ from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
 RATE = 0.01  # largest relative difference of a frame rate from the stated one
-NOISE = 2.0  # largest factor between the noise of the poses and the stated one
-FROZEN = 0.01  # largest share of poses that are equal to the pose before in all digits
+NOISE = 2.0  # largest factor between the noise of the poses and the stated noise, either way
+FROZEN = 0.01  # largest fraction of poses that equal the previous pose in all digits
 FRAMES_A_PERIOD = 6.0  # smallest number of frames in a period of the highest frequency of a motion
-# Largest share of commands that stay at the end of their range while the robot moves.
+# Largest fraction of commands that stay at an end of their range while commands change.
 SATURATED = 0.01
 STUCK = 3  # smallest number of equal commands in a row that count as staying
 FOLLOWS = 0.8  # smallest mean correlation of the joints with their commands
-BEFORE_S = 0.1  # largest time, s, by which a motion can seem to be before its commands
-CLOCK = 0.05  # largest offset of the clocks, in frames, beside what is stated of them
-STDS = 3.0  # largest offset or drift in stated standard deviations
-SHOWN_GROUPS = 0.5  # smallest share of the groups of parameters that the motion can show
+BEFORE_S = 0.1  # largest time, s, by which the motion can seem to precede its commands
+CLOCK = 0.05  # largest offset of the clocks, in frames, in addition to STDS
+STDS = 3.0  # largest offset and drift of the clocks in stated standard deviations
+SHOWN_GROUPS = 0.5  # smallest fraction of the groups of parameters that the motion must show
 LISTED = 5  # largest number of names or times in a finding
 
 
@@ -73,7 +73,7 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         unit="Hz",
         relation="about",
     )
-    # Rows that are lost do not count as jitter.
+    # Lost rows do not count as jitter.
     even = np.round(steps * rate)
     off = np.abs(steps - even / rate)
     text = (
@@ -262,7 +262,7 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         )
         yield Finding("clock offset", True, None, text, unit="s")
         return
-    # The row of a command without its own time is that of its pose.
+    # Without a time of their own, commands have the times of their poses.
     expected = 0.0 if logged.telemetry.commands.written is None else timing.latency_s
     offset = delay.seconds - expected
     step = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
@@ -322,9 +322,9 @@ def _rms(values: Array) -> float:
 
 
 def _at_ends(values: Array) -> NDArray[np.bool_]:
-    """Return where (K,) a command stays at an end of its range, apart from rest at first and last.
+    """Return for the rows between first and last change whether a command stays at an end.
 
-    K counts the rows between the first and the last change.
+    It stays at an end of its range if at least STUCK successive rows are equal.
     """
     changes = np.flatnonzero(np.diff(values))
     if not len(changes):
@@ -333,7 +333,7 @@ def _at_ends(values: Array) -> NDArray[np.bool_]:
     if not len(moving):
         return np.zeros(1, dtype=bool)
     at_end = (moving == values.max()) | (moving == values.min())
-    # Runs of equal commands, by the place of the run of each row.
+    # Index of the run of equal commands to which each row belongs.
     starts = np.concatenate([[True], np.diff(moving) != 0])
     run = np.cumsum(starts) - 1
     return np.asarray(at_end & (np.bincount(run)[run] >= STUCK))

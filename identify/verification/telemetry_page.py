@@ -10,7 +10,7 @@ from identify.reporting.tables import Table, number
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
-# Word in the table for a finding that fails. The style of the page highlights this word.
+# Word for a failed finding in the table, which the style of the page highlights.
 MISSED = "MISSED"
 
 
@@ -31,7 +31,7 @@ def findings_table(findings: Sequence[Finding]) -> Table:
 
 
 def telemetry_page(logged: LoggedRun, findings: Sequence[Finding], name: str) -> str:
-    """Return the page about a log of this name as HTML text."""
+    """Return the page as HTML text. `name` is the name of the log in the title."""
     failed = [one for one in findings if not one.ok]
     shown = _pictures(logged)
     headline = (

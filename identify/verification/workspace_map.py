@@ -1,6 +1,6 @@
 """Maps of a robot's workspace, as figures and as numbers.
 
-A map is a plane of poses around home, with the used travel, the reach and the conditioning.
+A map shows the used travel, the reach and the conditioning over a plane of poses around home.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from identify.reporting.figures import COMPONENTS
 
 POINTS = 101  # number of grid points along each side of a map
 JOINT_SAMPLES = 20_000  # number of random joint vectors for the extremes over the travel
-COLUMNS = 3  # number of columns of maps in a figure
+COLUMNS = 3  # number of maps side by side in a figure
 
 AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 
@@ -31,10 +31,10 @@ class WorkspacePlane:
     across, up, fixed        Indices 0..5 of the components.
     value                    Value of the fixed component [m or rad].
     horizontal, vertical     Grid lines (n,) [m or rad].
-    travel_share, condition  Used share of the travel limit and condition number of the joint
+    travel_share, condition  Used fraction of the travel limit, and condition number of the joint
                              Jacobian, each (n, n), with a row for each entry of ``vertical``. They
                              are NaN out of reach.
-    reach_margin             Margin (n, n) of the worst leg.
+    reach_margin             Margin (n, n) of the worst leg, negative out of reach.
     """
 
     across: int
@@ -73,7 +73,7 @@ class WorkspaceMap:
     travel: workspace.WorkspaceMeasures
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures of the maps for JSON. Units are in the names."""
+        """Return the extremes of the maps for JSON. Units are in the names."""
         return {
             "robot": self.robot,
             f"travel_limit_{self.unit}": self.home.travel_limit,
@@ -97,12 +97,13 @@ def map_workspace(
     """Map planes of poses around home.
 
     The planes are x-y at three heights, or at three angles for a planar platform, and alpha-beta at
-    three gamma. Planes in which the platform cannot move are left out. The other components have
-    their values at home.
+    three gamma. Planes for which the platform lacks a freedom are left out. The other components
+    have their values at home.
 
     The half side of a plane is the displacement at which the most sensitive joint reaches its
     travel limit, according to the Jacobian at home. For angles it is 1.3 times this displacement
-    divided by the characteristic length.
+    divided by the characteristic length. The fixed component is at home, and 0.4 half sides to both
+    sides.
     """
     progress = progress or SilentProgress()
     length = robot.geometry.characteristic_length
@@ -155,7 +156,7 @@ def _plane(
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
     """Return the largest negative and positive change of a pose component from home.
 
-    At these changes a joint reaches its limit.
+    The travel limit or the reach ends the change, at the latest three times `side`.
     """
     steps = np.linspace(0, 3 * side, points)
     ends = []
@@ -164,8 +165,8 @@ def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[fl
         share = workspace.measure(robot, poses).travel_share
         # NaN means out of reach, and counts as outside.
         outside = ~(share <= 1)
-        last = max(int(np.argmax(outside)) - 1, 0) if outside.any() else -1
-        ends.append(sign * float(steps[last]))
+        farthest = max(int(np.argmax(outside)) - 1, 0) if outside.any() else -1
+        ends.append(sign * float(steps[farthest]))
     return ends[0], ends[1]
 
 
@@ -194,7 +195,7 @@ def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
 
 
 def travel_figure(workspace: WorkspaceMap) -> Figure:
-    """Draw the largest joint coordinate as a share of the travel limit."""
+    """Draw the largest joint coordinate as a fraction of the travel limit."""
     title = (
         f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} "
         f"{workspace.unit}"
