@@ -27,7 +27,7 @@ BETTER: tuple[str, ...] = get_args(Better)
 PROPERTY = "cmmsim_accuracy"
 CONFIDENCE = 0.95  # probability with which the interval of a sample contains the true mean
 FIRST = 20  # number of values that `Accuracy.sample_until` draws first
-MOST = 640  # default of the largest number of values that it draws
+MOST = 640  # default of the largest number of values that `Accuracy.sample_until` draws
 
 
 class AccuracyError(IdentifyError):
@@ -74,27 +74,27 @@ class Figure:
 
     @property
     def sign(self) -> int:
-        """Sign: +1 if a larger value is worse, -1 if a larger value is better."""
+        """Sign of a deterioration: +1 if a larger value is worse, -1 if it is better."""
         return 1 if self.better == "lower" else -1
 
     @property
     def best(self) -> float:
-        """Good end of the interval, or the value without an interval."""
+        """Good end of the interval, or the value if there is no interval."""
         return self._end(-self.sign)
 
     @property
     def worst(self) -> float:
-        """Bad end of the interval, or the value without an interval."""
+        """Bad end of the interval, or the value if there is no interval."""
         return self._end(self.sign)
 
     @property
     def beyond_limit(self) -> bool:
-        """True if the value, or the whole interval, lies on the bad side of the limit."""
+        """True if the whole interval, or the value without one, lies beyond the limit."""
         return self.limit is not None and self.sign * (self.best - self.limit) > 0
 
     @property
     def undecided(self) -> bool:
-        """True if the interval contains the limit, so that the sample is not decisive."""
+        """True if the interval contains the limit. The test then passes."""
         return (
             self.limit is not None
             and not self.beyond_limit
@@ -103,7 +103,7 @@ class Figure:
 
     @property
     def limit_text(self) -> str:
-        """Limit with its relation, such as "≤ 2", without a unit. Empty without a limit."""
+        """Limit with its relation and without a unit, such as "≤ 2". Empty if there is none."""
         return (
             ""
             if self.limit is None
@@ -112,7 +112,7 @@ class Figure:
 
     @property
     def margin(self) -> float | None:
-        """Distance of the value from the limit as a share of the limit, negative beyond it.
+        """Distance of the value from the limit, as a fraction of the limit, negative beyond it.
 
         It is None if there is no limit, or if the limit is zero.
         """
@@ -120,7 +120,7 @@ class Figure:
 
     @property
     def verdict(self) -> str:
-        """One line with name, value, unit, interval and limit."""
+        """One line that states why the figure is beyond its limit."""
         side = "above" if self.better == "lower" else "below"
         limit = f"the limit of {with_unit(f'{self.limit:.6g}', self.unit)}"
         if self.interval is None:
@@ -139,7 +139,7 @@ class Figure:
 
 
 def test_name(file: Path, place: str) -> str:
-    """Return the name of a test: its file, from the folder of its package on, and its place there.
+    """Return the name of a test: its file, from its outermost package on, and `place`.
 
     Unlike a node id, the name depends neither on the folder from which pytest runs nor on the
     folder of the package. `place` is the part of a node id after the file, such as `test_x[1]`.
@@ -158,9 +158,9 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def percent(share: float, form: str) -> str:
-    """Format a share in per cent, in a form such as ".0" or "+.1".
+    """Format a fraction in per cent, in a form such as ".0" or "+.1".
 
-    Shares from 100 (10,000 %) on are written with a power of ten.
+    Fractions from 100 (10,000 %) on are written with a power of ten.
     """
     return f"{share:{form}%}" if abs(share) < 100 else f"{100 * share:{form}e}%"
 
@@ -202,7 +202,8 @@ class Accuracy:
         Raises
         ------
         AccuracyError
-            The value is not a finite number, or the name was recorded already.
+            The value or limit is not a finite number, the name was recorded already, or `name`,
+            `unit` or `better` is not valid.
 
         Examples
         --------
@@ -241,8 +242,8 @@ class Accuracy:
         Raises
         ------
         AccuracyError
-            There are fewer than two values, a value is not a finite number, or the name was
-            recorded already.
+            There are fewer than two values, or their interval is not finite. Further causes are
+            those of `record`.
 
         Examples
         --------
@@ -272,16 +273,16 @@ class Accuracy:
         """Record the mean of independent values, which are drawn until the limit is decided.
 
         From 20 on, the number of values is doubled as long as the interval of the mean contains the
-        limit. If it still does with `most` values, the figure is undecided, and the test passes.
-        The interval is wider than that of `sample`, as it is judged several times (Bonferroni).
+        limit. If the interval of `most` values still does, the figure is undecided, and the test
+        passes. The intervals are wider than that of `sample`, because several of them are judged
+        (Bonferroni).
 
         Parameters
         ----------
         name : str
             Name of the figure. It must be new in this test.
         draw : callable
-            Function of a number n that returns n new values, which are independent of all earlier
-            ones.
+            Function of a number n that returns n values, independent of all earlier values.
         limit : float
             Largest mean with which the test passes, or the smallest mean if higher is better.
         unit : str, optional
@@ -294,8 +295,8 @@ class Accuracy:
         Raises
         ------
         AccuracyError
-            `draw` returns a wrong number of values, a value is not a finite number, `most` is not a
-            whole number of at least 20, or the name was recorded already.
+            `draw` returns a wrong number of values, or `most` is not a whole number of at least 20.
+            Further causes are those of `record`.
 
         Examples
         --------
@@ -369,7 +370,10 @@ def mean_interval(
 
 
 def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDArray[np.float64]:
-    """Convert the argument to finite floats. Raises AccuracyError if it has other dimensions."""
+    """Convert the argument to finite floats.
+
+    Raises AccuracyError if it is not numeric, not finite, or has other dimensions.
+    """
     __tracebackhide__ = True
     import numpy as np
 

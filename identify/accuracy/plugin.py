@@ -145,7 +145,7 @@ def cmmsim_robot(cmmsim_scenario: Scenario) -> Robot:
 def cmmsim_taught() -> dict[str, Taught]:
     """Cache of results of teaching, by the settings on which they depend.
 
-    Teaching takes seconds, so every process teaches each sensor only once.
+    Teaching takes seconds, so each process teaches a sensor only once.
     """
     return {}
 
@@ -202,10 +202,11 @@ def _check_options(config: pytest.Config) -> None:
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
     """Return the names or files that this test uses.
 
-    Markers replace the choices of the command line. The closest marker has priority.
+    Markers replace the choices of the command line. Raises AccuracyError for invalid arguments of a
+    marker.
     """
     chosen = _from_options(request.config)
-    # Pytest returns the closest marker first, so the reversed list ends with it.
+    # Pytest returns the closest marker first, so it ends the reversed list and has priority.
     for mark in reversed(list(request.node.iter_markers(MARKER))):
         unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [
             repr(value) for value in mark.args

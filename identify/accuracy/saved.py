@@ -38,7 +38,7 @@ class Comparison:
 
     @property
     def limit_change(self) -> str:
-        """One line with the present and the saved limit if they differ, else empty."""
+        """One line with the present and the saved limit, empty if they are equal."""
         now, saved = (
             f"{f.limit_text} {f.unit}".strip() if f.limit_text else "none"
             for f in (self.now, self.saved)
@@ -51,10 +51,10 @@ class Comparison:
 
     @property
     def evidence_change(self) -> str:
-        """One line if the value has other evidence than the saved value, else empty.
+        """One line that states how the evidence differs, empty if the present is not weaker.
 
-        Other evidence is a single number in place of a sample or the reverse, or fewer values. An
-        interval of fewer values is wider, so it could hide a deterioration.
+        It differs if a single number replaces a sample or the reverse, or if there are fewer
+        values. An interval of fewer values is wider, so it could hide a deterioration.
         """
         now = self.now
         saved = self.saved
@@ -75,7 +75,7 @@ class Comparison:
         return grown / abs(self.saved.value) if self.saved.value else float("inf") * grown
 
     def worse_by_more_than(self, ratio: float) -> bool:
-        """Return whether the value is worse by more than `ratio` times the saved value.
+        """Return whether the value is worse by more than `ratio` times the saved magnitude.
 
         With intervals, the best end of the present interval is compared with the worst end of the
         saved interval.
@@ -109,7 +109,7 @@ def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, 
 
 
 def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, list[str]]:
-    """Return the names of saved figures that are missing in `figures`, by their test."""
+    """Return the names of saved figures that are not among `figures`, by their test."""
     measured = {figure.key for figure in figures}
     gone: dict[str, list[str]] = {}
     for figure in saved:
@@ -139,7 +139,7 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
-    """Content of a file: figures, the seed of the fixtures, and how they were measured."""
+    """Content of a file: the figures of a session, and the conditions of their measurement."""
 
     __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012  as pydantic wants it
 
@@ -218,7 +218,8 @@ def read_saved(path: Path) -> SavedSession:
 def check_writable(path: Path) -> None:
     """Check that a session can be saved to a path.
 
-    Raises AccuracyError if the path cannot be written, or the file to be replaced holds no figures.
+    Raises AccuracyError if the path cannot be written, or the file to be replaced cannot be read as
+    saved figures.
     """
     try:
         # If the folder does not exist yet, its nearest parent must be writable.

@@ -113,7 +113,7 @@ WHY_MISSING = {
 
 
 class AccuracySession:
-    """Plugin object of the main process. Workers of pytest-xdist do not have it."""
+    """Plugin object of the main process, which workers of pytest-xdist lack."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
@@ -158,7 +158,7 @@ class AccuracySession:
 
     @property
     def figures(self) -> list[Figure]:
-        """All figures, sorted by the names of their tests. Within a test they keep their order."""
+        """All figures, sorted by the names of their tests. Those of a test keep their order."""
         return [figure for test in sorted(self._figures) for figure in self._figures[test]]
 
     @property
@@ -167,7 +167,7 @@ class AccuracySession:
         return dict(saved.compare(self.figures, self._saved))
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        """Store the outcome of a module that is skipped as a whole."""
+        """Store the outcome of a module that is skipped, or fails, as a whole."""
         if report.outcome != "passed":
             self._outcomes[self._name(report.nodeid)] = report.outcome
 
@@ -198,7 +198,7 @@ class AccuracySession:
             self._save_figures(session)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Show the table."""
+        """Show the table of the figures and the remarks."""
         if not self._figures and not self._lines:
             return
         terminalreporter.section("accuracy")

@@ -25,9 +25,10 @@ def run_geometry(
 ) -> GeometryOutcome:
     """Calibrate the geometry of a robot, simulated or from a user's own measurements.
 
-    Raises EstimationError if the loops do not close, or if there are too few poses. The message
-    states how many poses are needed and for which numbers. Raises RecordError if the encoder
-    readings do not fit the poses. Raises UnreachablePoseError if a measured pose is out of reach.
+    Raises EstimationError if the loops do not close, the search does not converge, or there are too
+    few poses. For too few measured poses, the message states how many are needed and for which
+    numbers. Raises RecordError if the encoder readings do not fit the poses. Raises
+    UnreachablePoseError if a measured pose is out of reach.
     """
     robot = setup.nominal
     seed = setup.seed
@@ -45,10 +46,10 @@ def run_geometry(
         among = designer.candidates(settings.candidates, rng)
     else:
         plan = setup.sensor_plan
-        nothing = np.zeros((6, 6))
-        # The errors of teaching are unknown before it, so the frames count as exact.
+        zero = np.zeros((6, 6))
+        # The errors of teaching are unknown before teaching, so taught frames count as exact.
         taught = settings.frames == "taught"
-        frames = FrameKnowledge(nothing, nothing) if taught else FrameKnowledge.none()
+        frames = FrameKnowledge(zero, zero) if taught else FrameKnowledge.none()
         covariance = plan.covariance(robot.home_pose) / settings.frames_per_pose
         designer = _designer(robot, settings, limits, frames, covariance, plan.sight)
         chosen, among = _choose(designer, settings, seed, progress)
@@ -78,7 +79,7 @@ def _designer(
     covariance: Array,
     sight: SightLines | None,
 ) -> Designer:
-    """Return the designer of pose sets. covariance: covariance of a mean pose."""
+    """Return the designer of pose sets. covariance: covariance of the mean of a pose's frames."""
     model = PoseModel(
         robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames
     )

@@ -2,9 +2,9 @@
 
 The model of a measured pose is z = base o f(joints, geometry) o platform + noise. Here f is the
 pose at which the loops close for the measured joint coordinates. Base and platform are the small
-errors of the two frames from teaching. The unknowns are the geometric numbers
-(`dynamics.legs.geometric_numbers`) and the twelve numbers of the frames. Other errors that all
-poses have in common, such as errors of the cameras, are further unknowns.
+errors of the two frames from teaching. The unknowns are the deviations of the geometric numbers
+(`dynamics.legs.geometric_numbers`) and the twelve errors of the frames. Other errors that all poses
+have in common, such as errors of the cameras, are further unknowns.
 
 Each unknown has a prior: the stated tolerance of a machine part about its nominal value, or the
 covariance of teaching. Errors of the encoders enter the covariance of the pose through the loops. A
@@ -12,7 +12,7 @@ number that the poses do not determine keeps its nominal value, with the toleran
 deviation.
 
 An encoder offset has the same effect as a change of the zero angle of a turning joint, or of the
-place of a sliding joint along its slide. The calibrated geometry contains these offsets, so that it
+position of a sliding joint along its slide. The calibrated geometry contains these offsets, so it
 agrees with the encoders.
 """
 
@@ -31,8 +31,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 
-# Largest standard deviation, as a share of the tolerance, with which a number is determined. The
-# prior then has at most a ninth of the information, and hardly affects an interval.
+# Largest standard deviation, as a fraction of the tolerance, with which a number counts as
+# determined. The prior then has at most a ninth of the information, and hardly affects an interval.
 OBSERVABLE = 1 / 3
 
 
@@ -52,7 +52,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class PoseModel:
-    """Model of poses with unknowns u (g + 12,), the geometric numbers and the errors of the frames.
+    """Model of poses with unknowns (g + 12,): deviations of the geometry, and errors of the frames.
 
     The unknowns are in units of their prior: each has the prior mean zero and variance one.
     """
@@ -63,7 +63,7 @@ class PoseModel:
 
     @cached_property
     def closure(self) -> Closure:
-        """Loop closure of the robot's geometries."""
+        """Loop closure of the robot."""
         return Closure(self.robot.geometry)
 
     @cached_property
@@ -81,7 +81,7 @@ class PoseModel:
         return values[: len(self.tolerance)], values[len(self.tolerance) :]
 
     def closed(self, joints: Array, unknowns: Array, start: Array) -> Array:
-        """Return the poses (N, 6) at which the loops close, without the errors of the frames."""
+        """Return the poses (N, 6), near `start`, at which the loops close in exact frames."""
         chart = self.robot.geometry.chart
         return self.closure.poses(
             joints, self.split(unknowns)[0], chart.pose(chart.coordinates(start))
@@ -90,8 +90,8 @@ class PoseModel:
     def columns(self, joints: Array, closed: Array, unknowns: Array) -> tuple[Array, Array]:
         """Return the derivatives of the m coordinates of measured poses.
 
-        The first array (N, m, g + 12) is with respect to the unknowns, and the second (N, m, n)
-        with respect to the joints.
+        The first array (N, m, g + 12) is with respect to the unknowns, at frames without errors.
+        The second array (N, m, n) is with respect to the joints.
         """
         free = list(self.robot.geometry.chart.freedoms)
         by_numbers, by_joints = self.closure.derivatives(closed, joints, self.split(unknowns)[0])
@@ -102,13 +102,13 @@ class PoseModel:
 def measured_poses(poses: Array, frames: Array) -> Array:
     """Return the measured poses for true poses (N, 6) and errors (12,) of the frames, m and rad.
 
-    The errors are [dt, dphi] of the base, then of the platform.
+    The errors are [dt, dphi] of the base, then of the platform, with rotation vectors dphi.
     """
     base = Rotation.from_rotvec(frames[3:6])
     platform = Rotation.from_rotvec(frames[9:12])
     turned = Rotation.from_euler("XYZ", poses[:, 3:])
-    places = frames[:3] + base.apply(poses[:, :3] + turned.apply(frames[6:9]))
-    return np.hstack([places, (base * turned * platform).as_euler("XYZ")])
+    positions = frames[:3] + base.apply(poses[:, :3] + turned.apply(frames[6:9]))
+    return np.hstack([positions, (base * turned * platform).as_euler("XYZ")])
 
 
 def frame_columns(robot: Robot, poses: Array) -> Array:
@@ -140,8 +140,8 @@ class Calibration:
     prior_std : ndarray, shape (g,)
         Tolerances.
     noise_ratio : float
-        Mean square of the residuals in units of the stated noise. It is near one if model and noise
-        are right.
+        Sum of the squared residuals in units of the stated noise, per degree of freedom. It is near
+        one if model and noise are right.
     noise_ratio_std : float
         Standard deviation of this ratio.
     frames_known : bool
@@ -159,7 +159,7 @@ class Calibration:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (g, g) of the deviations."""
+        """Covariance (g, g) of the deviations, m and rad."""
         count = len(self.deviations)
         return self.joint_covariance[:count, :count]
 
@@ -184,7 +184,7 @@ class _Fit:
     """Least-squares problem: whitened residuals of the poses, then residuals of the prior.
 
     The unknowns are those of the model, then the errors that all poses have in common. The effect
-    of an encoder's error on a pose is computed at the nominal geometry.
+    of the encoders' errors on a pose is computed at the nominal geometry.
     """
 
     model: PoseModel
@@ -239,24 +239,24 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     """
     model = PoseModel(robot, tolerance.of(robot), data.frames)
     fit = _Fit(model, data)
-    # Unknowns are in units of their prior, so a single tolerance is enough.
+    # Unknowns are in units of their prior, so a single threshold is enough.
     limit = 1e-10
-    none = fit.nothing
+    start = fit.nothing
     try:
         found = least_squares(
-            fit.residuals, none, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit
+            fit.residuals, start, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit
         )
     except DynamicsError as error:
         raise EstimationError(f"the poses do not fit robot {robot.name}: {error}") from error
     if not found.success:
         raise EstimationError(f"the search for the geometry did not converge: {found.message}")
-    rows = found.jac[: -len(none)]
-    own = len(model.scale)
-    spread = np.linalg.inv(found.jac.T @ found.jac)
-    covariance = model.scale @ spread[:own, :own] @ model.scale.T
+    by_poses = found.jac[: -len(start)]
+    count = len(model.scale)
+    posterior = np.linalg.inv(found.jac.T @ found.jac)
+    covariance = model.scale @ posterior[:count, :count] @ model.scale.T
     # The trace is the effective number of unknowns that the poses determine.
-    spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
-    deviations, frames = model.split(found.x[:own])
+    freedom = max(len(by_poses) - float(np.sum(posterior * (by_poses.T @ by_poses))), 1.0)
+    deviations, frames = model.split(found.x[:count])
     return Calibration(
         nominal=robot,
         deviations=deviations,
@@ -264,8 +264,8 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
         # The average removes asymmetry due to rounding.
         joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
-        noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),
-        noise_ratio_std=float(np.sqrt(2 / spare)),
+        noise_ratio=float(np.sum(found.fun[: len(by_poses)] ** 2) / freedom),
+        noise_ratio_std=float(np.sqrt(2 / freedom)),
         frames_known=not np.array_equal(data.frames.base, FrameKnowledge.none().base),
     )
 
@@ -274,7 +274,7 @@ def whiteners(covariances: Array, by_joints: Array, joint_std: Array) -> Array:
     """Return the matrices (N, m, m) that whiten the residuals of the coordinates.
 
     The covariance is the sum of the covariance of the measured pose (N, m, m) and of the effect of
-    the encoders' errors. These act through d(coordinates)/d(joints) (N, m, n), `by_joints`.
+    the encoders' errors. These act through `by_joints` (N, m, n), d(coordinates)/d(joints).
     """
     encoders = by_joints * joint_std
     return np.asarray(

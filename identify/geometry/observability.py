@@ -4,11 +4,11 @@ The smaller the index of a set of poses, the better the poses:
 
 - `determinant`: minus the logarithm of the determinant of the information, Borm and Menq's O1,
   which is D-optimality (Int. J. Robot. Res. 10(1), 1991).
-- `prediction`: mean expected error of the calibrated robot at the candidates' poses
-  (I-optimality).
-- `noise_amplification`: s_1 / s_r^2 of the extreme singular values of the whitened columns, the
-  inverse of Nahvi and Hollerbach's index (ICRA 1996). It covers only combinations that all
-  candidates together determine, because the other combinations do not depend on the choice.
+- `prediction`: logarithm of the mean expected squared error of the calibrated robot at the
+  candidates' poses (I-optimality).
+- `noise_amplification`: logarithm of s_1 / s_r^2, with the extreme singular values of the whitened
+  columns, the inverse of Nahvi and Hollerbach's index (ICRA 1996). It covers only combinations that
+  all candidates together determine, because no choice determines the others.
 """
 
 from abc import ABC, abstractmethod
@@ -21,8 +21,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.calibration import OBSERVABLE
 
-SMALL = 0.05  # share of the largest coefficient below which a number is left out of a combination
-# Smallest length of the column of a pivot, as a share of the largest remaining length.
+SMALL = 0.05  # fraction of the largest coefficient up to which a number is left out
+# Smallest length of a pivot's column, as a fraction of the largest remaining length.
 LONG_ENOUGH = 0.5
 
 
@@ -55,17 +55,17 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
 
 
 def _pivots(directions: Array) -> list[int]:
-    """Return well-separated pivot columns, as many as there are rows.
+    """Return the indices of well-separated pivot columns, as many as there are rows.
 
-    Each pivot is the first column that is long enough.
+    Each pivot is the first column that is still long enough.
     """
-    left = directions.copy()
+    remaining = directions.copy()
     pivots = list[int]()
     while len(pivots) < len(directions):
-        lengths = np.linalg.norm(left, axis=0)
+        lengths = np.linalg.norm(remaining, axis=0)
         pivots.append(int(np.argmax(lengths >= LONG_ENOUGH * lengths.max())))
-        along = left[:, pivots[-1]] / lengths[pivots[-1]]
-        left -= np.outer(along, along @ left)
+        along = remaining[:, pivots[-1]] / lengths[pivots[-1]]
+        remaining -= np.outer(along, along @ remaining)
     return sorted(pivots)
 
 
@@ -83,8 +83,8 @@ def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot
 def posterior(information: Array, scale: Array, count: int) -> Array:
     """Return the covariance (g, g) [m and rad] of the geometry, the first `count` = g unknowns.
 
-    information (u, u): information of the poses about unknowns in units of their prior. The prior
-    is added here.
+    information (u, u): information of the poses, without the prior, about unknowns in units of
+    their prior. scale (u, u): matrix from these units to m and rad.
     """
     covariance = scale @ np.linalg.inv(information + np.eye(len(scale))) @ scale.T
     return np.asarray(covariance[:count, :count])
@@ -93,32 +93,33 @@ def posterior(information: Array, scale: Array, count: int) -> Array:
 def check_enough(
     robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array
 ) -> None:
-    """Raise EstimationError if the poses give fewer equations than there are numbers to determine.
+    """Raise EstimationError if poses give fewer equations than combinations can be determined.
 
-    ``information`` (u, u) is the information of many poses about all unknowns, in units of their
-    prior. The message states how many poses are needed and which numbers are hardest to determine.
+    ``information`` (u, u) is the information of many candidates about all unknowns, in units of
+    their prior. The message states the needed poses, and the numbers hardest to determine.
     """
     names = robot.geometry.number_names
-    rows = len(robot.coordinate_names)
+    coordinates = len(robot.coordinate_names)
     covariance = posterior(information, scale, len(names))
-    told = len(names) - len(unobservable(covariance, prior_std))
-    if poses * rows >= told:
+    determinable = len(names) - len(unobservable(covariance, prior_std))
+    if poses * coordinates >= determinable:
         return
     worst = np.argsort(-np.sqrt(np.diagonal(covariance)) / prior_std, kind="stable")
     unseen = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2][
-        : told - poses * rows
+        : determinable - poses * coordinates
     ]
     shown = ", ".join(unseen[:6]) + (f" and {len(unseen) - 6} more" if len(unseen) > 6 else "")
-    needed = -(-told // rows)
-    missing = told - poses * rows
+    needed = -(-determinable // coordinates)
+    missing = determinable - poses * coordinates
     raise EstimationError(
-        f"{poses} poses that differ give {poses * rows} equations for {told} combinations of the "
-        f"{len(names)} geometric numbers of {robot.name} that poses can determine: at least "
-        f"{needed} are needed; missing: {missing}, hardest to determine: {shown}"
+        f"{poses} poses that differ give {poses * coordinates} equations for {determinable} "
+        f"combinations of the {len(names)} geometric numbers of {robot.name} that poses can "
+        f"determine: at least {needed} are needed; missing: {missing}, hardest to determine: "
+        f"{shown}"
     )
 
 
-# Number of the best determined, and of the worst determined directions in the first ranking.
+# Number of best determined directions, and of worst determined directions, in the first ranking.
 EXTREMES = 24
 # Number of best candidates of the first ranking for which the index is computed exactly.
 PROMISING = 16
@@ -130,7 +131,7 @@ class ObservabilityIndex(ABC):
 
     @abstractmethod
     def value(self, information: Array) -> tuple[float, Array]:
-        """Return the index, and its negative derivative with respect to the information (u, u)."""
+        """Return the index, and the negative of its derivative by the information (u, u)."""
 
     @abstractmethod
     def best(self, columns: Array, information: Array) -> int:
@@ -154,9 +155,9 @@ class Determinant(ObservabilityIndex):
 
 @dataclass(frozen=True)
 class Prediction(ObservabilityIndex):
-    """Mean squared error of the candidates' coordinates, each in units of its noise.
+    """Log of the mean squared error of the candidates' coordinates, each in units of its noise.
 
-    ``weight`` (u, u) is the matrix of this quadratic form in the unknowns.
+    ``weight`` (u, u) is the matrix of the squared error as a quadratic form of the unknowns.
     """
 
     weight: Array
@@ -175,7 +176,7 @@ class Prediction(ObservabilityIndex):
 
 @dataclass(frozen=True)
 class NoiseAmplification(ObservabilityIndex):
-    """Inverse of Nahvi and Hollerbach's index.
+    """Logarithm of the inverse of Nahvi and Hollerbach's index.
 
     ``told`` (u, r) are orthonormal directions of the unknowns that the candidates can determine.
     """
@@ -217,14 +218,14 @@ class NoiseAmplification(ObservabilityIndex):
 
 
 def _eigenvalues(information: Array, columns: Array) -> Array:
-    """Return the ascending eigenvalues (N, k) of an information (k, k) with each pose added."""
+    """Return the ascending eigenvalues (N, k) of an information (k, k) plus that of each pose."""
     return np.asarray(np.linalg.eigvalsh(information + columns.swapaxes(1, 2) @ columns))
 
 
 def _spread(columns: Array, information: Array) -> tuple[Array, Array]:
-    """Return columns of each pose times the covariance, and covariances of its coordinates."""
-    spread = columns @ np.linalg.inv(information)
-    return spread, np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
+    """Return columns times the unknowns' covariance, and covariances of measured coordinates."""
+    weighted = columns @ np.linalg.inv(information)
+    return weighted, np.eye(columns.shape[1]) + weighted @ columns.swapaxes(1, 2)
 
 
 def chosen_index(criterion: str, information: Array, candidates: int) -> ObservabilityIndex:

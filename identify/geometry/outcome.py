@@ -1,4 +1,4 @@
-"""Outcome of a geometry calibration: figures, calibrated robot, poses, and a text."""
+"""Outcome of a geometry calibration, and its files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
 CURVE = 12  # number of entries in the list of expected errors by the number of random poses
-NOISY = 4.0  # excess of the noise ratio, in standard deviations, at which a warning is given
+NOISY = 4.0  # excess of the noise ratio, in standard deviations, above which a warning is given
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class GeometryOutcome:
     calibration  Estimated geometry.
     data         Measured poses.
     lost_frames  Number of lost frames.
-    true (g,)    True deviations in a simulation.
+    true (g,)    True deviations in a simulation, or None.
     unseen       Validation poses, which were not measured.
-    chosen       Chosen poses in a simulation.
+    chosen       Poses chosen for a simulation, or None.
     among        Candidates for the choice of poses.
     """
 
@@ -56,8 +56,8 @@ class GeometryOutcome:
     def write(self, folder: Path, pictures: Mapping[str, Any] | None = None) -> None:
         """Write the files of the outcome into a folder: all files, or none.
 
-        They are geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
-        scenario.toml. ``pictures`` are further figures and texts by file name.
+        The files are geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and
+        scenario.toml. ``pictures`` are the contents of further files by name.
         """
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
@@ -147,7 +147,7 @@ class GeometryOutcome:
         return said
 
     def _judged(self) -> dict[str, Any]:
-        """Return expected errors of the validation poses, and true errors if they are known."""
+        """Return errors of the validation poses: expected, and true ones if they are known."""
         found = self.calibration
         robot = self.calibration.nominal
         closure = self.model.closure
@@ -162,13 +162,13 @@ class GeometryOutcome:
             covariance = found.joint_covariance
         judged = {"expected": self._spread(columns, covariance)}
         if self.true is None:
-            # Without the truth there is no such figure. NaN becomes null in the file.
+            # Without the truth these errors are unknown. NaN becomes null in the file.
             return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
-        stands = true_poses(robot, self.true, joints, poses)
+        actual = true_poses(robot, self.true, joints, poses)
         predicted = measured_poses(closure.poses(joints, found.deviations, poses), found.frames)
         return judged | {
-            "unseen": rms_figures(predicted - stands),
-            "uncalibrated": rms_figures(poses - stands),
+            "unseen": rms_figures(predicted - actual),
+            "uncalibrated": rms_figures(poses - actual),
         }
 
     def _compared(self, chosen: Candidates) -> dict[str, Any]:
@@ -182,7 +182,7 @@ class GeometryOutcome:
     def _by_count(self, most: int) -> list[dict[str, Any]]:
         """Return expected errors of validation poses after several numbers of random poses.
 
-        The largest number is `most`, if there are so many candidates.
+        The largest number is `most`, or that of the candidates if there are fewer.
         """
         rows = len(self.calibration.nominal.coordinate_names)
         fewest = -(-len(self.calibration.deviations) // rows)
@@ -200,8 +200,8 @@ class GeometryOutcome:
 
     def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
         """Return expected RMS errors for columns (N, m, u) and a covariance (u, u) of unknowns."""
-        spread = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
-        return rms_figures(self.calibration.nominal.geometry.chart.lifted(spread))
+        std = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
+        return rms_figures(self.calibration.nominal.geometry.chart.lifted(std))
 
 
 def geometry_markdown(entry: dict[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """Selection of static poses by an observability index over candidates within the travel.
 
 The index (see `observability`) is computed from the information about geometry and frames together.
-Poses are chosen one by one from the candidates (greedy) and exchanged until no exchange improves
-the index. Then all poses are optimised together in joint space by a gradient search.
+Poses are chosen one by one from the candidates (greedy), and then exchanged for better ones in a
+few passes. A gradient search in joint space can then optimise all poses together.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ from identify.geometry.calibration import PoseModel, whiteners
 from identify.geometry.observability import ObservabilityIndex, chosen_index
 from identify.progress import Advance
 
-STEP = 1e-5  # step of the difference quotients behind the gradient, as a share of the travel
+STEP = 1e-5  # step of the difference quotients in the gradient, as a fraction of the travel
 GRADIENT_STEPS = 40  # largest number of steps of one gradient search
 # Largest number of gradient searches. Poses that violated a limit after a search are fixed in the
 # next search.
 ROUNDS = 4
-EXCHANGES = 3  # largest number of exchange passes over all poses
-TRIALS = 40  # largest number of random joint coordinates per candidate
+EXCHANGES = 3  # largest number of passes over all poses in which each can be exchanged
+TRIALS = 40  # largest number of random vectors of joint coordinates per candidate
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Limits:
     sight: SightLines | None
 
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
-        """Return for each pose (N, 6) whether it is within the limits."""
+        """Return which poses (N, 6) are within the limits."""
         measures = measure(self.robot, poses)
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
@@ -78,7 +78,7 @@ class Candidates:
         return len(self.joints)
 
     def of(self, rows: Array | list[int]) -> "Candidates":
-        """Return some of the candidates."""
+        """Return the candidates with these indices."""
         return Candidates(self.joints[rows], self.poses[rows], self.columns[rows])
 
     @property
@@ -109,7 +109,7 @@ class Designer:
     def candidates(self, count: int, rng: np.random.Generator) -> Candidates:
         """Draw random joint coordinates within the travel, with poses within the limits.
 
-        Raises EstimationError if there are too few such poses.
+        Raises EstimationError if `TRIALS` draws per candidate give too few such poses.
         """
         kept_joints: list[Array] = []
         kept_poses: list[Array] = []
@@ -135,7 +135,7 @@ class Designer:
         return self.seen(joints, poses)
 
     def seen(self, joints: Array, poses: Array) -> Candidates:
-        """Return poses (N, 6) of joint coordinates (N, n) with their information."""
+        """Return joint coordinates (N, n) and their poses (N, 6) with the information of these."""
         none = np.zeros(len(self.model.scale))
         free = list(self.limits.robot.geometry.chart.freedoms)
         columns, by_joints = self.model.columns(joints, poses, none)
@@ -148,9 +148,10 @@ class Designer:
     def greedy(
         self, among: Candidates, count: int, advance: Advance = lambda n=1: None
     ) -> Candidates:
-        """Choose the best candidates one by one, then exchange them until no exchange is better.
+        """Choose the best candidates one by one, then exchange each for the best in its k.
 
-        The same candidate can be chosen twice.
+        The passes over all poses end when none is exchanged, or after `EXCHANGES`. The same
+        candidate can be chosen twice.
         """
         index = self.index(among)
         chosen = list[int]()
@@ -163,17 +164,17 @@ class Designer:
             advance()
         for _ in range(EXCHANGES):
             before = list(chosen)
-            for place in range(count):
+            for k in range(count):
                 # The sum is computed again, because a difference of two sums would lose directions
                 # with little information.
-                information = prior + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
-                chosen[place] = index.best(among.columns, information)
+                information = prior + own[chosen[:k] + chosen[k + 1 :]].sum(axis=0)
+                chosen[k] = index.best(among.columns, information)
             if chosen == before:
                 break
         return among.of(chosen)
 
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
-        """Return the poses after a gradient search of the index in joint space.
+        """Return poses after gradient searches of the index in joint space.
 
         Their index is not worse than before. A pose that would violate a limit is not moved.
         """
@@ -199,9 +200,9 @@ class Designer:
     def _along_gradient(
         self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex
     ) -> Array:
-        """Return joint coordinates (N, n) at a nearby optimum of the index, within the travel.
+        """Return joint coordinates (N, n) within the travel after one gradient search.
 
-        Rows that are `held` do not move.
+        Poses that are `held` do not move.
         """
         shape = chosen.joints.shape
         travel = self.limits.travel
@@ -213,17 +214,17 @@ class Designer:
             poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
-            # The next closure starts here, and thus finds the same assembly mode.
+            # The next search for poses starts here, and thus finds the same assembly mode.
             near = poses
-            at = self.seen(joints, poses)
-            found, spread = index.value(at.with_prior)
-            pull = np.einsum("uv,nmv->nmu", spread, at.columns)
+            now = self.seen(joints, poses)
+            found, descent = index.value(now.with_prior)
+            pull = np.einsum("uv,nmv->nmu", descent, now.columns)
             gradient = np.empty(shape)
             for joint in range(shape[1]):
                 ahead = joints + STEP * travel * np.eye(shape[1])[joint]
                 columns = self.seen(ahead, self._poses(ahead, poses)).columns
                 gradient[:, joint] = -2 * np.einsum(
-                    "nmu,nmu->n", pull, (columns - at.columns) / STEP
+                    "nmu,nmu->n", pull, (columns - now.columns) / STEP
                 )
             return found, gradient.ravel()
 

@@ -29,10 +29,10 @@ from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream
 from identify.record.stored_common_errors import CommonErrors, kind_of
 from identify.scenario.sections import Geometry
 
-# Number of the sensor's run at the first pose, larger than those of an experiment's motions.
+# Number of the sensor's run at the first pose, above the numbers of an experiment's motions.
 FIRST_POSE_RUN = 2_000_000
-# Largest difference between commanded and actual joint coordinates, as a share of the travel. It is
-# caused by friction. The encoders read the actual coordinates.
+# Largest difference, due to friction, between commanded and actual joint coordinates, as a fraction
+# of the travel. The encoders read the actual coordinates.
 REST = 1e-3
 
 
@@ -40,8 +40,8 @@ REST = 1e-3
 class Encoders:
     """Encoders of a robot's joints, rad or m.
 
-    noise: standard deviation of one reading. resolution: quantisation step. offset: standard
-    deviation of the offsets.
+    noise: standard deviation of one reading. resolution: quantisation step, or zero. offset:
+    standard deviation of the offsets.
     """
 
     noise: float
@@ -52,8 +52,8 @@ class Encoders:
         """Return the standard deviation of the mean of readings of a joint at rest.
 
         The quantisation error is a sawtooth function of the joint coordinate. Its k-th harmonic has
-        the amplitude 1 / (pi k) steps. Averaging readings with noise of s steps reduces it by the
-        factor exp(-2 (pi k s)^2).
+        the amplitude 1 / (pi k) steps. Averaging readings with noise of s steps reduces this
+        amplitude by the factor exp(-2 (pi k s)^2).
         """
         if not self.resolution:
             return self.noise / readings**0.5
@@ -94,8 +94,8 @@ def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> 
 class MeasuredPlatform:
     """Measured static poses.
 
-    poses (N, 6)           Means of the frames, m and rad.
-    covariances (N, 6, 6)  Covariances of the means.
+    poses (N, 6)           Means of the measured frames, m and rad.
+    covariances (N, 6, 6)  Covariances of the means, NaN without a measured frame.
     seen (N,)              True for poses with at least one measured frame.
     lost                   Number of lost frames.
     """
@@ -109,7 +109,7 @@ class MeasuredPlatform:
 def measured(
     sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress
 ) -> MeasuredPlatform:
-    """Measure poses through images.
+    """Measure poses (N, 6) through images, each as the mean of frames.
 
     Averaging reduces only the part of the stated variance that appears as scatter of frames at
     rest. Constant errors, for example of rendering and detection, remain in the covariance of the
@@ -123,7 +123,7 @@ def measured(
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
-            # Each pose has its own stream, so a lost frame does not change the noise at others.
+            # Each pose has its own stream, so a lost frame does not change the noise of others.
             sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
             values, covariances = _frames_at(sensor, pose, bodies, frames)
             advance(frames)
@@ -136,9 +136,9 @@ def measured(
                 scatter += float(np.sum(away * weighted)) / away.shape[1]
                 spare += len(values) - 1
     seen = counts > 0
-    # If each pose has a single frame, no scatter is known, and the variance is not reduced.
-    share = min(scatter / spare, 1.0) if spare else 0.0
-    kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
+    # If no pose has several frames, no scatter is known, and the variance is not reduced.
+    fraction = min(scatter / spare, 1.0) if spare else 0.0
+    kept = 1 - fraction * (1 - 1 / np.maximum(counts, 1))
     lost = int(len(poses) * frames - counts.sum())
     return MeasuredPlatform(means, stated * kept[:, None, None], seen, lost)
 
@@ -148,8 +148,8 @@ def _frames_at(
 ) -> tuple[Array, Array]:
     """Return poses (k, 6) and covariances (k, 6, 6) of the measured frames at a pose.
 
-    Whole images are searched until a pose is found. All later frames look for stickers near this
-    pose.
+    Frames are searched as whole images until a pose is measured. In all later frames, stickers are
+    searched near this pose.
     """
     left = frames
     while left:
@@ -204,7 +204,8 @@ def drawn(
 def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
     """Return the shift (N, 6, k) of poses (N, 6) at rest by k independent camera errors.
 
-    Each error has variance one and is the same for all poses. None means exact cameras.
+    Each error has variance one and is the same for all poses. None means that the cameras count as
+    exact, as with any pose method other than registration.
     """
     if sensor.method != "registration":
         return None
@@ -231,7 +232,6 @@ def measure_static_poses(
     """Measure the true robot at rest after it has moved to joint coordinates (N, n).
 
     robot                           Nominal robot.
-    settings                        Settings of the calibration.
     sensor                          Taught sensor.
     sight                           Stickers and cameras of the sensor, for the visibility.
     deviations (g,)                 True minus nominal geometric numbers.
@@ -241,7 +241,7 @@ def measure_static_poses(
     seed                            Seed of the experiment.
 
     Returns the readings at the measured poses, and the number of lost frames. Raises
-    EstimationError if the true robot cannot reach a pose. The message names it.
+    EstimationError, which names the pose, if the true robot cannot reach one.
     """
     taught = sensor.taught
     encoders = encoders_of(robot, settings)

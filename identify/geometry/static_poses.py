@@ -15,9 +15,9 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.run_folder import load_result
 
-# Standard deviation (6,) of an unknown frame, m and rad. It is larger than realistic errors.
+# Standard deviation (6,) of the pose of an unknown frame, m and rad, above realistic errors.
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
-# Smallest difference in a joint by which two poses are different, in standard deviations.
+# Two poses differ if a joint differs by more than this number of standard deviations.
 APART = 10.0
 ROUNDING = 1e-9  # lower bound of this difference, rad or m
 
@@ -78,7 +78,7 @@ class StaticPoses:
 
     @property
     def different(self) -> int:
-        """Number of poses that differ in the encoder readings by more than the noise."""
+        """Number of poses that differ from one another in the encoder readings."""
         apart = np.maximum(APART * self.joint_std, ROUNDING)
         kept = self.joints[:0]
         for joints in self.joints:
@@ -162,7 +162,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
 
 
 def _columns(rows: Any) -> int:
-    """Return the length of the first innermost one of nested lists, or 1 if there is none."""
+    """Return the length of the first list in nested lists (N, 6, k), or 1 if it is not a list."""
     try:
         return len(rows[0][0])
     except (TypeError, LookupError):
@@ -186,12 +186,12 @@ def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
         raise RecordError(f"{name}, number {row + 1}, {why}: it is not a covariance")
 
 
-# Largest allowed difference between read and expected motion, as a share of the expected.
+# Largest allowed difference between read and expected motion, as a fraction of the expected motion.
 WRONG = 0.2
-# Smallest expected motion (rms) to which a difference is related, as a share of the travel.
+# Lower bound of the expected motion (rms) in this fraction, as a fraction of the travel.
 STILL = 0.1
 
-# Factors of readings in wrong units. The key is True for sliding actuators.
+# Ratios of readings in wrong units to right readings. The key is True for sliding actuators.
 UNITS = {
     False: {
         "in degrees": 180 / pi,
@@ -243,9 +243,9 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
         for sign in (1, -1)
         for other in range(readings.shape[1])
     ]
-    # Among equal fits the simplest is chosen, because False sorts before True.
-    left, swapped, opposite, unit, other = min(found)
-    if left > WRONG:
+    # Among equal fits `min` takes the simplest, because False sorts before True.
+    unexplained, swapped, opposite, unit, other = min(found)
+    if unexplained > WRONG:
         off = _left(moves[:, joint], readings[:, joint], still)
         return f"is {off:.0%} of its motion off, and no sign, unit or order fits"
     what = [f"with the readings of {robot.joint_names[other]}"] if swapped else []
@@ -257,7 +257,7 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
 def _left(expected: Array, read: Array, still: float) -> float:
     """Return the norm of the unexplained motion, relative to that of the expected motion.
 
-    If the rms of the expected motion is less than `still`, `still` is used in its place.
+    An expected motion with an rms below `still` counts as one with this rms.
     """
     least = still * len(expected) ** 0.5
     return float(np.linalg.norm(read - expected) / max(float(np.linalg.norm(expected)), least))

@@ -4,15 +4,15 @@ The figures of merit follow Leboutet et al., "Inertial parameter identification 
 survey" (Applied Sciences 11(9), 2021; their toolbox is BIRDy): distance of the parameters, distance
 of the output, time, iterations and model evaluations.
 
-Single parameters cannot be compared, because no motion separates them. The parameter distance is
-the RMS relative error of the base parameters that the record identifies. These are selected by the
-information at the true parameters, so that the selection does not depend on an estimator. A few
-barely identified base parameters dominate this RMS, and can favour a fit close to the initial
-guess. Therefore the median of the relative errors is also listed. The gains of the joint PID have
-their own column.
+Single parameters cannot be compared, because no motion separates all of them. The parameter
+distance is the RMS relative error of the base parameters that the record identifies. These are
+selected by the information at the true parameters, so that the selection does not depend on an
+estimator. A few barely identified base parameters dominate this RMS, and can favour a fit close to
+the initial guess. Therefore the median of the relative errors is also listed. The gains of the
+joint PID have their own column.
 
-The pose distance is the RMS difference of the closed-loop model and the true plant on validation
-trajectories, for the worst axis and run.
+The pose distance is the RMS pose difference between the closed-loop model and the true plant on
+validation trajectories, for the worst axis and run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -88,14 +88,14 @@ class ComparisonTruth:
         It is NaN if the model's loop is unstable, or if no model can have the parameters, for
         example a gain of zero.
         """
-        rows = []
+        errors = []
         for record, truth in self.unseen:
             try:
                 poses = model_on_record(self.side, parameters, record)
             except (ParameterError, SimulationError):
                 return float("nan"), float("nan")
-            rows.append(rms_row(rms_figures(poses - true_poses(truth))))
-        worst = np.max(np.array(rows), axis=0)
+            errors.append(rms_row(rms_figures(poses - true_poses(truth))))
+        worst = np.max(np.array(errors), axis=0)
         return float(worst[:3].max()), float(worst[3:].max())
 
 
@@ -110,8 +110,8 @@ class Score:
                                    trajectories.
     seconds                        Duration of the estimation.
     iterations, evaluations        Iterations and model evaluations.
-    note                           Remark, such as the reason of a failure. After a failure all
-                                   figures are NaN.
+    note                           Remark, such as the reason of a failure. After a failure,
+                                   distances, errors and duration are NaN.
     parameters, std (p,)           Estimates and their standard deviations.
     names                          Names of the parameters.
     """
@@ -145,7 +145,8 @@ def compare_on_run(
     Joint instruments are simulated from its truth, and their readings are returned with the scores.
     Estimators that need the joint PID get its true gains.
 
-    Raises RecordError for damaged files, and EstimationError for a record with torque commands.
+    Raises RecordError for damaged files. Raises EstimationError for a record with torque commands,
+    and as `examination` does.
     """
     folder = files.folder
     record = files.experiment
@@ -217,7 +218,7 @@ def examination(
     true: Array,
     unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
 ) -> ComparisonTruth:
-    """Set up the examination from true parameters (p,) and (record, truth) pairs of validation.
+    """Return the truth of a comparison from true parameters (p,) and (record, truth) pairs.
 
     Raises EstimationError if the record identifies no base parameter, or if there is no validation
     run.
@@ -231,7 +232,7 @@ def examination(
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
     groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
-    # The relative error of a base parameter that is almost zero is meaningless.
+    # The relative error of a base parameter near zero is meaningless.
     shown: NDArray[np.bool_] = groups.identifiable & (
         groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate)
     )
@@ -272,8 +273,8 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Compariso
     pid = layout.joint_pid
     groups = asked.group_errors(found.parameters)
     # Gains that the drive law does not use are zero, and are omitted.
-    read = np.flatnonzero(asked.true[pid]) + pid.start
-    gains = found.parameters[read] / asked.true[read] - 1
+    used = np.flatnonzero(asked.true[pid]) + pid.start
+    gains = found.parameters[used] / asked.true[used] - 1
     distances = (
         _rms(groups),
         float(np.median(np.abs(groups))),
@@ -305,20 +306,20 @@ PANELS = (
 def estimators_figure(scores: Sequence[Score]) -> "Figure":
     """Draw the scores on logarithmic axes, one panel per figure of merit.
 
-    A missing figure, for example of an unstable model, has no point.
+    A value that is missing, for example of an unstable model, or zero has no point.
     """
     from matplotlib.figure import Figure  # rows of studies compare and draw nothing
 
     figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
-    places = np.arange(len(scores))[::-1]
+    heights = np.arange(len(scores))[::-1]
     for axes, (title, label, field, factor) in zip(
         figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True
     ):
         values = np.array([factor * getattr(score, field) for score in scores], dtype=float)
         # Logarithmic axes cannot show zero.
-        axes.plot(np.where(values > 0, values, np.nan), places, "o", color="tab:blue")
+        axes.plot(np.where(values > 0, values, np.nan), heights, "o", color="tab:blue")
         axes.set(title=title, xlabel=label, xscale="log")
         axes.grid(alpha=0.3, which="both")
-    figure.axes[0].set_yticks(places, [score.title for score in scores])
+    figure.axes[0].set_yticks(heights, [score.title for score in scores])
     figure.suptitle("Estimators on one record, against one truth")
     return figure

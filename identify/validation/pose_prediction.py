@@ -23,10 +23,10 @@ from identify.progress import Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
 
-# Source of uncertainty of a prediction: the sensor's noise moves the plant through the servo.
+# Name of a source of uncertainty: the sensor's noise, which moves the plant through the servo.
 MOTION = "motion"
-# Number of repeated experiments per motion. With NEIGHBOURS, they determine the standard deviation
-# due to noise in a frame to about 6 %.
+# Number of repeated experiments per motion. Averaged over NEIGHBOURS, they determine a frame's
+# standard deviation due to noise to about 6 %.
 REPETITIONS = 48
 NEIGHBOURS = 5  # number of frames over which the covariance due to noise is averaged
 # Weight of the mean over the motion in a frame's covariance due to noise. Without it, the
@@ -54,9 +54,9 @@ class PosePrediction:
     poses (N, 6)          Predicted poses, m and rad.
     covariance (N, 6, 6)  Covariance of the plant's true poses about the predicted poses. It is zero
                           along directions in which the platform cannot move.
-    slopes (N, 6, p)      Sensitivities of the poses. They are given only if no frame is lost, poses
-                          have no common errors, the platform carries no load, and the servo drives
-                          the model.
+    slopes (N, 6, p)      Sensitivities of the poses to the parameters. They are None unless no
+                          frame is lost, poses have no common errors, the platform carries no load,
+                          and the servo drives the model.
     """
 
     chart: Chart
@@ -132,7 +132,7 @@ class _Basis:
     by_noise: Array
 
     def spread(self, covariance: Array) -> Array:
-        """Return the poses' covariance (N, 6, 6) for one of parameters and numbers like `known`."""
+        """Return the poses' covariance (N, 6, 6) for another covariance in place of `known`."""
         return np.asarray(self.slopes @ covariance @ self.slopes.transpose(0, 2, 1))
 
 
@@ -177,19 +177,19 @@ def _known_in_common(
 ) -> tuple[Array, Array, Array]:
     """Return what is known beforehand about the common errors of a run's poses.
 
-    The errors are a linear function of k independent numbers. The first result (k,) is the most
-    likely values of these numbers. The second is the matrix (k, k) from the numbers with known
-    covariance to these numbers. The third is the covariance (p + k, p + k) of the parameters and
-    the numbers with known covariance.
+    The errors are a linear function of k independent numbers. Their covariance is known for the
+    learned errors, or without these for the numbers. The first result is the most likely values
+    (k,) of the numbers. The second is the matrix (k, k) from the quantities of known covariance to
+    the numbers. The third is the covariance (p + k, p + k) of the parameters and these quantities.
     """
     names = run.common.all_names
     if names and tuple(learned) == names:
         # The factor has no inverse if the covariance lacks full rank.
         root = np.asarray(np.linalg.pinv(run.common.whole_factor))
         return root @ np.array([*learned.values()]), root, covariance
-    each = np.eye(len(names))
-    whole = np.asarray(block_diag(covariance[:parameters, :parameters], each))
-    return np.zeros(len(names)), each, whole
+    identity = np.eye(len(names))
+    whole = np.asarray(block_diag(covariance[:parameters, :parameters], identity))
+    return np.zeros(len(names)), identity, whole
 
 
 def predicted_runs(
@@ -203,9 +203,8 @@ def predicted_runs(
 ) -> list[PosePrediction]:
     """Predict the plant on the references of records from the identified model.
 
-    The parameters (p,) have covariance (p, p). For ``learned`` see `predict_poses`. All poses of a
-    prediction are NaN if the loop is unstable, or if too few frames were measured to determine the
-    sensor's noise.
+    For ``parameters``, ``covariance`` and ``learned`` see `predict_poses`. A prediction is NaN if
+    the loop is unstable, or if too few frames were measured to determine the sensor's noise.
 
     Raises RecordError or EstimationError for a record that is damaged, or of another robot, timing
     or servo. Raises dynamics.DynamicsError for parameters that no model can have.
@@ -248,9 +247,9 @@ def predicted_variances(
 
     `sources` (p + k, p + k) are the parts of the covariance by their names. The motion due to the
     sensor's noise is another source, MOTION. Common errors that the record of the identification
-    does not determine are further sources. `number` (of the record, from one on) and `seed` select
-    the noise, as in `predicted_runs`. Raises LoopFailure or TooFewFramesError if nothing can be
-    predicted.
+    does not determine are further sources. `number` (that of the record, from one on) and `seed`
+    select the noise, as in `predicted_runs`. Raises LoopFailure if the loop is unstable, and
+    TooFewFramesError if too few frames were measured.
     """
     run, rng = _predicting(side, record, seed, number)
     whole = np.asarray(sum(sources.values()))
@@ -264,9 +263,9 @@ def predicted_variances(
             name: block_diag(part[:count, :count], 0 * of_errors) for name, part in parts.items()
         }
         for kind, modes in run.common.by_kind(of_errors).items() if size > count else ():
-            before = parts.get(kind, np.zeros((size, size)))
-            parts[kind] = before + block_diag(np.zeros((count, count)), modes @ modes.T)
-    found = {
+            so_far = parts.get(kind, np.zeros((size, size)))
+            parts[kind] = so_far + block_diag(np.zeros((count, count)), modes @ modes.T)
+    variances = {
         name: np.diagonal(basis.spread(part), axis1=1, axis2=2) for name, part in parts.items()
     }
-    return found | {MOTION: np.diagonal(basis.by_noise, axis1=1, axis2=2)}
+    return variances | {MOTION: np.diagonal(basis.by_noise, axis1=1, axis2=2)}

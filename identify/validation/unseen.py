@@ -42,10 +42,10 @@ from identify.runtime import cores, mapped
 from identify.trajectory import FourierTrajectory
 
 MOST_FITS = 12
-"""Largest number of linear fits of the starts and the clock of a record that begins in motion."""
+"""Largest number of linear fits of the starts and the clock, if a record begins in motion."""
 
 SETTLED = 0.99
-"""Ratio of the costs of two fits from which on no further fit is made."""
+"""Ratio of the costs of two successive fits above which no further fit is made."""
 
 POLL_S = 0.2
 """Interval at which the progress of the workers is read, s."""
@@ -98,10 +98,10 @@ def model_run(
     latencies: Array | None = None,
     lost: NDArray[np.bool_] | None = None,
 ) -> Array:
-    """Return the poses (N, 6) of the model on a reference. All are NaN if its loop is unstable.
+    """Return the poses (N, 6) of the model on a reference. All are NaN if the loop is unstable.
 
-    ``latencies`` (N,) [s] are the latencies of its commands, by default the latency of the timing.
-    In ``lost`` (N,) frames its servo measures nothing, by default in none.
+    ``latencies`` (N,) [s] are the latencies of the commands, by default the latency of the timing.
+    In ``lost`` (N,) frames the servo measures nothing, by default in none.
 
     Raises dynamics.DynamicsError for parameters of another shape or outside their range, and for
     poses out of reach.
@@ -142,8 +142,9 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
 def _with_fitted_start(run: LoopModel, parameters: Array) -> LoopModel:
     """Return a model that begins in motion, with the starts and the clock that fit its record best.
 
-    Without them, a model with the right parameters would be off after each start. Each fit is
-    linear, and stick-slip of the joints is not: fits follow until they lower the cost no more.
+    Without these, a model with the right parameters would be wrong after each start. Each fit is
+    linear, but stick-slip of the joints is not. Fits are therefore repeated until the cost hardly
+    falls (SETTLED), at most MOST_FITS times.
     """
     cost = math.inf
     for _ in range(MOST_FITS):
@@ -201,7 +202,7 @@ def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
 
 @contextmanager
 def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
-    """Update the progress bar with the count of the workers until the context ends."""
+    """Report the workers' count as progress until the block ends."""
     done = 0
     ended = threading.Event()
 
@@ -227,8 +228,8 @@ def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: i
 
     Both run on the validation trajectories of a seed, each with its own friction law and
     integration steps. An ideal sensor closes both loops, so the errors are caused only by the
-    parameters (p,) and by effects that the model lacks. They are NaN if, and only if, the model's
-    loop is unstable.
+    parameters (p,) and by effects that the model lacks. The errors of a run are NaN if, and only
+    if, the model's loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
     range. Raises TrajectoryError if no validation trajectory is within the robot's limits.

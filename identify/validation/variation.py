@@ -1,11 +1,11 @@
 """Variation of the estimates from trajectory to trajectory (table 5 of the paper).
 
 The robot is identified from each of several runs separately. The paper gives no formula for its
-"variation measure". Here it is the standard deviation of a parameter's estimates in per cent of
-their mean, for the parameters that every run identifies. It is compared with the value that is
-expected from the standard deviations of the runs. As in the paper, all runs share one weighing of
-the platform and one teaching of the sensor. The errors of weighing and teaching therefore do not
-contribute.
+"variation measure". Here it is the standard deviation of a parameter's estimates, divided by the
+magnitude of their mean. It is compared with the value that is expected from the standard deviations
+of the runs. Only parameters that every run identifies count. As in the paper, all runs share one
+weighing of the platform and one teaching of the sensor. The errors of weighing and teaching
+therefore do not contribute.
 
 The masses of the links of `rss6` vary most, because they act only through accelerations. The
 information of designed runs at the true parameters, without noise in the servo, shows how well the
@@ -40,7 +40,8 @@ class Variation:
 
     layout           Names and units of the parameters.
     mean (p,)        Means of the estimates, SI.
-    variation (p,)   Standard deviations of the estimates over the size of their means.
+    variation (p,)   Standard deviations of the estimates over the magnitude of their means, NaN for
+                     a mean of zero.
     expected (p,)    Expected variation according to the standard deviations of the runs.
     identified (p,)  True for parameters that every run identifies.
     runs             Number of runs.
@@ -96,7 +97,7 @@ def variation(results: Sequence[IdentificationResult]) -> Variation:
     estimates = np.array([r.estimate for r in results])
     stds = np.array([r.std for r in results])
     mean = estimates.mean(axis=0)
-    # A parameter of zero has no relative variation.
+    # A mean of zero has no relative variation.
     size = np.where(mean == 0, np.nan, np.abs(mean))
     return Variation(
         layout=results[0].layout,
