@@ -114,8 +114,8 @@ def check_enough(
     raise EstimationError(
         f"{poses} poses that differ give {poses * coordinates} equations for {determinable} "
         f"combinations of the {len(names)} geometric numbers of {robot.name} that poses can "
-        f"determine: at least {needed} are needed; missing: {missing}, hardest to determine: "
-        f"{shown}"
+        f"determine: at least {needed} are needed; missing equations: {missing}; hardest to "
+        f"determine: {shown}"
     )
 
 

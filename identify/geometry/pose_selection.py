@@ -129,8 +129,8 @@ class Designer:
         if len(joints) < count:
             raise EstimationError(
                 f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} "
-                f"within its travel ({travel:.3g} {robot.layout.joint_unit}) are poses within all "
-                f"limits and visible; {count} are needed"
+                f"within its travel ({travel:.3g} {robot.layout.joint_unit}) give visible poses "
+                f"within all limits; {count} are needed"
             )
         return self.seen(joints, poses)
 

@@ -181,7 +181,8 @@ def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
         why = (
             "is not symmetric"
             if skewed[row]
-            else f"has correlations with the eigenvalue {least[row]:.2g}, which must be > 0"
+            else f"has correlations with the eigenvalue {least[row]:.2g}, which must be "
+            f"{'>' if strictly else '>='} 0"
         )
         raise RecordError(f"{name}, number {row + 1}, {why}: it is not a covariance")
 
@@ -247,7 +248,7 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
     unexplained, swapped, opposite, unit, other = min(found)
     if unexplained > WRONG:
         off = _left(moves[:, joint], readings[:, joint], still)
-        return f"is {off:.0%} of its motion off, and no sign, unit or order fits"
+        return f"differs from the expected motion by {off:.0%}, and no sign, unit or joint fits"
     what = [f"with the readings of {robot.joint_names[other]}"] if swapped else []
     what += ["with the opposite sign"] if opposite else []
     what += [f"as readings {unit}"] if unit else []

@@ -112,7 +112,7 @@ def variation(results: Sequence[IdentificationResult]) -> Variation:
 def check_count(runs: int) -> None:
     """Raise EstimationError if there are too few runs to show variation."""
     if runs < FEWEST_RUNS:
-        raise EstimationError(f"{runs} runs show no variation, at least {FEWEST_RUNS} are needed")
+        raise EstimationError(f"{runs} runs show no variation; at least {FEWEST_RUNS} are needed")
 
 
 def identify_each(

@@ -242,8 +242,9 @@ def _why_too_long(test: LengthTest, run: AcceptanceRun) -> Advice:
     if ratio <= STDS:
         sides = "x".join(f"{side / 2:.3g}" for side in run.volume.size)
         return Advice(
-            f"The images are this noisy: the mean of {exposures} exposures of this length has a "
-            f"stated standard deviation of {std_um:.2g} um. A smaller volume is nearer.",
+            f"The error is due to noise of the images: the mean of {exposures} exposures of this "
+            f"length has a stated standard deviation of {std_um:.2g} um. The far corners of a "
+            "smaller volume are nearer to the cameras.",
             f"cmmsim acceptance {run.sensor} --standard vdi --volume {sides}",
         )
     return Advice(

@@ -62,7 +62,7 @@ def check_loop(
         return
     at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
     text = (
-        f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is "
+        f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; the loop is "
         "stable below 1"
     )
     yield Finding("loop", radius < 1, radius, text, limit=1.0, relation="<")
@@ -82,7 +82,7 @@ def check_loop(
     text = (
         f"the loop is stable from {rate:.3g} Hz on with this latency"
         if rate > 0
-        else "no frame rate makes it stable"
+        else "no frame rate makes the loop stable"
     )
     yield Finding(
         "frame rate",
@@ -164,7 +164,7 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
             made = servo_figures(model, replace(settings, servo=gains), home)
             text = (
                 f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a "
-                f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, "
+                f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}; "
                 f"{made.gain_margin:.3g} times these gains make the loop unstable"
             )
             yield Finding(
@@ -176,11 +176,11 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
     nyquist = np.pi * settings.timing.frame_rate_hz
     text = (
         f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = "
-        f"{2 * asked.damping * w:.4g} 1/s, has the largest eigenvalue {torques.radius:.4g}, which "
-        "is stable below 1"
+        f"{2 * asked.damping * w:.4g} 1/s, has the largest eigenvalue {torques.radius:.4g}; the "
+        "loop is stable below 1"
     )
     if torques.radius < 1:
-        text += f"; {torques.gain_margin:.3g} times these gains make it unstable"
+        text += f"; {torques.gain_margin:.3g} times these gains make the loop unstable"
     yield Finding(
         "computed torque", torques.radius < 1, torques.radius, text, limit=1.0, relation="<"
     )

@@ -176,7 +176,7 @@ def _assembly(robot: Robot) -> Iterator[Finding]:
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
         text += (
             f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and "
-            f"{turn.magnitude():.3g} rad from it"
+            f"{turn.magnitude():.3g} rad from home"
         )
     yield Finding("assembly modes", len(modes) > 0, len(modes), text)
 
@@ -253,8 +253,8 @@ def _centres(robot: Robot, parameters: Array) -> Iterator[Finding]:
     body = layout.bodies[full[worst]]
     leg = next((k + 1 for k, own in enumerate(layout.of_leg) if full[worst] in own), None)
     text = (
-        f"the centre of mass of {body} is {off[worst]:.3g} m from where that of a centred body is; "
-        f"its drawing reaches {reach[worst]:.3g} m"
+        f"the centre of mass of {body} is {off[worst]:.3g} m from that of a centred body; the "
+        f"drawing of the body reaches {reach[worst]:.3g} m"
     )
     ratio = float(off[worst] / reach[worst])
     yield Finding("centres of mass", ratio <= 1.0, ratio, text, limit=1.0, leg=leg)

@@ -174,7 +174,7 @@ def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: st
         axes.axvline(
             value, color=f"C{number + 2}", linestyle=style, label=f"{figure.instrument}, {state}"
         )
-    axes.set(xscale="log", xlabel=f"{name} error [{unit}]", ylabel="share of frames")
+    axes.set(xscale="log", xlabel=f"{name} error [{unit}]", ylabel="fraction of frames")
     axes.legend(fontsize="x-small")
     axes.grid(alpha=0.3)
 

@@ -119,7 +119,7 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
         float(widths[longest]),
         f"no pose from {begin:.4f} to {end:.4f} s; commands changed in {changed} of "
         f"{len(widths)} gaps"
-        + (", in which the servo had poses that the log has not" if changed else "")
+        + (", in which the servo had poses that the log lacks" if changed else "")
         + (f"; rows of commands are missing in {missing}" if missing else ""),
         limit=LONG_GAP_S,
         unit="s",
@@ -137,7 +137,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         listed = ", ".join(
             f"{axis} {scale * one:.3g}" for axis, one in zip(POSE[kind], own, strict=True)
         )
-        text = f"standard deviations of the poses beside their neighbours: {listed} {word}"
+        text = f"standard deviations of the poses from their neighbours: {listed} {word}"
         if not np.isfinite(value):
             text = "no poses are near enough in time to tell their noise"
             yield Finding(name, False, None, text, unit=unit)
@@ -169,7 +169,7 @@ def _frozen(logged: LoggedRun) -> Iterator[Finding]:
         "frozen poses",
         bool(same.mean() <= FROZEN),
         float(same.mean()),
-        f"{same.sum()} poses are the pose before in all digits{first}",
+        f"{same.sum()} poses equal the previous pose in all digits{first}",
         limit=FROZEN,
     )
 
@@ -222,7 +222,7 @@ def _saturation(logged: LoggedRun) -> Iterator[Finding]:
         f"{int(np.argmax(most)) + 1}; "
         + (
             f"commands of joint {joint + 1} stay at the end of their range in {shares[joint]:.1%} "
-            "of the rows between rest and rest"
+            "of the rows from the first to the last change"
             if shares[joint] > 0
             else "no command stays at the end of its range"
         ),
@@ -247,8 +247,8 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         lag.correlation >= FOLLOWS and lag.seconds >= -BEFORE_S,
         lag.seconds,
         f"the motion follows the commands by {1e3 * lag.seconds:.1f} ms, with a correlation of "
-        f"{lag.correlation:.3f}: drives, friction, latency and the clocks; less than "
-        f"{-BEFORE_S:g} s, a motion before its commands, or a correlation below {FOLLOWS:g} fails",
+        f"{lag.correlation:.3f}, due to drives, friction, latency and the clocks; a lag below "
+        f"{-BEFORE_S:g} s (a motion before its commands) or a correlation below {FOLLOWS:g} fails",
         limit=-BEFORE_S,
         unit="s",
         relation=">=",
@@ -268,16 +268,18 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
     step = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
     allowed = step + STDS * (timing.clock_offset_std_s + timing.latency_std_s)
     beyond = (
-        "" if abs(offset) <= allowed else "; timing.clock_offset_std_s has the offset estimated"
+        ""
+        if abs(offset) <= allowed
+        else "; set timing.clock_offset_std_s to have the offset estimated"
     )
     yield Finding(
         "clock offset",
         abs(offset) <= allowed,
         offset,
-        f"the noise of a pose is in the command {1e3 * delay.seconds:.3f} ms later (correlation "
-        f"{delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
+        f"the noise of a pose appears in the command {1e3 * delay.seconds:.3f} ms later "
+        f"(correlation {delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
         f"{1e3 * expected:.3f} ms: the clock of the commands is {1e3 * abs(offset):.3f} ms "
-        f"{'ahead' if offset >= 0 else 'behind'}, or the latency is another{beyond}",
+        f"{'ahead' if offset >= 0 else 'behind'}, or the latency differs{beyond}",
         limit=allowed,
         unit="s",
     )

@@ -53,7 +53,9 @@ def test_missed_limit_is_the_exit_status_and_all_is_written(accepted):
     text = (out / "acceptance.md").read_text(encoding="utf-8")
     assert "MISSED" in text
     # A hundredth of a micrometre is less than noise: the largest error is within its deviation.
-    assert test["advice"]["cause"].startswith("The images are this noisy: the mean of 5 exposures")
+    assert test["advice"]["cause"].startswith(
+        "The error is due to noise of the images: the mean of 5"
+    )
     assert test["advice"]["command"].startswith("cmmsim acceptance ctrack780 --standard vdi")
     assert f"Next: `{test['advice']['command']}`" in text
     names = [

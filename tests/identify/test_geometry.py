@@ -299,7 +299,7 @@ def test_too_few_poses_are_refused_with_how_many_are_needed():
     enough(11)
     said = refusal(EstimationError, enough, 10)
     assert "10 poses that differ give 60 equations for 66" in said
-    assert "at least 11 are needed; missing: 6" in said
+    assert "at least 11 are needed; missing equations: 6" in said
     assert "leg" in said
 
 

@@ -117,7 +117,9 @@ def test_what_is_wrong_with_the_commands_is_found_with_its_size(record):
     assert {"saturation", "clock offset", "units and frames"} <= failed
     assert found["saturation"].leg == 3
     assert found["clock offset"].value == pytest.approx(0.012, abs=1e-6)
-    assert "timing.clock_offset_std_s has the offset estimated" in found["clock offset"].text
+    assert (
+        "set timing.clock_offset_std_s to have the offset estimated" in found["clock offset"].text
+    )
     assert "commands of joint 4 lie 6.2" in found["units and frames"].text
     assert "off by a turn" in found["units and frames"].text
 
