@@ -243,20 +243,20 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     limit = 1e-10
     start = fit.nothing
     try:
-        found = least_squares(
+        solution = least_squares(
             fit.residuals, start, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit
         )
     except DynamicsError as error:
         raise EstimationError(f"the poses do not fit robot {robot.name}: {error}") from error
-    if not found.success:
-        raise EstimationError(f"the search for the geometry did not converge: {found.message}")
-    by_poses = found.jac[: -len(start)]
+    if not solution.success:
+        raise EstimationError(f"the search for the geometry did not converge: {solution.message}")
+    by_poses = solution.jac[: -len(start)]
     count = len(model.scale)
-    posterior = np.linalg.inv(found.jac.T @ found.jac)
+    posterior = np.linalg.inv(solution.jac.T @ solution.jac)
     covariance = model.scale @ posterior[:count, :count] @ model.scale.T
     # The trace is the effective number of unknowns that the poses determine.
     freedom = max(len(by_poses) - float(np.sum(posterior * (by_poses.T @ by_poses))), 1.0)
-    deviations, frames = model.split(found.x[:count])
+    deviations, frames = model.split(solution.x[:count])
     return Calibration(
         nominal=robot,
         deviations=deviations,
@@ -264,7 +264,7 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
         # The average removes asymmetry due to rounding.
         joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
-        noise_ratio=float(np.sum(found.fun[: len(by_poses)] ** 2) / freedom),
+        noise_ratio=float(np.sum(solution.fun[: len(by_poses)] ** 2) / freedom),
         noise_ratio_std=float(np.sqrt(2 / freedom)),
         frames_known=not np.array_equal(data.frames.base, FrameKnowledge.none().base),
     )

@@ -151,14 +151,14 @@ def _frames_at(
     Frames are searched as whole images until a pose is measured. In all later frames, stickers are
     searched near this pose.
     """
-    left = frames
-    while left:
+    due = frames
+    while due:
         first = sensor.measure(pose, bodies)
-        left = left - 1
+        due = due - 1
         if not first.ok:
             continue
         rest = sensor.measure_many(
-            np.tile(pose, (left, 1)), obstacles=bodies, near=np.tile(first.pose, (left, 1))
+            np.tile(pose, (due, 1)), obstacles=bodies, near=np.tile(first.pose, (due, 1))
         )
         ok = rest.stickers > 0
         return np.stack([first.pose, *rest.poses[ok]]), np.stack(

@@ -107,7 +107,8 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
     Without `base_covariance` and `platform_covariance` the frames are unknown.
 
     Raises RecordError if the file is unreadable, an entry is missing or has a wrong shape, a number
-    is not finite, the joints have another unit, or a matrix is not a covariance.
+    is not finite, the joints have another unit, a standard deviation is negative, or a matrix is
+    not a covariance.
     """
     content = load_result(path)
     if not isinstance(content.get("joints"), list):

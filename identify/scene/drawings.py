@@ -111,18 +111,18 @@ def draw_scene(
     """Draw a scene into axes, as `scene_figure` does."""
     placed = cell.placed(pose)
     rods = cell.rods(pose)
-    solids = [apply(place, body.vertices) for body, place in placed]
+    solids = [apply(transform, body.vertices) for body, transform in placed]
     shown = [*solids, rods.reshape(-1, 3), *(camera.frustum(FRUSTUM_M) for camera in cell.cameras)]
     painter = Painter(viewpoint, *extent(shown))
-    for body, place in placed:
-        _solid(painter, body, place)
+    for body, transform in placed:
+        _solid(painter, body, transform)
     meshes = cell.leg_meshes
-    places = cell.obstacles(pose) if meshes else {}
+    transforms = cell.obstacles(pose) if meshes else {}
     for part, ends in zip(cell.parts, rods, strict=True):
         colour = leg_colour(cell, part.leg, part.body)
         if part.name in meshes:
             mesh = meshes[part.name]
-            painter.faces(apply(places[part.name], mesh.vertices), mesh.faces, colour)
+            painter.faces(apply(transforms[part.name], mesh.vertices), mesh.faces, colour)
         else:
             painter.faces(*tube(ends, part.segment.radius), colour)
     for ends in cell.frame:
@@ -252,11 +252,11 @@ def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
 
 
 def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -> None:
-    named = [(camera.base_from_camera @ [0, -0.09, -0.06, 1])[:3] for camera in cell.cameras]
+    positions = [(camera.base_from_camera @ [0, -0.09, -0.06, 1])[:3] for camera in cell.cameras]
     words = [f"{camera.name} camera" for camera in cell.cameras]
-    for text, place in zip(words, named, strict=True):
+    for text, position in zip(words, positions, strict=True):
         axes.annotate(
-            text, tuple(painter.pixels(place)), fontsize=8, ha="center", va="bottom", zorder=5
+            text, tuple(painter.pixels(position)), fontsize=8, ha="center", va="bottom", zorder=5
         )
     for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
         flat = painter.pixels(vertices)

@@ -176,8 +176,8 @@ def _models(
         raise RecordError(
             f"{run.model} does not belong to the records of {run.path}: run {name} differs"
         )
-    found = {
+    modelled = {
         IDENTIFIED: poses(files.model[name], "identified"),
         STARTING: poses(files.model[name], "initial"),
     }
-    return {kind: values for kind, values in found.items() if np.isfinite(values).any()}
+    return {kind: values for kind, values in modelled.items() if np.isfinite(values).any()}

@@ -265,28 +265,28 @@ def compare(
 
 def _score(name: str, estimator: Estimator, evidence: Evidence, asked: ComparisonTruth) -> Score:
     try:
-        found = estimator(evidence)
+        estimate = estimator(evidence)
     except (EstimationError, DynamicsError) as error:
         nothing = (np.nan,) * 6
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
     layout = asked.side.robot.layout
     pid = layout.joint_pid
-    groups = asked.group_errors(found.parameters)
+    groups = asked.group_errors(estimate.parameters)
     # Gains that the drive law does not use are zero, and are omitted.
     used = np.flatnonzero(asked.true[pid]) + pid.start
-    gains = found.parameters[used] / asked.true[used] - 1
+    gains = estimate.parameters[used] / asked.true[used] - 1
     distances = (
         _rms(groups),
         float(np.median(np.abs(groups))),
         _rms(gains),
-        *asked.pose_distance(found.parameters),
+        *asked.pose_distance(estimate.parameters),
     )
     return Score(
         name,
         estimator.title,
         estimator.uses,
         *distances,
-        **vars(found),
+        **vars(estimate),
         names=layout.names,
     )
 

@@ -298,17 +298,17 @@ def _rms_norm(errors: np.ndarray) -> float:
 
 
 def _latency(test: LatencyTest, run: AcceptanceRun) -> dict[str, Any]:
-    found = test.latency
+    measured = test.latency
     return {
         "reports": len(test.reported),
         "lost_frames": test.lost,
-        "mean_ms": 1e3 * found.mean,
-        "mean_interval_ms": [1e3 * bound for bound in found.interval],
-        "std_ms": 1e3 * found.std,
-        "max_ms": 1e3 * found.maximum,
-        "single_report_noise_ms": 1e3 * found.resolution,
+        "mean_ms": 1e3 * measured.mean,
+        "mean_interval_ms": [1e3 * bound for bound in measured.interval],
+        "std_ms": 1e3 * measured.std,
+        "max_ms": 1e3 * measured.maximum,
+        "single_report_noise_ms": 1e3 * measured.resolution,
         "sensor_file_ms": 1e3 * test.stated,
-        "oldest_pose_ms": 1e3 * (found.maximum + test.frame_period),
+        "oldest_pose_ms": 1e3 * (measured.maximum + test.frame_period),
     }
 
 

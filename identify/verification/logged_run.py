@@ -192,7 +192,7 @@ def read_logged_run(path: Path) -> LoggedRun:
         scenario = about.scenario
         robot = load_robot(scenario.robot)
         telemetry = read_telemetry(path, about, robot)
-        found = log_suspicions(path, about, telemetry, robot)
+        suspected = log_suspicions(path, about, telemetry, robot)
         measured = about.measured
         stds = [measured.position_std_m, measured.orientation_std_rad]
         stated = None if None in stds else np.repeat(np.array(stds, dtype=float), 3)
@@ -201,13 +201,13 @@ def read_logged_run(path: Path) -> LoggedRun:
         scenario = recorded_scenario(record)
         robot = load_robot(scenario.robot)
         telemetry = recorded_telemetry(record, str(path))
-        found = suspicions(telemetry, robot)
+        suspected = suspicions(telemetry, robot)
         stated = None
     if telemetry.poses.covariance is not None:
         covariance = telemetry.poses.covariance[telemetry.poses.ok]
         stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
     return LoggedRun(
-        telemetry, model_side(robot, scenario), scenario.identification, stated, tuple(found)
+        telemetry, model_side(robot, scenario), scenario.identification, stated, tuple(suspected)
     )
 
 

@@ -141,7 +141,7 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
     asked = around.feedback
     model = Model(robot, parameters, settings.friction)
     try:
-        found = servo_figures(model, settings, home)
+        figures = servo_figures(model, settings, home)
         torques = torque_figures(model, settings, home, asked)
         limit = largest_bandwidth(model, settings, home, asked)
     except DynamicsError as error:
@@ -149,14 +149,14 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
         yield Finding("bandwidth", False, None, text, unit="rad/s")
         return
     text = (
-        f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of "
-        f"{found.damping:.3g}"
+        f"the servo follows up to {figures.bandwidth:.3g} rad/s, with a least damping of "
+        f"{figures.damping:.3g}"
     )
-    bandwidth: float | None = found.bandwidth
-    if found.radius >= 1:
+    bandwidth: float | None = figures.bandwidth
+    if figures.radius >= 1:
         bandwidth = None
         text = "an unstable loop has no bandwidth"
-    yield Finding("bandwidth", found.radius < 1, bandwidth, text, unit="rad/s")
+    yield Finding("bandwidth", figures.radius < 1, bandwidth, text, unit="rad/s")
     wanted = control.servo_bandwidth_rad_s
     if wanted is not None:
         try:

@@ -134,7 +134,7 @@ def bar_figure(test: BarTest) -> Figure:
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
-    for (series, spread), name, unit, columns in zip(
+    for (series, histogram), name, unit, columns in zip(
         panels, ("position", "orientation"), ("um", "urad"), (slice(0, 3), slice(3, 6)), strict=True
     ):
         for run in test.runs:
@@ -147,7 +147,7 @@ def bar_figure(test: BarTest) -> Figure:
         series.set_ylabel(f"{name} error [{unit}]")
         series.axvline(0.0, color="black", linestyle="--", linewidth=1)
         series.grid(alpha=0.3)
-        _distribution(spread, test, columns, name, unit)
+        _distribution(histogram, test, columns, name, unit)
     panels[0, 0].set_title(
         "error of the second end relative to the first (dashes: the bar starts to move)"
     )

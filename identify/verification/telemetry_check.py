@@ -2,7 +2,7 @@
 
 The findings concern the times, gaps and noise of the poses, the size and the frequencies of the
 motion, the commands, the units and frames, the clocks, and the parameters that the motion can show.
-The last one needs the guessed model, which runs under the logged commands.
+The last finding needs the guessed model, which runs under the logged commands.
 """
 
 from collections.abc import Callable, Iterator

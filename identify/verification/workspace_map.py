@@ -162,9 +162,9 @@ def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[fl
     ends = []
     for sign in (-1.0, 1.0):
         poses = robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]
-        share = workspace.measure(robot, poses).travel_share
+        used = workspace.measure(robot, poses).travel_share
         # NaN means out of reach, and counts as outside.
-        outside = ~(share <= 1)
+        outside = ~(used <= 1)
         farthest = max(int(np.argmax(outside)) - 1, 0) if outside.any() else -1
         ends.append(sign * float(steps[farthest]))
     return ends[0], ends[1]
