@@ -14,12 +14,13 @@ from matplotlib.patches import FancyBboxPatch
 from identify.paper.exhibit import Exhibit
 from identify.reporting.figures.style import BLUE, GREY, INK, PAPER, WIDTH
 
+# Half width and half height of a block. Blocks stand on a grid of unit distance.
 HALF_WIDTH = 0.35
-HALF_HEIGHT = 0.3  # half width and half height of a block. Blocks stand on a grid of unit distance.
+HALF_HEIGHT = 0.3
 
 
 class Block(NamedTuple):
-    """Block at a place of the grid. ``ours`` names the function or command that does its work."""
+    """Block at a column and row of the grid. ``ours`` names what does its work here."""
 
     name: str
     column: float
@@ -43,16 +44,16 @@ class Diagram:
     arrows: Sequence[Arrow]
 
     def draw(self) -> Figure:
-        """Draw the diagram. Rows go down, and an arrow runs from edge to edge."""
+        """Draw the diagram. Rows count downwards, and an arrow runs from edge to edge of blocks."""
         columns = max(block.column for block in self.blocks) + 1
         rows = max(block.row for block in self.blocks) + 1
         figure = Figure(figsize=(WIDTH, 0.25 + 0.95 * rows))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
         axes.set_axis_off()
-        places = {block.name: (block.column, block.row) for block in self.blocks}
+        centres = {block.name: (block.column, block.row) for block in self.blocks}
         for block in self.blocks:
-            x, y = places[block.name]
+            x, y = centres[block.name]
             corner = (x - HALF_WIDTH + 0.03, y - HALF_HEIGHT + 0.03)
             size = (2 * HALF_WIDTH - 0.06, 2 * HALF_HEIGHT - 0.06)
             axes.add_patch(
@@ -65,7 +66,7 @@ class Diagram:
             axes.text(x, y - shift, block.name, fontsize=6.5, **centre)
             axes.text(x, y + 0.16, block.ours, fontsize=5, color=BLUE, **centre)
         for arrow in self.arrows:
-            start, end = _edges(places[arrow.start], places[arrow.end])
+            start, end = _edges(centres[arrow.start], centres[arrow.end])
             axes.annotate(
                 "", end, start, arrowprops={"arrowstyle": "-|>", "color": GREY, "lw": 0.9}
             )
@@ -87,10 +88,10 @@ class Diagram:
 def _edges(
     start: tuple[float, float], end: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends of an arrow on the edges of two blocks at these places."""
+    """Return the ends of an arrow on the edges of two blocks with these centres."""
     dx = end[0] - start[0]
     dy = end[1] - start[1]
-    # The straight line between the centres leaves a block through its nearer edge.
+    # The line between the centres leaves a block through the edge that it reaches first.
     reach = min(
         HALF_WIDTH / abs(dx) if dx else float("inf"), HALF_HEIGHT / abs(dy) if dy else float("inf")
     )

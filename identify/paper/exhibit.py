@@ -21,7 +21,7 @@ from identify.verification.against_mujoco import EngineRuns
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Results from which all exhibits are drawn.
+    """Results from which all exhibits are made.
 
     robot           Robot of both runs.
     ours, settings  Run of the scenario `paper`, and run of the scenario `paper_settings`.
@@ -41,7 +41,7 @@ class PaperRuns:
         return {"ours": self.ours, "paper's settings": self.settings}
 
 
-# Columns of text and numbers by their headings. All columns have the same length.
+# Columns of text and numbers by their headings. All have the same number of rows.
 Columns = Mapping[str, Collection[Any]]
 
 
@@ -67,8 +67,8 @@ class Exhibit:
     @property
     def stem(self) -> str:
         """Name of the files without suffix, such as "figure_08"."""
-        kind, _, place = self.name.lower().partition(" ")
-        return f"{kind}_{int(place):02d}"
+        kind, _, digits = self.name.lower().partition(" ")
+        return f"{kind}_{int(digits):02d}"
 
     @property
     def table(self) -> Table:
@@ -117,7 +117,7 @@ def table_figure(table: Table) -> Figure:
 
 
 def pose_columns(poses: Array, whose: str = "") -> dict[str, Array]:
-    """Return poses (N, 6) [m, rad] as six columns in mm and mrad."""
+    """Return poses (N, 6) [m, rad] as six columns in mm and mrad, headed by ``whose`` they are."""
     before = f"{whose} " if whose else ""
     return {
         f"{before}{name} [{'mm' if i < 3 else 'mrad'}]": 1e3 * poses[:, i]

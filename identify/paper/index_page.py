@@ -26,11 +26,11 @@ def exhibit_files(runs: PaperRuns, progress: Progress) -> dict[Path, bytes]:
     files: dict[Path, bytes] = {}
     with progress.stage("draw", len(exhibits)) as advance:
         for one in exhibits:
-            place = Path(EXHIBITS) / one.stem
+            path = Path(EXHIBITS) / one.stem
             figure = drawn(one.figure)
             for suffix in (".png", ".pdf"):
-                files[place.with_suffix(suffix)] = figure_bytes(figure, suffix)
-            files[place.with_suffix(".csv")] = one.csv().encode()
+                files[path.with_suffix(suffix)] = figure_bytes(figure, suffix)
+            files[path.with_suffix(".csv")] = one.csv().encode()
             advance()
     files[Path(INDEX)] = page(exhibits, runs).encode()
     return files

@@ -26,7 +26,7 @@ class MarkedPlanes:
 
     ids                      Names (n,) of the stickers.
     plane (n,)               Plane of each sticker, 0 to 2.
-    points (n, 3)            Measured places in the frame of the planes, m.
+    points (n, 3)            Measured positions in the frame of the planes, m.
     distances (n,)           Signed distances of the stickers from their planes, m.
     normals (3, 3)           Unit normals of the planes in the frame of the planes, one per row.
     base_from_planes (4, 4)  Frame of the planes in the base frame.
@@ -42,22 +42,23 @@ class MarkedPlanes:
     def corners(self, plane: int) -> Array:
         """Return the corners (m, 3), m, of the drawn part of a plane.
 
-        It is the convex hull of the stickers, projected onto the plane, and of the ends of the
-        plane's intersections with the other planes.
+        This part is the convex hull of the stickers, projected onto the plane, and of the ends of
+        the plane's intersections with the other planes.
         """
         own = self.points[self.plane == plane]
         normal = self.normals[plane]
-        flat = own - np.outer(own @ normal, normal)
+        projected = own - np.outer(own @ normal, normal)
         ends = [self.edge(plane, other) for other in range(3) if other != plane]
-        every = np.vstack([flat, *ends])
-        across = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[2][:2]
-        hull = ConvexHull(every @ across.T)
+        every = np.vstack([projected, *ends])
+        in_plane = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[2][:2]
+        hull = ConvexHull(every @ in_plane.T)
         return np.asarray(every[hull.vertices])
 
     def edge(self, first: int, second: int) -> Array:
         """Return the ends (2, 3), m, of the intersection of two planes.
 
-        It begins at the origin, and reaches as far as the farthest sticker of both planes.
+        The drawn part begins at the origin, where all planes intersect, and reaches as far as the
+        farthest sticker of both planes.
         """
         along = np.cross(self.normals[first], self.normals[second])
         along /= np.linalg.norm(along)
@@ -73,18 +74,18 @@ def marked_planes(cell: Workcell, view: StereoView) -> MarkedPlanes:
     """
     found = view.found["platform"]
     body = cell.marked("platform")
-    of = dict(zip(map(str, body.sticker_ids), body.plane_index, strict=True))
-    plane = np.array([of[name] for name in found.ids])
+    plane_of = dict(zip(map(str, body.sticker_ids), body.plane_index, strict=True))
+    plane = np.array([plane_of[name] for name in found.ids])
     # Nominal normals only decide to which side a fitted normal points.
-    rough = body.normals @ pose_to_transform(view.pose)[:3, :3].T
-    frame, planes = frames_of_points(found.points, found.covariances, plane, rough)
-    turned = np.array([fitted.normal for fitted in planes]) @ frame[:3, :3]
+    nominal = body.normals @ pose_to_transform(view.pose)[:3, :3].T
+    frame, planes = frames_of_points(found.points, found.covariances, plane, nominal)
+    normals = np.array([fitted.normal for fitted in planes]) @ frame[:3, :3]
     return MarkedPlanes(
         ids=found.ids,
         plane=plane,
         points=apply(invert(frame), found.points),
         distances=_distances(found.points, plane, planes),
-        normals=turned,
+        normals=normals,
         base_from_planes=frame,
     )
 
@@ -117,8 +118,8 @@ def draw(marked: MarkedPlanes) -> Figure:
             0, 0, 0, *(length * direction), color=INK, linewidth=0.9, arrow_length_ratio=0.1
         )
         axes.text(*(1.08 * length * direction), name, fontsize=9, fontstyle="italic")
-    for name, place in zip(marked.ids, 1e3 * marked.points, strict=True):
-        axes.text(*place, f" {name}", fontsize=6)
+    for name, point in zip(marked.ids, 1e3 * marked.points, strict=True):
+        axes.text(*point, f" {name}", fontsize=6)
     axes.set_aspect("equal")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
     # The planes B and C face the cameras.

@@ -30,7 +30,8 @@ from identify.verification.against_mujoco import PAPER, figure_8, judge
 def figures(runs: PaperRuns) -> list[Exhibit]:
     """Return figures 1 to 13 in their order.
 
-    Raises OutputFolderError if the scene of the run cannot be drawn.
+    Raises OutputFolderError if the scene of the run cannot be drawn, and cmmsim.LostError if the
+    view shows too few stickers.
     """
     cell, view = _scene(runs.ours)
     drawn = [
@@ -96,16 +97,16 @@ def motion(robot: Robot, data: RunData) -> Exhibit:
     assert data.truth is not None
     poses = true_poses(data.truth)
     away = np.abs(poses - robot.home_pose)
-    places = np.sort(away.argmax(axis=0))
-    times = data.experiment["time"].values[places]
+    indices = np.sort(away.argmax(axis=0))
+    times = data.experiment["time"].values[indices]
     return Exhibit(
         "Figure 6",
         "Animation of the motion",
         "A film of the SimMechanics model.",
         "The six instants of our run at which one component of the pose is farthest from home. The "
         "page replay.html moves, and shows images and errors with it.",
-        {"time [s]": times, **pose_columns(poses[places])},
-        partial(_instants, workcell(robot), times, poses[places]),
+        {"time [s]": times, **pose_columns(poses[indices])},
+        partial(_instants, workcell(robot), times, poses[indices]),
     )
 
 

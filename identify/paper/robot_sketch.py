@@ -33,12 +33,12 @@ def draw(robot: Robot) -> Figure:
     whole: Any = figure.add_axes((-0.1, -0.3, 0.72, 1.5), projection="3d")
     alone: Any = figure.add_axes((0.5, -0.1, 0.55, 1.1), projection="3d")
     for corner, colour in ((0, GREY), (2, INK)):
-        around = np.vstack([points[:, corner], points[:1, corner]])
-        whole.plot(*around.T, color=colour, linewidth=1.6)
+        outline = np.vstack([points[:, corner], points[:1, corner]])
+        whole.plot(*outline.T, color=colour, linewidth=1.6)
     for number, leg in enumerate(points, start=1):
         _leg(whole, leg)
-        for name, place in zip("BTA", leg, strict=True):
-            whole.text(*place, f" {name}{number}", fontsize=5.5)
+        for name, point in zip("BTA", leg, strict=True):
+            whole.text(*point, f" {name}{number}", fontsize=5.5)
     for name, origin in (("O", np.zeros(3)), ("E", home)):
         for axis, direction in zip("xyz", np.eye(3), strict=True):
             whole.quiver(*origin, *(70 * direction), color=INK, linewidth=0.8)
@@ -50,7 +50,7 @@ def draw(robot: Robot) -> Figure:
     for axes in (whole, alone):
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_axis_off()
-    # The leg is seen along the normal of its plane, so that both rods have their full length.
+    # The view is along the normal of the leg's plane, so that both rods have their full length.
     base, tip, joint = points[LEG]
     normal = np.cross(joint - tip, tip - base)
     normal *= np.sign(normal[2]) / np.linalg.norm(normal)
@@ -69,8 +69,8 @@ def _leg(axes: Any, leg: Array) -> None:
 def _one(axes: Any, leg: Array, home: Array) -> None:
     _leg(axes, leg)
     base, tip, joint = leg
-    for name, place in zip(("Bᵢ", "Tᵢ", "Aᵢ"), leg, strict=True):
-        axes.text(*place, f"  {name}", fontsize=8)
+    for name, point in zip(("Bᵢ", "Tᵢ", "Aᵢ"), leg, strict=True):
+        axes.text(*point, f"  {name}", fontsize=8)
     vectors = {"wᵢ": (base, tip), "lᵢ": (tip, joint), "aᵢ": (home, joint)}
     axes.plot(*np.array([home, joint]).T, color=GREEN, linestyle="--", linewidth=1.0)
     for name, ends in vectors.items():
@@ -84,15 +84,15 @@ def _one(axes: Any, leg: Array, home: Array) -> None:
 
 
 def exhibit(robot: Robot) -> Exhibit:
-    """Return figure 1, with the joints of all legs at home as its numbers."""
+    """Return figure 1, with the positions of all legs' joints at home as its numbers."""
     points = 1e3 * leg_points(robot)
-    inside = apply(invert(pose_to_transform(robot.home_pose)), points[:, 2] / 1e3)
+    in_platform = apply(invert(pose_to_transform(robot.home_pose)), points[:, 2] / 1e3)
     columns: dict[str, Any] = {"leg": range(1, len(points) + 1)}
     for k, name in enumerate(("B crank axis", "T crank to link", "A platform joint")):
         for i, axis in enumerate("xyz"):
             columns[f"{name} {axis} [mm]"] = points[:, k, i]
     for i, axis in enumerate("xyz"):
-        columns[f"a in the platform frame {axis} [mm]"] = 1e3 * inside[:, i]
+        columns[f"a in the platform frame {axis} [mm]"] = 1e3 * in_platform[:, i]
     return Exhibit(
         "Figure 1",
         "Sketch of the 6-RSS robot, and of one leg",

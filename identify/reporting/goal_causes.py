@@ -1,7 +1,7 @@
 """Likeliest cause of each missed goal of a run, and the command to type next.
 
-Both follow from the figures of the run alone. For each goal there is a list of rules, and the first
-rule that finds its cause is used.
+Both follow from `result.json` alone. Each goal has a list of rules, and the first rule that finds a
+cause is used.
 """
 
 import math
@@ -19,11 +19,12 @@ from identify.reporting.goals import Goal, explanation_goals, far_off, unseen
 from identify.reporting.number_format import number
 
 STDS = 3.0  # number of stated standard deviations within which an error counts as stated
-# Largest share of the true error at which measured poses count as agreeing with the model.
+# Ratio of the model's error against the measured poses to that against the true poses, below which
+# the measured poses count as agreeing with the model.
 AGREES = 0.5
-# Share of an estimate's variance from which on it rests mainly on the initial guess.
+# Fraction of a variance due to the initial guess, from which on an estimate rests on the guess.
 MOSTLY_GUESS = 0.5
-ALIKE = 0.99  # correlation from which on two parameters act almost alike
+ALIKE = 0.99  # absolute correlation from which on two parameters act almost alike
 # Beginning of the reason why a search stopped before it had converged.
 STOPPED = "stopped after max_iterations"
 
@@ -50,7 +51,7 @@ class _Run:
 
     @property
     def part(self) -> slice:
-        """Part of a pose that the goal is about: its position or its orientation."""
+        """Slice of the position in a pose for a goal in µm, otherwise of the orientation."""
         return slice(3) if self.goal.unit == "µm" else slice(3, 6)
 
     @property
@@ -79,7 +80,7 @@ def advice(goal: Goal, result: dict[str, Any], folder: Path | str) -> Advice:
 def advices(
     missed: Sequence[Goal], result: dict[str, Any], folder: Path | str
 ) -> list[tuple[Advice, list[str]]]:
-    """Return each different advice for missed goals, with the names of its goals."""
+    """Return each different advice for missed goals, with the names of these goals."""
     found: dict[Advice, list[str]] = {}
     for goal in missed:
         found.setdefault(advice(goal, result, folder), []).append(goal.name)
@@ -130,7 +131,7 @@ def _unsure_drive(run: _Run) -> Advice | None:
 
 
 def _known_cause(run: _Run) -> Advice | None:
-    """Return the first finding of the diagnosis of the run."""
+    """Find the first cause of the run's diagnosis, or that no known cause explains the misfit."""
     diagnosis = run.result.get("diagnosis")
     if run.explained or not diagnosis:
         return None
@@ -141,14 +142,14 @@ def _known_cause(run: _Run) -> Advice | None:
             f"cmmsim diagnose {run.folder} --add my_module:my_cause",
         )
     first = diagnosis["findings"][0]
-    share = f"{100 * first['share']:.3g} % of the misfit"
+    much = f"{100 * first['share']:.3g} % of the misfit"
     remedy = first["remedies"][0]
-    # Several settings, or one of two, are for the reader to choose.
+    # A remedy of several settings, or with a choice of two, is left to the reader.
     if remedy.startswith("--set ") and " or " not in remedy and remedy.count("--set ") == 1:
         return Advice(
-            f"{first['name']} explains {share}.", f"cmmsim identify --out {run.folder} {remedy}"
+            f"{first['name']} explains {much}.", f"cmmsim identify --out {run.folder} {remedy}"
         )
-    return Advice(f"{first['name']} explains {share}: {remedy}.", f"cmmsim diagnose {run.folder}")
+    return Advice(f"{first['name']} explains {much}: {remedy}.", f"cmmsim diagnose {run.folder}")
 
 
 def _model_or_cameras(run: _Run) -> Advice | None:
@@ -186,7 +187,7 @@ def _unstable(run: _Run) -> Advice | None:
 
 
 def _in_common(run: _Run) -> Advice | None:
-    """Find an error that all measured poses share: the model follows them, and not the robot."""
+    """Find an error of all measured poses, if the model follows these poses and not the robot."""
     true = np.array([rms_row(one["true"])[run.part] for one in run.result["validation"]])
     worst = np.unravel_index(int(np.argmax(true)), true.shape)
     measured = rms_row(run.result["validation"][worst[0]].get("measured"))[run.part][worst[1]]
@@ -270,8 +271,8 @@ def _unstated_error(run: _Run) -> Advice:
 def _lost(run: _Run) -> Advice:
     sensor = run.result["sensor"]
     why = sensor.get("lost_because")
-    share = number(100 * sensor["lost_frames"] / sensor["frames"], 2)
-    said = f"In {share} % of the frames the cameras did not find the platform"
+    percent = number(100 * sensor["lost_frames"] / sensor["frames"], 2)
+    said = f"In {percent} % of the frames the cameras did not find the platform"
     return Advice(f"{said}{f': {why}' if why else ''}.", f"cmmsim replay {run.folder}")
 
 
@@ -279,7 +280,7 @@ _OF_THE_MODEL = (_moved_cameras, _unfinished_search, _unsure_drive, _known_cause
 _OF_CAMERAS = (_moved_cameras, _noise, _unstated_error)
 _OF_PREDICTIONS = (*_OF_THE_MODEL, _held_gains, _unstable, _in_common, _stated, _intervals_fail)
 
-# Rules of each goal, in the order in which they are asked. The last one always finds a cause.
+# Rules of each goal, in the order in which they are tried. The final one always finds a cause.
 _RULES: dict[str, tuple[Callable[[_Run], Advice | None], ...]] = {
     goals.RESIDUALS: _OF_THE_MODEL,
     goals.CHANCE: _OF_THE_MODEL,

@@ -17,18 +17,18 @@ from identify.files.run_folder import predicted_row, rms_row
 from identify.loop_parameters import is_gain
 from identify.record.stored_common_errors import kind_of
 
-# Limits of the goals: RMS in µm and µrad, a share of the truth, and standard deviations.
+# Limits of the goals: RMS in µm and µrad, a fraction of the truth, and standard deviations.
 VALIDATION_UM = 2.0
 VALIDATION_URAD = 10.0
 SENSOR_UM = 20.0
 SENSOR_URAD = 100.0
 PARAMETER_FRACTION = 0.05
 PARAMETER_STDS = 3.0
-# Number of standard deviations of a declared error that do not count as a missed goal.
+# Number of standard deviations up to which a declared error does not count as a missed goal.
 DECLARED_STDS = 3.0
 # Kinds of common errors that the cameras declare, beside those of teaching.
 OF_CAMERAS = ("rig", "exposure")
-TEACHING = "teaching"  # kind of the errors of teaching, which are there in each run and small
+TEACHING = "teaching"  # kind of the errors of teaching, which every run has, and which are small
 
 COMMON_ERRORS = "the estimated errors that all frames share"
 
@@ -47,7 +47,7 @@ class Goal:
     """Goal of a run: a value that must keep a limit, both in ``unit``.
 
     ``relation`` is ``<=`` or ``>=``. ``detail`` explains the value in words that follow the name of
-    the goal. ``widened`` says what the limit is if it is not the usual one.
+    the goal. ``widened`` says what the limit is if it is not the usual one, and otherwise is empty.
     """
 
     name: str
@@ -103,8 +103,8 @@ class Unseen:
 
     rows (n, 6): RMS of each run, µm and µrad. predicted (n, 6): their stated standard deviations.
     estimated: words for the declared errors beyond teaching, such as those of cameras or of centres
-    of mass, or empty. If there are any, the errors are those of the poses that the model predicts
-    together with the estimates of these errors.
+    of mass. If they are not empty, `rows` are the errors of the poses that the model predicts
+    together with the estimates of these declared errors.
     """
 
     rows: Array
@@ -122,8 +122,8 @@ def unseen(result: dict[str, Any]) -> Unseen:
     runs = result.get("validation", [])
     declared = {kind_of(name) for name in result["identification"].get("nuisance_prior_std", {})}
     predicts = all("position_rms_um" in run.get("predicted", {}) for run in runs)
-    # The model alone lacks these errors: that of a camera shifts the robot by the servo, and a
-    # centre of mass changes the torques.
+    # The model alone lacks the other declared errors, which move the robot: the servo follows an
+    # error of the cameras, and an error of a centre of mass changes the torques.
     declared -= {TEACHING}
     estimated = ""
     if predicts and declared:
@@ -178,7 +178,7 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
 def _within(
     name: str, value: float, limit: float, declared: Array, unit: str, text: str, what: str
 ) -> Goal:
-    """Return a goal whose limit is the largest declared error if that is beyond its own limit.
+    """Return a goal whose limit is raised to the largest declared error, if that is larger.
 
     declared: three standard deviations of declared errors. what: words for these errors.
     """
@@ -204,7 +204,7 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
 
 
 def far_off(parameters: Mapping[str, dict[str, Any]]) -> list[str]:
-    """Return the names of frictions and gains that are off the truth by more than they may."""
+    """Return the names of frictions and gains that are not `within_tolerance` of the truth."""
     # A small friction may be off by more than 5 %, if that is within its stated uncertainty.
     return [name for name, p in _judged(parameters).items() if not within_tolerance(p)]
 
@@ -224,7 +224,7 @@ def is_friction_or_pid(name: str) -> bool:
 
 
 def within_tolerance(parameter: dict[str, Any]) -> bool:
-    """Tell whether an estimate is within 5 % of the truth or within 3 standard deviations of it."""
+    """Tell whether an estimate is known, and within 5 % or 3 standard deviations of the truth."""
     if parameter["estimate"] is None or parameter["true"] is None:
         return False
     error = abs(parameter["estimate"] - parameter["true"])

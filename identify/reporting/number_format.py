@@ -7,14 +7,14 @@ written as zero.
 import math
 import re
 
-ROUNDING = 1e-9  # a sum that is smaller than this share of its terms counts as a rounding error
-LONG = 6  # numbers from this power of ten on are written with a power of ten
+ROUNDING = 1e-9  # ratio of a sum to its terms, up to which the sum counts as a rounding error
+LONG = 6  # exponent of ten from which on numbers are written with a power of ten
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Format a number with the given number of significant digits, or "-" if there is none."""
+    """Format a number with so many significant digits. None, NaN and infinity are "-"."""
     if value is None or not math.isfinite(value):
         return "-"
     mantissa, exponent, power = f"{value:.{digits}g}".partition("e")
@@ -26,14 +26,17 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def with_deviation(value: float, std: float | None) -> str:
-    """Format a value to the second digit of its standard deviation, such as "0.1046 ± 0.0011"."""
+    """Format a value to the second digit of its standard deviation, such as "0.1046 ± 0.0011".
+
+    Without a positive and finite standard deviation, the value stands alone with four digits.
+    """
     if std is None or not math.isfinite(std) or std <= 0:
         return number(value)
     return _to_the_second_digit((value, std), std, " ± ")
 
 
 def interval(low: float, high: float) -> str:
-    """Format both ends of an interval to the second digit of its width."""
+    """Format both ends of an interval to the second digit of its width, if that is not zero."""
     width = high - low
     if not math.isfinite(width) or width <= 0:
         return f"{number(low)} to {number(high)}"
@@ -62,9 +65,7 @@ def typographic(text: str) -> str:
 
 
 def rounded(value: float | None, size: float) -> float | None:
-    """Return the value, or zero if it is only a rounding error compared with the size of
-    its terms.
-    """
+    """Return a value, or zero if it is only a rounding error of terms of the given size."""
     return 0.0 if value is not None and abs(value) <= ROUNDING * size else value
 
 

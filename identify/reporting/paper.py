@@ -1,8 +1,8 @@
 """Numbers from the paper whose experiment this project repeats.
 
-Reports state them only for runs that repeat the settings of the paper. Each row is the RMS of x, y,
-z [µm] and alpha, beta, gamma [µrad]. The paper compares an identified model with measurements of a
-real robot, whose truth was not known.
+Reports state them only for runs that repeat the settings of the paper. A row of RMS errors has x,
+y, z [µm] and alpha, beta, gamma [µrad]. The paper compares an identified model with measurements of
+a real robot, whose truth was not known.
 """
 
 from identify.reporting.settings import BUILT_IN_PAPER, changed_settings
@@ -43,7 +43,7 @@ FREE = ("renderer", "description", "sensor_note")
 
 
 def repeats_the_paper(recorded: str) -> bool:
-    """Tell whether a record was made with the paper's robot and settings.
+    """Tell whether a record was made with the settings of the paper, except those in `FREE`.
 
     ``recorded`` is the scenario of the record (TOML).
     """

@@ -21,8 +21,8 @@ Entry = dict[str, Any]
 def parameter_table(result: dict[str, Any]) -> Table:
     """Return the table of the identified parameters.
 
-    The columns are the initial guess, the truth if it is known, and the estimate with its standard
-    deviation and interval.
+    The columns are the unit, the initial guess, the truth, the estimate with its standard
+    deviation, the interval, the error, and a remark. A column without any entry is left out.
     """
     identification = result["identification"]
     rows = [
@@ -66,23 +66,23 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     The sentence is a warning if the intended anchor does not fix the factor.
     """
     anchor = identification["scale_anchor"]
-    said = ANCHORS.get(anchor, anchor)
+    source = ANCHORS.get(anchor, anchor)
     parameters = identification["parameters"]
     name = next((one for one in GAINS if one in parameters), GAINS[0])
     gain = parameters.get(name, {})
-    share = gain.get("prior_share") or 0.0
+    of_guess = gain.get("prior_share") or 0.0
     if not identification.get("drive", {}).get("in_loop", True):
         return "The overall scale is fixed by the commanded torques."
-    if anchor == "prior" or share <= RESTS_ON_PRIOR:
-        return f"The overall scale is fixed by {said}."
+    if anchor == "prior" or of_guess <= RESTS_ON_PRIOR:
+        return f"The overall scale is fixed by {source}."
     return (
-        f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the "
+        f"The overall scale should be fixed by {source}, but is not: {100 * of_guess:.0f} % of the "
         f"variance of {name} comes from the initial guess, and all values in kg, N m or N are "
         "only as good as this guess."
     )
 
 
-# Gain whose variance shows whether the scale is fixed, if joints share gains, or if not.
+# Gain whose variance shows whether the scale is fixed: if joints share their gains, and otherwise.
 GAINS = ("joint_pid.lp", "joint1.lp")
 
 # Descriptions of the scale anchors.
@@ -97,17 +97,18 @@ ANCHORS = {
 def group_table(result: dict[str, Any]) -> Table:
     """Return the table of the base parameters that combine several parameters.
 
-    The columns are the truth, and the estimate with its standard deviation.
+    The columns are the initial guess, the truth, the estimate with its standard deviation, the
+    interval, the error, and a remark. A column without any entry is left out.
     """
     identification = result["identification"]
     rows = []
     for group in identification.get("groups", {}).values():
-        # A sum of one member is a parameter itself, and is in the table of parameters.
+        # A base parameter of one member is a parameter itself, and is in the table of parameters.
         if len(group["coefficients"]) > 1:
-            known = _remark(group) if group["identifiable"] else "not identified"
+            remark = _remark(group) if group["identifiable"] else "not identified"
             shown = _shown(group, _size(group, identification["parameters"]))
             rows.append(
-                (group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known)
+                (group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), remark)
             )
     note = (
         "In the SI unit of the first parameter of each sum. A sum can be identified even if none "
@@ -129,7 +130,7 @@ def group_table(result: dict[str, Any]) -> Table:
 
 
 def correlation_table(result: dict[str, Any]) -> Table:
-    """Return the table of the pairs of identified parameters with the strongest correlations."""
+    """Return the table of the strongest correlations of two identified parameters."""
     pairs = result["identification"].get("strongest_correlations", [])
     rows = tuple(
         (f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}".replace("-", "−"))
@@ -158,7 +159,7 @@ DRIVES = {
 def drive_sentence(identification: Mapping[str, Any]) -> str:
     """Return the sentence that states the law of the drives, and how it is known.
 
-    The text is empty if the scenario states the usual law, a PID.
+    The text is empty if the scenario states the usual law, a PID, or the result names no law.
     """
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):
@@ -204,7 +205,7 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     alone = {name for weights in coefficients for name in weights if len(weights) == 1}
     summed = {name for weights in coefficients for name in weights if len(weights) > 1}
     unknown = [name for name, p in parameters.items() if not p["identifiable"]]
-    # If the model does not explain the record, no parameter is identified.
+    # If no parameter is identified, it is assumed that the model does not explain the record.
     if unknown and len(unknown) == len(parameters):
         return [("the model does not explain the record, and no estimate can be trusted", unknown)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
@@ -234,9 +235,9 @@ def _remark(entry: Entry) -> str:
 
 
 def _shown(entry: Entry, size: float) -> tuple[str, ...]:
-    """Format initial guess, truth, estimate, interval and error of an entry.
+    """Format initial guess, truth, estimate, interval and error in per cent of an entry.
 
-    The last three are dashes if the entry is not identified, so that nobody quotes them. ``size``
+    The final three are dashes if the entry is not identified, so that nobody quotes them. ``size``
     is the size of the terms of the entry; rounding errors relative to it are shown as zero.
     """
     start = number(rounded(entry["initial"], size))
@@ -250,7 +251,7 @@ def _shown(entry: Entry, size: float) -> tuple[str, ...]:
 
 
 def _deviations(group: Entry) -> str:
-    """Format the error in units of the standard deviation."""
+    """Format the error in standard deviations, as a dash if one of both is unknown."""
     true = group["true"]
     estimate = group["estimate"]
     std = group["std"]

@@ -109,7 +109,7 @@ def _of_the_diagnosis(result: dict[str, Any]) -> dict[str, Picture]:
 
 
 def _errors(data: RunData) -> Picture:
-    """Show the errors of both models against the truth or, if it is unknown, the measurement."""
+    """Show the errors of both models on the first validation run or, without one, on the record."""
     shown = data.validation_fit
     if shown is None:
         text = (
@@ -127,7 +127,7 @@ def _errors(data: RunData) -> Picture:
 
 
 def _of_the_scene(data: RunData) -> dict[str, Picture]:
-    """Show robot, cameras and camera images, or nothing if the robot's file is missing."""
+    """Show robot, cameras and camera images, as far as they can be drawn."""
     cell = data.scene
     view = data.stereo_view
     if isinstance(cell, str):
@@ -162,7 +162,7 @@ def _of_the_sensor(data: RunData) -> dict[str, Picture]:
     covariances = data.experiment["measured_covariance"].values
     covariances = covariances + shared @ np.swapaxes(shared, 1, 2)
     errors = None if data.truth is None else true_poses(data.truth) - measured
-    # The reference has no noise, and shows which components move.
+    # The reference, if there is one, shows without noise which components move.
     shown = moving(intended_motion(data.experiment))
     text = (
         "Uncertainty of single measured poses: ellipses that contain 95 % of true poses according "

@@ -47,7 +47,7 @@ def write_report(
     """Write the report and the figures of a run folder, and return the path of the report.
 
     The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. Either all or none of
-    them are written. ``further`` returns additional files to write.
+    them are written. After all is drawn, ``further`` returns additional files to write.
 
     Raises OutputFolderError if an earlier stage has not been run. Raises RecordError if a file of
     the run is damaged. Raises WriteError if a file cannot be written.
@@ -135,7 +135,7 @@ def picture_elements(shown: Mapping[str, Picture]) -> dict[str, str]:
 
 
 def image_element(png: bytes) -> str:
-    """Return an <img> element with a PNG image, reduced to the size for a page."""
+    """Return an <img> element with a PNG image, reduced in size and quality for a page."""
     stream = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
         reduced = image.convert("RGB")
@@ -157,9 +157,9 @@ def _sentence(text: str) -> str:
 
 
 def _coloured(element: str) -> str:
-    """Return a figure whose colours are variables of the page.
+    """Return an <svg> element with variables of the page for colours, and without a fixed size.
 
-    Screen readers skip the figure, because the caption describes it.
+    Screen readers skip the element, because the caption describes the figure.
     """
     # CSS variables work in a style, but not in an attribute of SVG.
     text = re.sub(r'\sfill="(#[0-9a-f]{6})"', r' style="fill: \g<1>"', element)

@@ -13,7 +13,7 @@ from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
-CAUSES = 12  # largest number of causes in the table of a diagnosis
+CAUSES = 12  # largest number of causes in the table of a diagnosis, those that explain most
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def sensor_section(data: RunData) -> Section:
 def frames_due(time: Array, rate_hz: float) -> int:
     """Return the number of frames between the first and the last time (N,) of a record, s.
 
-    It is at least N: a clock that differs makes no frame disappear.
+    The number is at least N, even if the frames were faster than ``rate_hz``.
     """
     return max(len(time), round(float(np.ptp(time)) * rate_hz) + 1)
 
@@ -105,7 +105,7 @@ def excitation_section(data: RunData) -> Section:
 
 
 def fit_section(data: RunData) -> Section:
-    """Describe how well the models follow the exciting trajectory, and how the search ended."""
+    """Describe how the search ended, how well the models fit, and the diagnosis if there is one."""
     found = data.result["identification"]
     text = f"{_steps(found)} ended because {typographic(found['stop_reason'])}."
     table = tables.excitation_error_table(data.result, data.repeats_paper)
@@ -197,7 +197,7 @@ SECTIONS: tuple[Callable[[RunData], Section], ...] = (
 
 
 def _steps(found: Mapping[str, Any]) -> str:
-    """State the number of steps and of searches. Each search has its own limit of steps."""
+    """Begin a sentence with the numbers of steps and of searches. Each search has its own limit."""
     steps = found["iterations"]
     searches = len(found.get("searches") or [""])
     counted = f"{steps} step{'s' * (steps != 1)}"
@@ -235,7 +235,7 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
 
 
 def _index_text(data: RunData) -> tuple[str, ...]:
-    """State what the search for an exciting trajectory gained."""
+    """State what the search for an exciting trajectory gained, if there was one."""
     chosen = data.trajectories
     if chosen is None:
         return ()
@@ -273,10 +273,7 @@ def _diagnosis_text(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _diagnosis_table(result: dict[str, Any]) -> Table:
-    """Return the candidates of a diagnosis in their order.
-
-    The table has no rows if there is no diagnosis.
-    """
+    """Return the first candidates of a diagnosis. Without a diagnosis, the table has no rows."""
     entry = result.get("diagnosis") or {"candidates": []}
     rows = tuple(
         (

@@ -61,12 +61,12 @@ class RunData:
 
     @property
     def robot(self) -> str:
-        """Name of the robot."""
+        """Name of the robot, or words for an unknown name."""
         return str(self.experiment.attrs.get("robot", "of an unknown name"))
 
     @property
     def scenario_toml(self) -> str:
-        """Scenario that the record was made with, as TOML."""
+        """Scenario that the record was made with, as TOML. Empty if the record states none."""
         return str(self.experiment.attrs.get("scenario", ""))
 
     @cached_property
@@ -86,7 +86,7 @@ class RunData:
     def cameras_consistent(self) -> bool | None:
         """True if the cameras cannot be the cause of the model's residuals.
 
-        None if the truth is not known.
+        None if this is unknown, see `identify.reporting.verdict.cameras_consistent`.
         """
         return cameras_consistent(self.experiment, self.truth)
 
@@ -94,7 +94,7 @@ class RunData:
     def scene(self) -> Workcell | str:
         """Robot and cameras as placed by the scenario, or the reason why they cannot be drawn.
 
-        A missing file is such a reason. For a record of a real robot, only the robot is shown.
+        A missing file is such a reason. For a record without truth, there are no cameras.
         """
         try:
             robot = load_robot(self.scenario.robot)
@@ -123,14 +123,14 @@ class RunData:
     def middle(self) -> Array:
         """Pose (6,) of the platform half way through the record, in m and rad.
 
-        It is the true pose if that is known, and the reference otherwise.
+        The true pose is used if known, otherwise the reference, or without one the measured pose.
         """
         motion = intended_motion(self.experiment) if self.truth is None else true_poses(self.truth)
         return motion[len(motion) // 2]
 
     @cached_property
     def excitation_fit(self) -> Fit:
-        """Measurement and models on the exciting trajectory."""
+        """Measurement with its noise, models and, if known, truth on the exciting trajectory."""
         covariances = self.experiment["measured_covariance"].values
         # One number per component: the root of the mean variance over the measured frames.
         noise = np.sqrt(np.nanmean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
@@ -139,10 +139,7 @@ class RunData:
 
     @cached_property
     def validation_fit(self) -> Fit | None:
-        """Measurement, models and truth on the first validation trajectory.
-
-        None if there is none.
-        """
+        """Measurement, models and truth on the first validation trajectory, or None without one."""
         if not self.validation or self.validation_truth is None:
             return None
         fit = _fit(self.validation[0], self.models[run_name(1)])
@@ -207,7 +204,10 @@ def read_run(run: RunFolder) -> RunData:
 
 
 def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[str, Any]:
-    """Read the result of a run, and check that it was made from the present files."""
+    """Read the result of a run, and check that it was made from the present files.
+
+    Raises RecordError if it was not, lacks entries, or has an estimate outside its interval.
+    """
     result = load_result(run.result)
     check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
     later = ["validation.nc"] if simulated else []

@@ -21,7 +21,7 @@ SENSOR_KINDS = ("rig", "exposure", "teaching")
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
-    """Add the true values of parameters and of their groups to an identification entry."""
+    """Add the true values of parameters and of their groups to an identification entry in place."""
     entries = identification["parameters"]
     known = dict(zip(entries, true_values(truth, entries), strict=True))
     for name, value in known.items():
@@ -34,8 +34,8 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
 def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:
     """Return one column of an identification entry as a robot's parameters (p,).
 
-    ``column`` is a column of the entry, such as "initial" or "estimate". Raises RecordError if a
-    parameter is missing, is not a number, or has a value that no model can have.
+    ``column`` is "initial", "estimate" or another one. Raises RecordError if a parameter is
+    missing, is not a number, or has a value that no model can have.
     """
     values = parameter_column(identification, column, robot.layout.names)
     try:
@@ -63,7 +63,7 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
 
     The entry also has the speed of rendering and measuring in one process, the noise that the
     sensor states, the standard deviation of the errors that all its poses have in common, and why
-    the first frame was lost.
+    the first lost frame was lost.
     """
     errors = np.vstack(
         [recording.poses(record, "measured") - true_poses(truth) for record, truth in runs]
@@ -86,9 +86,9 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
 
 
 def common_modes(record: xr.Dataset) -> Array:
-    """Return the shifts (N, 6, k) of the poses by the sensor's errors that all of them share.
+    """Return the shifts (N, 6, k) of the poses [m, rad] by k errors that all of them share.
 
-    Each shift is by one standard deviation. The k numbers are independent.
+    Each shift is by one standard deviation. The k errors of the sensor are independent.
     """
     errors = read_common_errors(record, SENSOR_KINDS)
     if not errors.names:

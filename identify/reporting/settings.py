@@ -26,11 +26,11 @@ class Setting(NamedTuple):
 def changed_settings(
     recorded: str, estimator: Mapping[str, Any] | None = None
 ) -> tuple[str, list[Setting]]:
-    """Return the built-in scenario with which a recorded one is compared, and the differences.
+    """Return the name of the built-in scenario for a comparison, and the settings that differ.
 
-    recorded   The scenario of the record, as TOML.
+    recorded   Scenario of the record, as TOML.
     estimator  Settings of the identification by dotted key. A user can change them after the record
-               was made.
+               was made, so that they replace those of the record.
     """
     ours = _settings(recorded)
     name = ours["name"].value if "name" in ours else ""

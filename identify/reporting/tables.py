@@ -1,7 +1,6 @@
 """Tables of a run, and the summaries on the terminal.
 
-For a run that repeats the experiment of the paper, the figures of the paper are given for
-comparison.
+For a run that repeats the experiment of the paper, the paper's numbers are given for comparison.
 """
 
 import math
@@ -41,7 +40,7 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Marks of the columns that hold words instead of numbers."""
+        """True for each column that holds words instead of numbers, and for the first column."""
         # Signs and dashes are typographic, as written by `number`.
         numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
         columns = zip(*self.rows, strict=True)
@@ -119,8 +118,8 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
 def common_error_table(result: dict[str, Any]) -> Table:
     """Return the errors that all poses of the record have in common.
 
-    Each row has the prior standard deviation, and the estimate from the record with its standard
-    deviation.
+    Each row has the prior standard deviation, and the estimate with its standard deviation. There
+    are no rows if the record declares no such errors.
     """
     found = result["identification"]
     rows = tuple(
@@ -153,15 +152,15 @@ KINDS = {
 
 
 def _shares(found: dict[str, Any]) -> str:
-    """Return a text with each kind of common error's largest share in a parameter's variance."""
+    """State which fraction of a parameter's variance each kind of common error causes at most."""
     identified = [
         one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
     ]
-    # Older results have no shares, or one number for all kinds.
-    shares = [one for one in identified if isinstance(one, dict)]
-    largest = {kind: max(one[kind] for one in shares) for kind in (shares[0] if shares else ())}
+    # Older results have no fractions, or one number for all kinds.
+    parts = [one for one in identified if isinstance(one, dict)]
+    largest = {kind: max(one[kind] for one in parts) for kind in (parts[0] if parts else ())}
     said = ", ".join(
-        f"{KINDS.get(kind, kind)} {number(100.0 * share, 2)} %" for kind, share in largest.items()
+        f"{KINDS.get(kind, kind)} {number(100.0 * most, 2)} %" for kind, most in largest.items()
     )
     return f" Largest share of the variance of an identified parameter: {said}." if said else ""
 
@@ -169,8 +168,8 @@ def _shares(found: dict[str, Any]) -> str:
 def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the model with the measurement on the exciting trajectory.
 
-    The columns are the errors before and after the identification. For a run that repeats the
-    experiment of the paper, the paper's table 3 is given beside them.
+    The columns are the RMS before and after the identification. With ``repeats_paper``, those of
+    the paper's table 3 follow.
     """
     before = _rms(rms_row(result.get("before")))
     after = _rms(rms_row(result.get("after")))
@@ -190,7 +189,7 @@ def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) 
 def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the models with measurement and truth on the validation trajectories.
 
-    For a run that repeats the experiment of the paper, the paper's table 4 follows.
+    With ``repeats_paper``, the rows of the paper's table 4 follow.
     """
     rows: list[tuple[str, ...]] = []
     validation = result.get("validation", [])
@@ -220,16 +219,16 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
 def prediction_table(result: dict[str, Any]) -> Table:
     """Compare the predicted with the actual deviation of the true robot from the predicted poses.
 
-    There are two rows for each validation trajectory.
+    Each validation trajectory has a row for either.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         predicted = run.get("predicted", {})
         rows.append((f"{n}: predicted", *map(number, predicted_row(run)), ""))
         # Without a prediction, the deviation is that from the identified model.
-        found = rms_row(predicted if "position_rms_um" in predicted else run["true"])
+        actual = rms_row(predicted if "position_rms_um" in predicted else run["true"])
         rows.append(
-            (f"{n}: found", *_rms(found), number(predicted.get("normalised_squared_error")))
+            (f"{n}: found", *_rms(actual), number(predicted.get("normalised_squared_error")))
         )
     return Table(
         "Predicted and actual distance of the true robot from the predicted poses, RMS",
@@ -293,7 +292,7 @@ def _rms(values: list[float]) -> list[str]:
 def sums_of(identification: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the base parameters that combine several parameters.
 
-    A base parameter of one member is a parameter itself, and counts as one.
+    A base parameter of one member is a parameter itself, and is left out.
     """
     groups = identification.get("groups", {}).values()
     return [group for group in groups if len(group["coefficients"]) > 1]
@@ -306,14 +305,14 @@ def identified_counts(identification: Mapping[str, Any]) -> str:
         "sums of parameters": sums_of(identification),
     }
     return ", and ".join(
-        f"{sum(bool(one['identifiable']) for one in found)} of {len(found)} {words}"
-        for words, found in kinds.items()
-        if found
+        f"{sum(bool(one['identifiable']) for one in entries)} of {len(entries)} {words}"
+        for words, entries in kinds.items()
+        if entries
     )
 
 
 def common_scale_sentence(identification: Mapping[str, Any]) -> str:
-    """Return the sentence that states how well the common scale is known, or an empty string."""
+    """Return the sentence on how well the common scale is known, or "" without an entry of it."""
     scale = identification.get(ENTRY)
     if scale is None:
         return ""
@@ -337,7 +336,8 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
     """Print a summary of the identification.
 
     The summary states what is identified, how well the model explains the record, the time, and the
-    path of the result.
+    path of the result. It names the cause and the next command if the model does not explain the
+    record.
     """
     counts = identified_counts(result["identification"])
     typer.echo(f"identified: {counts}, in {number(result['seconds'].get('identify'))} s")
@@ -360,7 +360,7 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """Print the goals of a run with their values, and the path of the report.
+    """Print the goals of a run with their values, the common scale, and the path of the report.
 
     Missed goals follow with their likeliest causes and the command to type next.
     """

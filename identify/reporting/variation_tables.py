@@ -1,6 +1,6 @@
 """Variation of the estimates over several runs, compared with table 5 of the paper.
 
-The functions return a table, a figure and the entry of `variation.json`.
+The functions return a table, a figure and the content of `variation.json`.
 """
 
 from typing import Any
@@ -41,7 +41,7 @@ PAPER_PERCENT = {
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
-    """Return the entry of `variation.json`. ``trajectories`` names the kind of runs."""
+    """Return the content of `variation.json`. ``trajectories`` names the kind of the runs."""
     name, worst = found.worst
     return {
         "trajectories": trajectories,
@@ -67,8 +67,8 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
 def variation_table(found: Variation) -> Table:
     """Return the table of the parameters that every run identifies.
 
-    The columns are the mean, the variation, the variation expected from the intervals, and the
-    variation in the paper.
+    The columns are the unit, the mean, the variation, the variation expected from the standard
+    deviations that the runs state, and the variation in the paper.
     """
     rows = tuple(
         (
@@ -99,22 +99,22 @@ def variation_figure(found: Variation) -> Figure:
     shown = np.flatnonzero(found.identified)
     figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
     axes = figure.subplots()
-    places = np.arange(len(shown))
-    axes.barh(places, 100 * found.variation[shown], color="tab:blue", label="variation")
+    rows = np.arange(len(shown))
+    axes.barh(rows, 100 * found.variation[shown], color="tab:blue", label="variation")
     axes.plot(
         100 * found.expected[shown],
-        places,
+        rows,
         "kd",
         markersize=5,
         markerfacecolor="none",
         label="expected",
     )
     paper = [PAPER_PERCENT.get(found.names[k], np.nan) for k in shown]
-    axes.plot(paper, places, "x", color="tab:red", label="robot of the paper")
+    axes.plot(paper, rows, "x", color="tab:red", label="robot of the paper")
     axes.axvline(
         GOAL_PERCENT, color="black", linestyle="--", linewidth=1, label=f"goal {GOAL_PERCENT:g} %"
     )
-    axes.set_yticks(places, [found.names[k] for k in shown], fontsize="small")
+    axes.set_yticks(rows, [found.names[k] for k in shown], fontsize="small")
     axes.invert_yaxis()
     # Variations range from less than a tenth of a per cent to some ten per cent.
     axes.set_xscale("log")

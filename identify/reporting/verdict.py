@@ -55,8 +55,8 @@ class Verdict:
 def cameras_consistent(record: xr.Dataset, truth: xr.Dataset | None) -> bool | None:
     """Tell whether the errors of the cameras are consistent with what the cameras state.
 
-    They state their noise, and errors that all frames share. None if the truth is not known, or if
-    the record is too short to judge.
+    The cameras state their noise, and errors that all frames share. Returns None if the truth is
+    not known, or if the record is too short to judge.
     """
     if truth is None:
         return None
@@ -80,8 +80,8 @@ def cameras_consistent(record: xr.Dataset, truth: xr.Dataset | None) -> bool | N
 def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     """Return the verdict on a result.
 
-    ``consistent`` is the result of `cameras_consistent`: true if the cameras cannot be the cause of
-    the residuals.
+    ``consistent`` is the result of `cameras_consistent`: True if the cameras cannot be the cause of
+    the residuals, None if this is unknown.
     """
     judged = check_goals(result)
     unseen = bool(result.get("validation"))
@@ -89,7 +89,7 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, consistent)]
     if unseen:
-        # A model that does not explain its record is wrong, so that this is stated first.
+        # That a model does not explain its record is stated first, because it then is wrong.
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [
         f"Not met: {sentence(goal)}"
@@ -128,7 +128,11 @@ def sentence(goal: goals.Goal) -> str:
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
-    """Return three numbers for the summary."""
+    """Return the number of identified parameters, after two RMS errors of the worst axis.
+
+    With validation runs, these are the errors of model and measured poses against the truth,
+    otherwise those of both models against the measured poses.
+    """
     identification = result["identification"]
     parameters = identification["parameters"]
     validation = result.get("validation")
@@ -186,16 +190,14 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
 
 
 def _distance(rows: Array, turns: bool) -> str:
-    """Format the largest of errors (n, 6) [µm, µrad], without angles if the platform does
-    not rotate.
-    """
+    """Format the largest of errors (n, 6) [µm, µrad]. Angles are left out unless it ``turns``."""
     position = float(rows[:, :3].max())
     orientation = float(rows[:, 3:].max())
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
 def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool | None) -> str:
-    """State whether the residuals are only noise and, if not, the possible cause."""
+    """State whether the residuals are only noise and, if not, their possible cause."""
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
@@ -220,7 +222,7 @@ def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool
 def _drift_warning(result: dict[str, Any]) -> str | None:
     """Return the warning of the run's drift watch.
 
-    None if the calibration of the cameras was still valid, or if there was no drift watch.
+    Returns None if the cameras kept their calibration, or if there was no drift watch.
     """
     return (result.get("drift_watch") or {}).get("warning")
 

@@ -7,14 +7,14 @@ from matplotlib.figure import Figure
 
 from identify.reporting.figures.style import BLUE, GREY, LINE, RED, WIDTH
 
-SHOWN = 10  # number of candidates that are drawn
+SHOWN = 10  # largest number of candidates that are drawn
 
 
 def diagnosis_figure(entry: dict[str, Any]) -> Figure:
-    """Draw an entry of a diagnosis.
+    """Draw the diagnosis in a result.
 
     The left panel shows the share of the misfit that each candidate alone explains. The right
-    panel shows the remaining misfit, as one finding after the other is fitted.
+    panel shows the misfit that remains as one finding after the other is fitted.
     """
     shown = entry["candidates"][:SHOWN]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.2 * max(len(shown), 4)), layout="constrained")

@@ -30,10 +30,10 @@ class RelativeErrors(NamedTuple):
 
 
 def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
-    """Return the relative errors of the identifiable parameters of a result.
+    """Return the relative errors of the identified parameters of a result.
 
     Without an interval, the distances to its ends are zero. If the truth is not known, values are
-    in per cent of the estimate, and the error is zero.
+    in per cent of the estimate, and the error is zero. Parameters that are zero are left out.
     """
     shown = {
         n: p
@@ -105,11 +105,11 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
 def group_figure(
     groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, dict[str, Any]]
 ) -> Figure:
-    """Draw the parameters of each base parameter, with their shares.
+    """Draw which parameters each base parameter combines.
 
-    A row is a base parameter that combines several parameters, and a column is a parameter. The
-    area of a dot is the parameter's share of the sum: coefficient times initial guess. The dot is
-    open if the parameter is subtracted. A star marks an identified base parameter.
+    A row is a base parameter that combines several parameters, and a column is a parameter. A dot
+    is a term: coefficient times initial guess. Its area is the fraction of the sum of all absolute
+    terms, and it is open if the term is negative. A star marks an identified base parameter.
     """
     sums = {name: group for name, group in groups.items() if len(group["coefficients"]) > 1}
     columns = [
@@ -122,10 +122,10 @@ def group_figure(
             for n, weight in group["coefficients"].items()
         }
         total = sum(abs(part) for part in parts.values()) or 1.0
-        # The share is signed; the dot is filled or open accordingly.
+        # The sign of the fraction decides whether the dot is filled or open.
         for name, part in parts.items():
             shares[row, columns.index(name)] = part / total
-    # Parameters with an initial guess of zero have no share in any sum.
+    # Parameters with an initial guess of zero would have no dot.
     used = [k for k in range(len(columns)) if shares[:, k].any()]
     labels = [
         f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}"
@@ -146,7 +146,7 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     """Draw the correlations (n, n) of the estimates.
 
     The area of a dot is the size of a correlation. The dot is open if the correlation is negative.
-    If nothing is identified, the figure has a line of text instead.
+    Without parameters, the figure has a line of text instead.
     """
     side = min(WIDTH, max(4.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
@@ -155,7 +155,7 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
         axes.set_axis_off()
         axes.set_title("No parameter is identified: no correlations")
         return figure
-    # The matrix is symmetric with ones on the diagonal: its lower triangle is sufficient.
+    # The matrix is symmetric with ones on the diagonal, so that its lower triangle is sufficient.
     dot_matrix(axes, np.tril(correlations, -1), names, names)
     _key(axes, (1.0, 0.5, 0.1), "correlation", "negative")
     return figure
@@ -172,8 +172,8 @@ def dot_matrix(axes: Axes, values: Array, rows: Sequence[str], columns: Sequence
     axes.set_ylim(len(rows) - 0.3, -0.7)
     axes.tick_params(length=0)
     for seen, sign in ((values > SMALLEST, 1.0), (values < -SMALLEST, -1.0)):
-        places = np.argwhere(seen)
-        axes.scatter(places[:, 1], places[:, 0], **_dots(sign * values[seen], sign), zorder=3)
+        cells = np.argwhere(seen)
+        axes.scatter(cells[:, 1], cells[:, 0], **_dots(sign * values[seen], sign), zorder=3)
 
 
 SMALLEST = 0.004  # size of a value below which its dot would not be visible
@@ -205,16 +205,16 @@ def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> Non
     )
 
 
-# Hatches of the sources of a budget, which differ also without colour.
+# Hatches of the sources of a budget. The next one begins when all colours have been used.
 HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
 
 
 def budget_figure(budget: Budget, identified: Mapping[str, bool]) -> Figure:
-    """Draw the share of each source in the variance of poses, predictions and parameters.
+    """Draw the fraction of each source in the variance of poses, predictions and parameters.
 
-    Quantities are rows: poses and predictions, and the parameters that are ``identified``, those
-    with the largest share of the main source first. The number beside a row is the combined
-    standard uncertainty. Shares that are negative, by correlations, are left out.
+    The rows are poses and predictions, and the ``identified`` parameters, sorted by the fraction of
+    the source with the largest mean fraction. The number beside a row is the combined standard
+    uncertainty. Fractions that are negative, because of correlations, are left out.
     """
     names = budget.quantities
     shown = [k for k, name in enumerate(names) if budget.std[k] > 0 and identified.get(name, True)]

@@ -43,7 +43,7 @@ BAND = 2.0
 
 BAND_NAME = f"predicted ± {BAND:g} standard deviations"
 
-# Number of measured poses that are drawn. The errors below them are drawn for every frame.
+# Smallest number of measured poses to draw of a longer run. The errors below have every frame.
 MARKS = 40
 
 
@@ -81,7 +81,7 @@ class Fit:
     measured, identified, initial, truth
         Measured poses, poses of the identified and of the initial model, and true poses.
     std
-        Predicted standard deviation (N, 6) of the truth from the identified model.
+        Predicted standard deviation (N, 6) of the true poses about those of the identified model.
     noise
         Standard deviation (6,) of one measured pose according to the sensor.
     """
@@ -108,7 +108,7 @@ class Fit:
     def error_curves(self, i: int) -> list[Curve]:
         """Return the errors of the identified model in component i, in µm or µrad.
 
-        The errors are relative to the measurement and, if the truth is known, also to the truth.
+        They are the measurement minus the model and, if the truth is known, the truth minus it.
         """
         curves = [
             Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
@@ -120,7 +120,7 @@ class Fit:
         return curves
 
     def pose_range(self, i: int) -> tuple[float, float]:
-        """Return the range of the measurement, extended to show the models.
+        """Return the range of the measurement in mm or mrad, extended to show the models.
 
         The extension is limited to half of the range on either side, because an unstable model
         would otherwise hide everything else.
@@ -147,10 +147,10 @@ class Fit:
         return f"RMS {' → '.join(shown)} {UNITS[i]}"
 
     def distances(self, first: int) -> list[Curve]:
-        """Return the lengths of the errors in position (first = 0) [µm] or orientation (3) [µrad].
+        """Return the norms of the errors in position (first = 0) [µm] or orientation (3) [µrad].
 
-        They are the errors of both models and of the measurement against the truth. If the truth is
-        not known, they are the errors of the models against the measurement.
+        The errors are those of both models and of the measurement against the truth. If the truth
+        is not known, they are those of the models against the measurement.
         """
         if self.truth is None:
             reference = self.measured
@@ -259,11 +259,11 @@ def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
     )
 
 
-HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, which differ without colour
+HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, distinct without colour
 
 
 def validation_figure(result: dict[str, Any]) -> Figure:
-    """Draw the RMS by which the goals of validation are judged, on each validation trajectory.
+    """Draw the RMS by which the goals of validation are judged, for each validation trajectory.
 
     The RMS of the model against the measurement, the prediction and the limits are drawn as well.
     """

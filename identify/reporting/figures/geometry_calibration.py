@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 
 from identify.reporting.figures.style import BLUE, GREY, RED, WIDTH
 
-ROOM = 20.0  # ratio of the upper end of an axis to its highest curve. The space is for the legend.
+ROOM = 20.0  # factor by which the upper end of an axis is raised, to make room for the legend
 
 
 def geometry_figure(entry: Mapping[str, Any]) -> Figure:
     """Draw the content of a geometry.json.
 
-    One panel shows the standard deviation of each geometric parameter and, if the truth is known,
-    its error. If the expected error at validation poses was computed, a second panel shows this
+    A panel shows the standard deviation of each geometric parameter and, if the truth is known, its
+    error. If the expected error at validation poses was computed, a second panel shows this
     error against the number of measured poses, for random and for chosen poses.
     """
     several = "random_poses" in entry
@@ -38,7 +38,7 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
     kinds = list(dict.fromkeys(name.partition(".")[2] for name in parameters))
     legs = list(dict.fromkeys(name.partition(".")[0] for name in parameters))
     # The points of the legs are spread over 0.6 of the width of a column.
-    at = [
+    xs = [
         kinds.index(name.partition(".")[2])
         + 0.6 * (legs.index(name.partition(".")[0]) / len(legs) - 0.4)
         for name in parameters
@@ -47,16 +47,16 @@ def _numbers(axes: Axes, parameters: Mapping[str, Mapping[str, Any]]) -> None:
     # An error of zero cannot be drawn on a logarithmic axis.
     missed = [
         (x, p)
-        for x, p in zip(at, rows, strict=True)
+        for x, p in zip(xs, rows, strict=True)
         if p["true"] is not None and p["estimate"] != p["true"]
     ]
     known = [(x, abs(p["estimate"] - p["true"]) / p["tolerance"]) for x, p in missed]
     axes.plot(
-        at, [p["std"] / p["tolerance"] for p in rows], "o", color=BLUE, label="standard deviation"
+        xs, [p["std"] / p["tolerance"] for p in rows], "o", color=BLUE, label="standard deviation"
     )
     if known:
         axes.plot(*zip(*known, strict=True), "x", color=RED, label="error")
-    # A parameter counts as determined below a third of the tolerance.
+    # A parameter counts as determined if its standard deviation is below a third of the tolerance.
     axes.axhline(1 / 3, color=GREY, linewidth=0.8, linestyle="--")
     axes.annotate(
         "determined below",

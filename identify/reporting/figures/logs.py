@@ -21,7 +21,7 @@ LENGTH, ANGLE = slice(0, 3), slice(3, 6)
 
 
 def interval_figure(pose_time: Array, command_time: Array) -> Figure:
-    """Draw the times between rows of poses (N,) and of commands (M,), s, over the run."""
+    """Draw the intervals between the times of poses (N,) and of commands (M,), s, over the run."""
     figure = Figure(figsize=(WIDTH, 1.9), layout="constrained")
     axes = figure.subplots()
     for time, name, colour, marker in (
@@ -59,7 +59,7 @@ def motion_figure(time: Array, poses: Array, gaps: Array, jumps: Array) -> Figur
 def joint_figure(
     time: Array, coordinates: Array, command_time: Array, command: Array, unit: str
 ) -> Figure:
-    """Draw joint coordinates (K, n) of the poses, and the commands (M, n), over their times."""
+    """Draw joint coordinates (K, n) of the poses, and the commands (M, n), over their times, s."""
     figure, panels = panel_grid(coordinates.shape[1], WIDTH / 3, 1.5, above=0.3, sharex=True)
     for joint, axes in enumerate(panels):
         axes.step(
@@ -79,9 +79,10 @@ def joint_figure(
 
 
 def spectrum_figure(frequency: Array, power: Array, highest_hz: float, noise: Array) -> Figure:
-    """Draw the spectrum (F, 6) of poses, m2/Hz and rad2/Hz, with the level of their noise (6,).
+    """Draw the root of the spectrum (F, 6) of poses, m2/Hz and rad2/Hz, over frequencies (F,), Hz.
 
-    `noise` has the standard deviations, m and rad, of noise that is the same at all frequencies.
+    `noise` (6,) has the standard deviations, m and rad, of white noise, whose level is drawn too.
+    A vertical line marks `highest_hz`, up to which there is motion.
     """
     figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
     panels = figure.subplots(1, 2)

@@ -14,14 +14,14 @@ from identify.scene import StereoView, Viewpoint, Workcell, stereo_figure
 from identify.scene.drawings import FOUND, SIDES, draw_scene, show_image
 
 OVERVIEW = (4.8, 4.9)  # width and height of the overview, in inches
-BENEATH = 0.4  # share of the overview's height for the images
+BENEATH = 0.4  # fraction of the overview's height for the images
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
     """Draw robot, stickers and cameras with the platform at a pose (6,).
 
-    If there is a view, both camera images are drawn below. The figure is higher than wide, to fit
-    on the screen of a phone. Raises dynamics.UnreachablePoseError or dynamics.ChartError if the
+    If there is a view, both camera images are drawn below, and the figure is higher than wide, to
+    fit on the screen of a phone. Raises dynamics.UnreachablePoseError or dynamics.ChartError if the
     robot cannot have the pose.
     """
     width, height = OVERVIEW
@@ -30,7 +30,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
     draw_scene(axes, cell, pose, Viewpoint(), rays=True, labels=True)
     if view is not None:
-        # The images are square, but coordinates are shares of a figure that is not.
+        # The images are square, but the figure, whose fractions are the coordinates, is not.
         side = (beneath - 0.05) * height / width
         for number, name in enumerate(SIDES):
             axes = figure.add_axes(
@@ -45,13 +45,13 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     return figure
 
 
-ARROW = 0.12  # largest length of an arrow, as a share of the image's width
+ARROW = 0.12  # largest length of an arrow, as a fraction of the image's width
 
 
 def residual_figure(view: StereoView) -> Figure:
     """Draw both camera images with the detected ellipses and the errors of their centres.
 
-    The errors are enlarged arrows. A reference arrow is labelled with its length in px.
+    The errors are drawn as enlarged arrows. A reference arrow is labelled with its length in px.
     """
     errors = np.concatenate(
         [(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()]
@@ -70,9 +70,9 @@ def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
     """Draw a reference arrow for a length in px in the lower left corner of an image."""
     left = axes.get_xlim()[0]
     low, high = axes.get_ylim()
-    foot = left + 0.04 * width, low + 0.05 * (high - low)
+    tail = left + 0.04 * width, low + 0.05 * (high - low)
     axes.quiver(
-        *foot,
+        *tail,
         factor * length,
         0.0,
         angles="xy",
@@ -83,7 +83,7 @@ def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
     )
     axes.annotate(
         f"{length:g} px",
-        foot,
+        tail,
         xytext=(0, 4),
         textcoords="offset points",
         color="white",

@@ -30,7 +30,7 @@ from identify.reporting.figures.style import (
     moving,
 )
 
-# Parts of a pose: name, first component, unit of its motion and unit of its errors.
+# Parts of a pose: name, index of the first component, unit of motions and unit of errors.
 PARTS = (("position", 0, "mm", "µm"), ("orientation", 3, "mrad", "µrad"))
 
 
@@ -62,11 +62,11 @@ def path_figure(time: Array, poses: Array) -> Figure:
     move are omitted.
     """
     shown = moving(poses)
-    halves = [
+    parts = [
         ([i for i in shown if first <= i < first + 3], name, unit) for name, first, unit, _ in PARTS
     ]
-    halves = [half for half in halves if half[0]]
-    figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.2))
+    parts = [part for part in parts if part[0]]
+    figure = Figure(figsize=(WIDTH if len(parts) > 1 else WIDTH / 1.6, 3.2))
     figure.subplots_adjust(left=0.02, right=0.94, bottom=0.06, top=0.94, wspace=0.12)
     elapsed = time - time[0]
     # Search slightly before the round time, so that rounding does not select the next frame.
@@ -74,10 +74,10 @@ def path_figure(time: Array, poses: Array) -> Figure:
         elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9
     )
     drawn: list[tuple[Any, Array]] = []
-    for place, (columns, name, unit) in enumerate(halves, start=1):
-        solid = len(columns) == 3
+    for panel, (columns, name, unit) in enumerate(parts, start=1):
+        spatial = len(columns) == 3
         axes: Any = figure.add_subplot(
-            1, len(halves), place, **({"projection": "3d"} if solid else {})
+            1, len(parts), panel, **({"projection": "3d"} if spatial else {})
         )
         path = 1e3 * (poses[:, columns] - poses[0, columns])
         if len(columns) == 1:
@@ -88,9 +88,9 @@ def path_figure(time: Array, poses: Array) -> Figure:
             "xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False
         ):
             getattr(axes, f"set_{axis}label")(label)
-        letter = f"({'ab'[place - 1]}) " if len(halves) > 1 else ""
+        letter = f"({'ab'[panel - 1]}) " if len(parts) > 1 else ""
         axes.set_title(f"{letter}{name} from the start")
-        if solid:
+        if spatial:
             _plain_box(axes)
         else:
             figure.subplots_adjust(left=0.12, bottom=0.16)
@@ -102,7 +102,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
 
 
 def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_]) -> None:
-    """Draw a path (N, 2) or (N, 3) with marks, and its start as a square."""
+    """Draw a path (N, 2) or (N, 3) with dots at the indices `marks`, but a square at its start."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(
         *path[marks[1:]].T,
@@ -121,26 +121,23 @@ AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], 
 
 
 def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Write the time beside each mark of a path, where no other label or mark is.
-
-    A label for which there is no room is left out.
-    """
+    """Write the time beside each mark of a path, unless other labels and marks leave no room."""
     axes.figure.draw_without_rendering()
     flat = path[marks]
     if path.shape[1] == 3:
         flat = np.column_stack(proj3d.proj_transform(*flat.T, axes.get_proj())[:2])
-    places = axes.transData.transform(flat) * 72 / axes.figure.dpi
-    taken = [(place - 2.0, place + 2.0) for place in places]
-    for k, place, at in zip(marks, places, flat, strict=True):
+    points = axes.transData.transform(flat) * 72 / axes.figure.dpi
+    taken = [(point - 2.0, point + 2.0) for point in points]
+    for k, point, anchor in zip(marks, points, flat, strict=True):
         label = "start" if k == marks[0] else f"{time[k] - time[0]:.3g} s"
         half = np.array([0.31 * LABEL * len(label), 0.6 * LABEL])
         for step in (step for far in (3.0, 9.0, 15.0) for step in AROUND * (far + half)):
-            low, high = place + step - half, place + step + half
+            low, high = point + step - half, point + step + half
             if all((low > other).any() or (high < one).any() for one, other in taken):
                 taken.append((low, high))
                 axes.annotate(
                     label,
-                    at,
+                    anchor,
                     step,
                     textcoords="offset points",
                     ha="center",
@@ -165,7 +162,7 @@ def _plain_box(axes: Axes3D) -> None:
 
 COVERED = 0.95  # probability that an ellipse covers the true pose
 ELLIPSES = 12  # number of poses whose ellipses are drawn
-SHARE = 0.15  # largest half axis of a drawn ellipse, as a share of the size of the path
+SHARE = 0.15  # largest half axis of a drawn ellipse, as a fraction of the size of the path
 
 
 def ellipse_figure(
@@ -175,7 +172,7 @@ def ellipse_figure(
 
     poses        Measured poses (N, 6) [m, rad], NaN for a lost pose.
     covariances  Covariances (N, 6, 6) of the poses according to the sensor.
-    shown        Indices of the components that move. Each pair of them has a panel.
+    shown        Indices of the components that move. Any two of one part of a pose have a panel.
     errors       True minus measured poses (N, 6), if the truth is known. They are enlarged like the
                  ellipses.
     """
@@ -231,7 +228,7 @@ def ellipse_figure(
 
 def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float) -> None:
     """Draw enlarged ellipses of covariances (n, 2, 2) [SI] about centres (n, 2) [mm or mrad]."""
-    # All ellipses are one line with gaps: one entry in the legend, and faster drawing.
+    # As one line with gaps, all ellipses have one entry in the legend, and are drawn faster.
     gap = np.full((1, 2), np.nan)
     rings = [
         c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)
@@ -241,14 +238,14 @@ def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float
     axes.plot(*centres.T, linestyle="none", marker="+", color=BLUE, label="measured pose")
 
 
-# Squared Mahalanobis distance within which `COVERED` of the poses lie.
+# Squared Mahalanobis distance within which two components lie with the probability `COVERED`.
 REACH = float(chdtri(2, 1 - COVERED))
 
 RING = f"contains {100 * COVERED:g} % of true poses"
 
 
 def ellipse_outline(covariance: Array) -> Array:
-    """Return the outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
+    """Return the outline (n, 2), about zero, of the `COVERED` ellipse of a covariance (2, 2)."""
     angle = np.linspace(0, 2 * np.pi, 49)
     # With a small multiple of the identity, a singular covariance has a Cholesky factor.
     root = np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(2))
@@ -258,9 +255,7 @@ def ellipse_outline(covariance: Array) -> Array:
 
 
 def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
-    """Draw a reference bar with its enlarged length in the fine unit, on axes in the coarse
-    unit.
-    """
+    """Draw a bar of a length in the fine unit, enlarged by `factor`, on axes in the coarse unit."""
     look: dict[str, Any] = {
         "frameon": True,
         "sep": 3,
@@ -275,12 +270,12 @@ def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
 
 
 def _round_up(value: float) -> float:
-    """Return the next higher of 1, 2 and 5 times a power of ten."""
+    """Return the smallest of 1, 2 and 5 times powers of ten that is at least a positive value."""
     return 1.0 / round_down(1.0 / value)
 
 
 def round_down(value: float) -> float:
-    """Return the next lower of 1, 2 and 5 times a power of ten."""
+    """Return the largest of 1, 2 and 5 times powers of ten that is at most a positive value."""
     power = 10.0 ** np.floor(np.log10(value))
-    # The tolerance allows for values that rounding has moved just below a step.
+    # The tolerance is for values that rounding has moved just below a step.
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

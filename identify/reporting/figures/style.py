@@ -83,7 +83,7 @@ def drawn(draw: Callable[[], Figure]) -> Figure:
     """Draw a figure in this style, and compute its layout once for all of its files."""
     with mpl.rc_context(STYLE):
         figure = draw()
-        # Layout engines move the axes at every drawing, and files would differ.
+        # Layout engines move the axes at every drawing, so that the files would differ.
         if figure.get_layout_engine():
             # A layout can change the ticks, and the next one makes room for their labels.
             for _ in range(3):
