@@ -95,11 +95,10 @@ def _printing() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # All other files are written inside `identify.files.atomic.writing`, and errors of that
-        # function have a file name.
+        # Errors of reading have a file name, and those of writing a file are WriteError.
         if error.filename is not None or error.errno not in NO_ROOM:
             raise
-        # Without closing it, Python would write the rest at exit, and fail again.
+        # Without closing the stream, Python would write the rest at exit, and fail again.
         with suppress(OSError):
             sys.stdout.close()
         raise WriteError(f"cannot write standard output: {error.strerror}") from None
@@ -108,12 +107,12 @@ def _printing() -> Iterator[None]:
 def _show_warning(
     message: Warning | str, category: type[Warning], *place: object, **more: object
 ) -> None:
-    """Print a warning as one line, without its place in the code."""
+    """Print a warning as one line, without the line of code that caused it."""
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 def is_known(error: Exception) -> bool:
-    """Return whether an error is one of those that the three packages raise on purpose."""
+    """Return whether the three packages raise an error on purpose, or it names a file."""
     if isinstance(error, IdentifyError) or (
         isinstance(error, OSError) and error.filename is not None
     ):

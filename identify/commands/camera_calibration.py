@@ -106,7 +106,7 @@ def calibrate(
     over both images and into their corners, and tilt it by 30 degrees and more to all sides. LEFT
     and RIGHT are folders of pictures. Files of the two folders are paired in lexicographic order of
     their names. In this order img10 stands before img2, so number them img02, img10. A picture is
-    PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
+    PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, of 8 or 16 bits.
 
     Reads both folders and the description of the board:
 
@@ -230,7 +230,7 @@ def _write(
     """Write all files of a calibration.
 
     All contents are made before the first file is written. If no sensor can have these cameras,
-    there is no sensor.toml, and the reason is returned.
+    there is no sensor.toml, and the reason is returned. Otherwise, the returned text is empty.
     """
     from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
@@ -241,7 +241,7 @@ def _write(
     )
 
     sensor = None if template is None else template.filled(found)
-    unit = "" if template is None else template.wrong_unit(found)
+    refusal = "" if template is None else template.wrong_unit(found)
     figures = {
         "residuals": residual_figure,
         "coverage": coverage_figure,
@@ -249,7 +249,7 @@ def _write(
     }
     drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
     files = {"rig.toml": rig_tables(found), "calibration.json": content, **drawn}
-    if sensor is not None and not unit:
+    if sensor is not None and not refusal:
         try:
             # sensor.toml is checked in its folder, because its base file can be a path relative to
             # this folder.
@@ -259,7 +259,7 @@ def _write(
             return f"no sensor can have these cameras: {error}"
     else:
         save_files(folder, files)
-    return unit
+    return refusal
 
 
 def _render(

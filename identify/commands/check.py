@@ -72,7 +72,7 @@ def check(
     robot's platform. Each finding has its value, its limit, and the leg that it concerns.
 
     Record: the checks are rates and jitter of the times, gaps and whether commands changed in them,
-    noise of the poses beside the stated one, jumps and frozen poses, travel and spectrum of the
+    noise of the poses beside the stated noise, jumps and frozen poses, travel and spectrum of the
     motion, commands at the end of their range, units, axes, directions and zeros that are likely
     wrong, the clocks of poses and commands, and the groups of parameters that the motion can show.
 
@@ -127,7 +127,7 @@ def _check_record(path: Path, page: Path, json: Path | None, quiet: bool) -> Non
 def _tell(
     findings: "list[Finding]", title: str, about: str, json: Path | None, quiet: bool
 ) -> None:
-    """Output findings, and raise VerificationError if any of them fails."""
+    """Output findings about a robot or record, and raise VerificationError if any of them fails."""
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (

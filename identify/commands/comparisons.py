@@ -192,7 +192,7 @@ def _score_row(score: "Score") -> list[str]:
 def _short(value: float) -> str:
     if not math.isfinite(value):
         return "-"
-    # From 999.5 on, three digits would be written with a power of ten.
+    # From 999.5 on, the format g with three digits would write a power of ten.
     return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
 
 
@@ -228,7 +228,7 @@ def variation(
 
     The runs are the validation runs of validation.nc, as in the paper, or newly recorded runs,
     which are stored as variation.nc. The masses of the links vary most. Only accelerations separate
-    them from the other parameters, so fast trajectories determine them better than long ones.
+    these from the other parameters, so fast trajectories determine them better than long ones.
 
     Reads scenario.toml and validation.nc from the folder; with --designed, trajectories.json in
     place of validation.nc.
@@ -295,7 +295,7 @@ def variation(
 def compare_excitation(
     setup: "Setup", folder: Path, progress: Progress, json: Path | None, quiet: bool
 ) -> None:
-    """Run every search method, and write comparison.json and comparison.png into `folder`."""
+    """Run every search method, write comparison.json and comparison.png, and output the results."""
     from identify.excitation.comparison import compare_methods, comparison_figure
     from identify.excitation.information import knowledge
     from identify.record.known_geometry import KnownGeometry

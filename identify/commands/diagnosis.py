@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from identify.diagnosis.diagnosis import Diagnosis
     from identify.estimation.budget import Budget
 
-SHOWN = 12  # number of candidates that the table has
+SHOWN = 12  # largest number of candidates in the table
 
 HEADER = ("cause or group", "explains\n%", "statistic", "free\nnumbers", "chance", "size", "unit")
 
@@ -46,12 +46,12 @@ def diagnose(
 ) -> None:
     """Name the causes for which the identified model misses its record, with size and remedy.
 
-    Each cause of a catalogue, as the zero of a joint or the clock of the commands, is judged by how
-    much it explains of what the model leaves of the record. The first one is fitted beside the
-    parameters, then the next one is asked. cmmsim identify does the same where noise does not
-    explain the record, unless the watch of the cameras has warned. The first line says if no cause
-    is needed. A cause of one's own is a function (run, size) that returns the model of the run with
-    it, see identify.diagnosis.diagnose.
+    Each cause of a catalogue, such as the zero of a joint or the clock of the commands, is judged
+    by the share of the misfit that it explains. The best one is fitted beside the parameters, then
+    the others are judged again. cmmsim identify does the same if noise does not explain the record,
+    unless the drift watch of the cameras has warned. The output begins with a line that says so if
+    no cause is needed. A cause of your own is a function (run, size) that returns the model of the
+    run with this cause, see identify.diagnosis.diagnose.
 
     Reads scenario.toml, experiment.nc and result.json of the folder.
 
@@ -113,16 +113,16 @@ def budget(
 ) -> None:
     """State what each source of uncertainty adds to poses, parameters and predicted motion.
 
-    The form is that of the GUM: the squares of what the sources add sum up to the square of the
-    combined standard uncertainty. Sources are noise of the poses, cameras, teaching, clocks,
+    The form is that of the GUM: the squares of the sources' contributions sum up to the square of
+    the combined standard uncertainty. Sources are noise of the poses, cameras, teaching, clocks,
     geometry, drives, scale anchor, initial guess, and others that the run states. The parts are
     those of the covariance of the identification. Predictions need a validated run.
 
     Reads scenario.toml, experiment.nc, covariance.nc and result.json of the folder, and
     validation.nc if there is one.
 
-    Writes budget.json, which is also the JSON, budget.csv, and budget.png without the parameters
-    that are not identified, into the folder budget there.
+    Writes budget.json, which is also the JSON, budget.csv, and budget.png, which leaves out
+    parameters that are not identified, into the folder budget there.
 
     \b
     Example:
@@ -150,7 +150,7 @@ def budget(
     tell(found.to_dict(), json, quiet, lambda: _print_budget(found, identified, folder))
 
 
-# First of three entries of a pose whose mean variance is a column of the table.
+# First of three entries of a pose, whose mean variance makes a column of the table.
 GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
 
 
@@ -161,8 +161,8 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
     columns = []
     for first in GROUPS:
         if first in found.quantities:
-            place = found.quantities.index(first)
-            columns.append(1e6 * np.sqrt(np.maximum(found.variances[place : place + 3].mean(0), 0)))
+            index = found.quantities.index(first)
+            columns.append(1e6 * np.sqrt(np.maximum(found.variances[index : index + 3].mean(0), 0)))
     shares = 100 * found.shares[[found.quantities.index(name) for name in identified]]
     means = shares.mean(axis=0) if identified else np.zeros(len(found.sources))
     order = np.argsort(-(columns[-2] if len(columns) == 4 else means), kind="stable")
@@ -226,19 +226,19 @@ def gauntlet(
 ) -> None:
     """Judge the diagnosis: draw what is wrong, run, identify, diagnose, remedy, identify again.
 
-    In each case of a simulated laboratory nothing is wrong, one thing, two things, or something for
-    which the diagnosis has no cause. The estimator knows none of this. The verdict on a case is
-    right intervals, right cause or failed. Sizes are those of a workshop, large enough that the
-    misfit doubles in nearly all cases.
+    In each case of a simulated laboratory, nothing is wrong, or one thing, or two things, or
+    something for which the diagnosis has no cause. The estimator knows none of this. The verdict on
+    a case is right intervals, right cause or failed. The errors are those of a workshop, but large
+    enough that the misfit doubles in nearly all cases.
 
-    The cases are rows of a study. Finished cases are stored in the folder. After Ctrl-C the same
-    command continues, and a larger number of cases adds to those that are there.
+    The cases are rows of a study. Finished cases are stored in the folder. After Ctrl-C, the same
+    command continues. A larger number of cases adds to those that are there.
 
     Reads the scenario, and the robot and sensor that it names.
 
-    Writes into the folder gauntlet.csv, a row a case; gauntlet.json, the shares with their 95 %
-    intervals and all misses, which is also the JSON; gauntlet.md and gauntlet.html, the same as
-    tables; and the files of a study.
+    Writes into the folder gauntlet.csv, with a row for each case; gauntlet.json, the fractions of
+    right verdicts with their 95 % intervals and all misses, which is also the JSON; gauntlet.md and
+    gauntlet.html, the same as tables; and the files of a study.
 
     \b
     Examples:
@@ -280,7 +280,7 @@ def gauntlet(
 
 
 def _say_judged(entry: dict[str, Any], folder: Path) -> None:
-    """Print the shares."""
+    """Print the fractions of right verdicts, and the numbers of verdicts."""
     rows = [
         (
             one["what"],

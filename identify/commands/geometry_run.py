@@ -49,9 +49,9 @@ def geometry(
     Reads a scenario, or poses of your own from a JSON file like poses.json: joints (N, n) in rad or
     m, joint_std (n,), poses (N, 6) in m and rad and covariances (N, 6, 6). The optional
     base_covariance and platform_covariance, each (6, 6), state how well the base and platform
-    frames are known. It writes geometry.json, geometry.md, geometry.png, geometry.svg,
-    covariance.nc, poses.json and robot.toml. robot.toml is the calibrated robot, which every other
-    command reads; cmmsim run --set geometry.known=FILE reads it with its covariance.
+    frames are known. Writes geometry.json, which is also the JSON, geometry.md, geometry.png,
+    geometry.svg, covariance.nc, poses.json and robot.toml. robot.toml is the calibrated robot,
+    which every other command reads; cmmsim run --set geometry.known=FILE also reads its covariance.
 
     \b
     Examples:
@@ -82,7 +82,7 @@ def geometry(
 def _print(entry: dict[str, Any], folder: Path) -> None:
     import numpy as np
 
-    known = [
+    errors = [
         (said, [*entry[key]["position_rms_um"], *entry[key]["orientation_rms_urad"]])
         for key, said in (
             ("uncalibrated", "before"),
@@ -92,13 +92,13 @@ def _print(entry: dict[str, Any], folder: Path) -> None:
         if key in entry
     ]
     rows = [
-        (said, *(f"{value:.2f}" for value in row)) for said, row in known if np.isfinite(row).all()
+        (said, *(f"{value:.2f}" for value in row)) for said, row in errors if np.isfinite(row).all()
     ]
     header = ("", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
     print_table(header, rows, (), "rms error of poses that were not measured")
-    told = [name for name, one in entry["parameters"].items() if one["observable"]]
+    known = [name for name, one in entry["parameters"].items() if one["observable"]]
     typer.echo(
-        f"{entry['poses']} poses determine {len(told)} of {len(entry['parameters'])} geometric "
+        f"{entry['poses']} poses determine {len(known)} of {len(entry['parameters'])} geometric "
         f"numbers; {len(entry['cannot_be_told'])} combinations remain undetermined"
     )
     typer.echo(f"files: {folder}")

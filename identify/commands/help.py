@@ -59,7 +59,7 @@ class StudyCommand(Command):
 class Commands(TyperGroup):
     """Group of commands. Its help lists the commands before the options.
 
-    If Ctrl-C stops a command, "aborted" is printed, because typer alone would print nothing.
+    If Ctrl-C stops a command, "aborted" is printed, because typer would print nothing.
     """
 
     def invoke(self, ctx: Any) -> Any:

@@ -88,7 +88,7 @@ def urdf(
 
 
 def _read(read: Callable[..., Any], *files: Path) -> tuple["RobotDescription", list[str]]:
-    """Read a robot from untrusted files, within limits of time and memory."""
+    """Read a robot, and notes on it, from untrusted files, within limits of time and memory."""
     from identify.files.limited_process import UntrustedFileError, within_limits
 
     try:

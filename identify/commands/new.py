@@ -70,7 +70,7 @@ def robot(
     """Write a robot file: geometry, parameter sets and gains of a built-in robot, under a name of
     your own and with lengths of your own.
 
-    Without lengths, the file is a copy with its comments. With lengths, joints, home, directions
+    Without lengths, the file is a copy, comments included. With lengths, joints, home, directions
     and travel follow from them, masses and inertias are scaled, and the gains of the drives are
     designed. Lengths that are not given stay as they are. A family has its own lengths: robots
     with cranks have base-radius, platform-radius, crank and link, delta3 also bar-distance; those
@@ -228,8 +228,8 @@ def record(
     quantity that fixes the scale, and the uncertainty of the poses.
 
     With --from, no table is written. The TOML file then also says what the columns of your log are
-    called, and in which units and conventions they are. What the header does not tell has the value
-    "?", which you replace.
+    called, and in which units and conventions they are. Whatever the header does not tell is "?",
+    which you replace.
 
     Reads a robot file, and your logs. Writes FILE.csv and FILE.toml.
 
@@ -294,7 +294,7 @@ def _copy(kind: str, like: str, file: Path) -> str:
 
 
 def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
-    """Return the text of a robot like a built-in one with other lengths, m."""
+    """Return the text of a robot file with other lengths, m, and gains for two frame rates."""
     from dynamics import load_robot
     from dynamics.robot_lengths import lengths_of, robot_of_lengths
     from dynamics.robot_text import robot_text
@@ -340,8 +340,7 @@ def _of_a_workshop(text: str) -> str:
 def _named(text: str, file: Path) -> str:
     """Set the key `name` of a TOML text to the name of its file."""
     line = f"name = {json.dumps(file.stem)}"
-    # The replacement is a function, because re.sub would read backslashes in a string as group
-    # references.
+    # The replacement is a function, because re.sub would interpret backslashes in a string.
     return re.sub(r"^name = .*$", lambda _: line, text, count=1, flags=re.MULTILINE)
 
 
@@ -350,7 +349,7 @@ def _schema(kind: str) -> Path:
 
 
 def _with_schema(schema: Path, text: str) -> str:
-    """Put a first line before a TOML text that names the schema of this installation."""
+    """Put a line that names a schema of this installation before a TOML text."""
     return f"#:schema {schema.resolve().as_uri()}\n{text}"
 
 
@@ -366,8 +365,8 @@ def _toml(file: Path) -> Path:
 def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
     """Write new files into one folder: all of them, or none.
 
-    `read` must be able to read the first file. Raises OutputFolderError if a file exists, and the
-    errors of `read`, for example for an invalid name.
+    `read` checks the first file. Raises OutputFolderError if a file exists, and the errors of
+    `read`, for example for an invalid name.
     """
     for path in texts:
         if path.exists():

@@ -1,4 +1,4 @@
-"""Arguments and options shared by several commands, shell completion, and output of figures."""
+"""Arguments and options shared by several commands, shell completion, and output of results."""
 
 import tomllib
 from collections.abc import Callable
@@ -148,7 +148,7 @@ def _allow(modules: list[str] | None) -> None:
     allow_plugin(*modules or ())
 
 
-# Modules of the user's own parts. They are allowed as soon as the option is read.
+# Modules of the user's own parts, which are allowed before any other option is read.
 Plugins = Annotated[
     list[str] | None,
     typer.Option(
@@ -182,9 +182,9 @@ JsonFile = Annotated[
 def tell(
     entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]
 ) -> None:
-    """Output the figures of a command: as JSON if requested, and as text unless `quiet`.
+    """Output the results of a command: as JSON if requested, and as text unless `quiet`.
 
-    `say` prints the text. Raises WriteError if the file cannot be written.
+    `say` prints the text, unless the JSON is printed. Raises WriteError.
     """
     if str(json_file) == STANDARD_OUTPUT:
         typer.echo(as_json(entry), nl=False)
@@ -214,7 +214,7 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
 
 
 def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
-    """Load the scenario of this name or path, with replaced values, and with `robot` unless None.
+    """Load the scenario of this name or path, with replaced values and, if given, another robot.
 
     Raises ScenarioError if there is no such scenario or if a setting is invalid.
     """

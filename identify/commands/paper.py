@@ -46,7 +46,7 @@ def paper(
     of sticker centres in place of images, unless --set names a renderer. The page index.html shows
     what the paper shows, what comes out here, and why it differs. MuJoCo is needed for figure 8.
 
-    Reads the scenarios. Runs that an interrupted command has finished in the folder are used again.
+    Reads both scenarios. Runs that an interrupted command has finished in the folder are reused.
 
     Writes index.html, replay.html, the folder exhibits with each figure and table as PNG, PDF and
     CSV, and the folders paper and paper_settings of both runs.
@@ -94,7 +94,7 @@ def _run(setup: "Setup", folder: Path, progress: Progress, workers: int | None) 
 
 
 def _results(folder: Path, ours: Scenario, progress: Progress) -> "PaperRuns":
-    """Read both runs, and compare engines and identifications."""
+    """Read both runs, compare engines, and identify from each validation run."""
     from dynamics import load_robot
     from identify.estimation.identification import identify
     from identify.paper.exhibit import PaperRuns

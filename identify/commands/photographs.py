@@ -71,16 +71,16 @@ def teach(
 
     Both cameras and the base stand still. The platform takes 10 to 30 poses, and both cameras take
     an image of each at the same time. Files of the two folders are paired in lexicographic order of
-    their names. The stickers need no labels: those that stand belong to the base, and those that
-    move together to the platform. The sensor file names them by rough places, which may be off by
-    some millimetres, and its planes define the frames. If it states the covariance of its cameras,
-    as the file of cmmsim calibrate does, the cameras are adjusted within it.
+    their names. The stickers need no labels: those that stand still belong to the base, and those
+    that move together to the platform. The sensor file gives their names and rough positions, which
+    may be off by some millimetres, and its planes define the frames. If it states the covariance of
+    its cameras, as the file of cmmsim calibrate does, the cameras are adjusted within it.
 
     Reads both folders or videos, and the sensor file. Images are grey, and have the size and the
     bit depth of the sensor file.
 
-    Writes into the folder taught.json, which is also the JSON: places of the stickers, frames,
-    covariances, residuals, and stickers and pairs that do not fit; and residuals.png.
+    Writes into the folder residuals.png and taught.json, which is also the JSON: positions of the
+    stickers, frames, covariances, residuals, and stickers and pairs that do not fit.
 
     \b
     Examples:
@@ -114,7 +114,7 @@ def teach(
 
 
 def _render(folder: Path, sensor: str, count: int, seed: int, progress: Progress) -> None:
-    """Write images of the poses of a smooth path, and these poses: all files, or none."""
+    """Write images of a platform on a smooth path, and its true poses: all files, or none."""
     import numpy as np
 
     from cmmsim.loading import load_sensor
@@ -146,7 +146,7 @@ def save_pairs(folder: Path, frames: "Iterable[StereoFrame]", advance: Advance) 
 
 
 def require_none(reason: str, **given: object) -> None:
-    """Raise ScenarioError that names the arguments given although they would change nothing."""
+    """Raise ScenarioError that names the arguments that are given, but would change nothing."""
     if names := [name for name, value in given.items() if value is not None]:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
@@ -169,7 +169,7 @@ def _print_summary(found: "PhotographedTeaching", folder: Path) -> None:
 
 
 def _stds(covariance: "Array") -> tuple[str, str]:
-    """Show the root mean square of the standard deviations of position and orientation."""
+    """Format the RMS standard deviations of position, um, and orientation, urad."""
     diagonal = covariance.diagonal()
     return f"{1e6 * diagonal[:3].mean() ** 0.5:.2g}", f"{1e6 * diagonal[3:].mean() ** 0.5:.2g}"
 
@@ -198,12 +198,12 @@ def measure(
     """Measure the pose of the platform in each pair of photographs.
 
     Reads both folders or videos, the sensor file, and the taught.json that cmmsim teach wrote for
-    the same sensor file and place of the cameras.
+    the same sensor file and the same poses of cameras and base.
 
     Writes a CSV table with one row for each pair: time_s; measured_x_m to measured_gamma_rad, the
     pose of the platform in the base frame; covariance_x_x to covariance_gamma_gamma, the covariance
-    of the noise, which is new in each pair; common_x_x to common_gamma_gamma, the covariance of
-    what is the same in all pairs; stickers; ok, which is 1 or 0; and why a pair has no pose. The
+    of the noise, which is new in each pair; common_x_x to common_gamma_gamma, the covariance of the
+    errors that all pairs share; stickers; ok, which is 1 or 0; and why a pair has no pose. The
     columns have the names of a record. In folders, the time of an image follows from the frame rate
     of the sensor file.
 

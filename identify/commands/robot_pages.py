@@ -31,8 +31,8 @@ def base_parameters(
     can identify.
 
     A parameter that stands alone can be identified by itself. A parameter in a sum can be
-    identified only as part of that sum. The parameters listed last have no effect on any motion. If
-    only poses are measured, one common factor of all parameters remains unknown.
+    identified only as part of that sum. The parameters listed after the sums have no effect on any
+    motion. If only poses are measured, one common factor of all parameters remains unknown.
 
     Reads a robot file. Writes only the JSON, which has the coefficients of each combination.
 
@@ -238,8 +238,8 @@ def urdf(
 ) -> None:
     """Write the robot as URDF, with the closures of its loops in a YAML file of the same name.
 
-    URDF knows only trees. The YAML lists the frames that coincide in each closed loop, as
-    cmmsim import urdf reads them.
+    URDF knows only trees. The YAML file lists the frames that coincide in each closed loop, in the
+    form that cmmsim import urdf reads.
 
     Reads a robot file, and the result.json that --parameters names. Writes two files.
 
@@ -292,7 +292,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     effects = acceleration_changes(robot, parameters, inertias.values)
     said = {}
     for body, change in inertias.changes.items():
-        # An effect below 1e-9 is rounding.
+        # A relative effect of at most 1e-9 is rounding.
         felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
         said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'no effect on the motion'}"
     return [f"changed {line}" for line in grouped(said)]
@@ -305,7 +305,7 @@ def verify_model(
     json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compare the model of a robot with MuJoCo in the paper's loop (its figure 7).
+    """Compare the model of a robot with MuJoCo in the loop of figure 7 of the paper.
 
     Reads a robot file.
 

@@ -64,8 +64,8 @@ def run(
     Reads a scenario, and the robot and sensor that it names.
 
     Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json,
-    covariance.nc, validation.nc, model.nc, report.html and figures; with geometry.known=calibrated
-    also the folder geometry. The JSON is result.json.
+    covariance.nc, validation.nc, model.nc, report.html and figures; the folder geometry with
+    geometry.known=calibrated; payload.nc if a payload fixes the scale. The JSON is result.json.
 
     \b
     Examples:
@@ -154,8 +154,9 @@ def excite(
 
     Reads a scenario and its robot.
 
-    Writes scenario.toml and trajectories.json into the folder. With --compare, it writes the
-    results of all search methods instead. The JSON is trajectories.json or comparison.json.
+    Writes scenario.toml and trajectories.json into the folder, and the folder geometry with
+    geometry.known=calibrated. With --compare, it writes only a comparison of all search methods.
+    The JSON is trajectories.json or comparison.json.
 
     \b
     Examples:
@@ -190,8 +191,8 @@ def record(
 
     Reads scenario.toml and trajectories.json from the folder.
 
-    Writes experiment.nc there: the record, and the truth in a group of its own. If a known load
-    fixes the scale, it also writes payload.nc.
+    Writes experiment.nc there: the record, and the truth in a group of its own. If a payload fixes
+    the scale, it also writes payload.nc.
 
     \b
     Example:
@@ -232,15 +233,15 @@ def identify(
     """Estimate the robot's parameters from the record: the third stage.
 
     Reads scenario.toml, trajectories.json and experiment.nc from the folder, or a record of your
-    own. A record of your own is a netCDF file like experiment.nc, or a CSV table with a TOML file
-    of the same name beside it that describes the experiment. cmmsim new record mine.csv writes a
-    template of both, with comments that explain the columns and the rules below. Its option --from
-    describes a log of another program: an export of Motive or Vicon, or a bag of ROS 2 or MCAP.
+    own. A record of your own is a netCDF file like experiment.nc, or a CSV table beside a TOML file
+    of the same name that describes the experiment. cmmsim new record mine.csv writes templates of
+    both, with comments that explain the columns and the rules below. Its option --from describes a
+    log of another program: an export of Motive or Vicon, or a bag of ROS 2 or MCAP.
 
-    Units are m, rad and s. Times need not be frames, the record may begin in motion, and rows may
-    be missing: the logged commands then drive the model. If the rows are one frame apart, begin at
-    rest and have a reference, the model closes its own loop. A lost frame has empty measured
-    columns. If a rule is broken, the error names the line or the frame.
+    Units are m, rad and s. If the rows are one frame apart, begin at rest and have a reference, the
+    model closes its own loop. Otherwise, the logged commands drive the model: times may have any
+    distance, the record may begin in motion, and rows may be missing. A lost frame has empty
+    measured columns. If a rule is broken, the error names the line or the frame.
 
     Writes result.json, which is also the JSON, and covariance.nc into the folder. From a record of
     your own it also writes scenario.toml, experiment.nc and model.nc; continue with cmmsim report,
@@ -333,7 +334,7 @@ def report(
 
 
 def _tell_missed(result: dict[str, Any], unseen: bool, strict: bool) -> None:
-    """Print each missed goal on standard error if its table is unseen; raise an error if strict."""
+    """Print each missed goal on standard error if its table is not seen, and raise if strict."""
     from identify.reporting.goals import check_goals
     from identify.reporting.verdict import sentence
 
@@ -348,7 +349,7 @@ def _tell_missed(result: dict[str, Any], unseen: bool, strict: bool) -> None:
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:
-    """Load the result of a run, and print the notes and warnings of its identification."""
+    """Load the result of a run, and print the notes and warnings of the identification."""
     result = load_result(folder.result)
     print_warnings(result["identification"].get("notes", []), "note")
     print_warnings(result["identification"].get("warnings", []))
@@ -356,7 +357,7 @@ def _warned(folder: RunFolder) -> dict[str, Any]:
 
 
 def _summary() -> Any:
-    """Import the summary of a run late, for the same reason as the stages."""
+    """Import the summaries of a run late, for the same reason as the stages."""
     from identify.reporting import tables as run_summary
 
     return run_summary

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".pdf", ".svg")
 PAGES = (".html", ".htm")
 SENSOR = "ctrack780"  # shown with a robot that is named alone
+# Keys of which one is enough to tell a robot file and a sensor file.
 ROBOT_KEYS = {"parameters", "legs", "family"}
 SENSOR_KEYS = {"rig", "stickers", "based_on"}
 
@@ -43,7 +44,7 @@ def replay(
     The page shows the robot, stickers and cameras in space, the images of both cameras, and the
     measured, true and modelled poses over time, with enlarged differences. Open it in a browser.
 
-    Reads the files of a run that has been recorded. It writes RUN/replay.html.
+    Reads the files of a run that has been recorded. Writes RUN/replay.html.
 
     \b
     Examples:
@@ -90,8 +91,7 @@ def show(
     A robot is shown with the sensor that is named with it. Without such a name it is shown with
     ctrack780, if the platform of that sensor fits. The page opens without a network.
 
-    Reads the file of a robot, of a sensor, or of one of each. It writes NAME.html, or a picture for
-    print.
+    Reads the file of a robot, of a sensor, or of both. Writes NAME.html, or a picture for print.
 
     \b
     Examples:
@@ -126,7 +126,7 @@ def show(
 
 
 def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
-    """Draw the scene with the camera images beside it into a file. Raises WriteError."""
+    """Draw the scene and, with a sensor, the camera images into a file. Raises WriteError."""
     from identify.files.atomic import check_writable, figure_bytes, write_bytes
     from identify.scene import overview_figure, scene_figure, stereo_view
 
@@ -173,7 +173,7 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
 def kind_of(name: str) -> str:
     """Tell whether a built-in name or a file is a "robot" or a "sensor".
 
-    Raises ScenarioError with the valid names.
+    Raises ScenarioError if there is no such name or file, or the file is neither.
     """
     from cmmsim.files import built_in_names
     from dynamics import built_in_robots

@@ -60,9 +60,8 @@ def acceptance(
 ) -> None:
     """Test a sensor like a real instrument: lengths, a moving bar, latency.
 
-    The cameras of the sensor take noisy pictures of artefacts in the measuring volume. Its
-    detection and triangulation measure the artefacts, and the results are compared with the true
-    values.
+    The cameras of the sensor take noisy pictures of artefacts in the measuring volume. Detection
+    and triangulation measure the artefacts, and the results are compared with the true values.
 
     \b
     vdi    seven lines through the volume, five lengths each: length error
@@ -106,7 +105,7 @@ def acceptance(
 
 
 def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
-    """Print one line for each test, and the place of the report."""
+    """Print the results of each test, and the path of the report."""
     if (test := entry.get("vdi_2634_1")) is not None:
         typer.echo(
             f"length error: largest {test['largest_error_um']:+.1f} um, limit ± "
@@ -166,8 +165,8 @@ def detectors(
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
-    """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector can
-    beat.
+    """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector without
+    bias can beat.
 
     The first row of the table is the sensor's view of the platform at home. The other rows are all
     combinations of the options.
@@ -259,7 +258,7 @@ def _row(score: "Score") -> dict[str, Any]:
 
 
 def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
-    """Print one row per kind of marks and method."""
+    """Print a table of the errors, with one row per kind of marks and method."""
     print_table(
         ("marks", "method", "px", "µm", "µrad", "normalised\nerror", "lost\n%", "time\nms"),
         [
@@ -284,7 +283,7 @@ def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
 
 
 def _short(value: float) -> str:
-    """Return a number with two digits, or without decimals."""
+    """Format a number with two digits, but without decimals from 99.5 on."""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
@@ -318,7 +317,7 @@ def _print_scores(scores: list["Score"], sensor: str) -> None:
 
 
 def _cells(scores: list["Score"]) -> tuple[str, ...]:
-    """Return a row of the table: the scores of all detectors under one condition."""
+    """Return a row of the table: a condition, its bound, and the RMS error of each detector."""
     seen = _columns(scores[0].condition)
     return (
         f"{seen['radius_px']:.3g}",

@@ -197,7 +197,7 @@ def _run(
     beside: list[Path],
     progress: Progress,
 ) -> "tuple[Outcome, dict[str, Any]]":
-    """Run a study in its folder, and return its rows and its summary."""
+    """Run a study in its folder, and return its outcome and its summary."""
     with interruptible_imports():
         from identify.studies.processes import check_memory
         from identify.studies.runner import run_study
@@ -205,7 +205,7 @@ def _run(
         from identify.studies.table import rows_beside
 
     shared = prepare(study)
-    # Only the memory of this machine is known.
+    # The memory of the machines of a cluster is not known.
     if scheduler is None:
         check_memory(study, shared, max(workers, 1))
     others = rows_beside(study, beside)
@@ -221,9 +221,9 @@ def _run(
 
 
 def workers_of(scheduler: str | None, workers: int, insecure: bool) -> "Workers":
-    """Return the workers of a running cluster, of this machine, or this process if there are none.
+    """Return the workers of a running cluster, of this machine, or this process if `workers` is 0.
 
-    Raises StudyError if Dask is missing.
+    Raises StudyError if a cluster is named and Dask is missing.
     """
     if scheduler is not None:
         try:
@@ -263,7 +263,7 @@ def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
 
 
 def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    """If rows or laws failed, print a line on standard error and exit with the status for it."""
+    """If rows or laws failed, say so on standard error, and exit with the status for this."""
     broken = [law for law in laws if law["verdict"] == "failed"]
     if broken:
         typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)

@@ -71,12 +71,13 @@ def track(
     dynamics (feedforward), and torques (computed_torque). A law knows the initial guess of the
     model, the identified model, or the true model. The results are the errors of the true poses,
     the effort, and the share of the squared error that an exact sensor, an exact model or zero
-    latency would remove. The scenario's [control] states whether an observer predicts the pose, and
-    the limits of the actuators.
+    latency would remove. The scenario's [control] states the limits of the actuators, and whether
+    an observer predicts the pose.
 
     Reads a scenario, the folder of a finished run that --run names, and a CSV file of poses that
-    --motion names, with the columns t, x, y, z, alpha, beta, gamma in s, m and rad. It writes
-    track.json and scenario.toml.
+    --motion names, with the columns t, x, y, z, alpha, beta, gamma in s, m and rad.
+
+    Writes track.json, which is also the JSON, and scenario.toml.
 
     \b
     Examples:
@@ -155,12 +156,12 @@ def _print_tables(done: list[dict[str, Any]], effort_unit: str) -> None:
         )
         for run in done
     ]
-    of_effort = ("law", "model", f"effort\n{effort_unit}", "sensor", "model", "latency", "rest")
+    effort_header = ("law", "model", f"effort\n{effort_unit}", "sensor", "model", "latency", "rest")
     said = (
         "rms effort, and the share of the squared position error that an exact sensor, an exact "
         "model or zero latency would remove"
     )
-    print_table(of_effort, shares, header[:2], said)
+    print_table(effort_header, shares, header[:2], said)
 
 
 def _percent(share: float) -> str:
