@@ -38,7 +38,7 @@ def diagnose(
     context: typer.Context,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of an identified run.")],
     add: Annotated[
-        list[str] | None, repeatable("Cause of one's own beside these, as module:function", "none")
+        list[str] | None, repeatable("Additional cause of your own, as module:function", "none")
     ] = None,
     json: JsonFile = None,
     quiet: Quiet = False,
@@ -195,7 +195,7 @@ def gauntlet(
         str,
         typer.Option(
             metavar="NAME|FILE",
-            help="Scenario of the laboratory, without trouble.",
+            help="Scenario of the laboratory, to which the errors are added.",
             autocompletion=completion("scenario"),
         ),
     ] = "quick",

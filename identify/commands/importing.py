@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 IMPORT_HELP = """
 Read a robot from a file of another program. Its legs must be of the known kinds.
 
-Writes a robot file with the geometry, inertias and friction of that file, as the parameter set
-`guess`. Each joint is checked. A mechanism that is not such a robot is refused with the reason in
-one line.
+Writes a robot file with the geometry of that file, and with its inertias and friction as the
+parameter set `guess`. Each joint is checked. A mechanism that is not such a robot is refused with
+the reason in one line.
 """
 
 imports = typer.Typer(

@@ -117,9 +117,8 @@ EstimatorSettings = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Replace a setting of the estimator, in the sections identification, model or filter "
-        "of the scenario: "
-        "identification.method=command_driven; repeatable. Other sections cannot change, because "
-        "the record was made with them.",
+        "of the scenario: identification.method=command_driven; repeatable. Other sections cannot "
+        "change, because the record was made with them.",
     ),
 ]
 MOST_WORKERS = 1000  # largest number of processes that a command starts
@@ -157,8 +156,8 @@ Plugins = Annotated[
         is_eager=True,
         callback=_allow,
         help="Module of your own that is allowed to be imported: files and options then name its "
-        "parts as module:function; "
-        f"repeatable. The variable {ALLOWED} names such modules for all commands.",
+        f"parts as module:function; repeatable. The variable {ALLOWED} names such modules for all "
+        "commands.",
     ),
 ]
 
@@ -173,7 +172,7 @@ JsonFile = Annotated[
     typer.Option(
         "--json",
         metavar="FILE",
-        help="Also write the figures as JSON into this file, which is replaced if it exists; "
+        help="Also write the results as JSON into this file, which is replaced if it exists; "
         "- prints the JSON in place of the tables.",
     ),
 ]

@@ -26,7 +26,7 @@ SensorFile = Annotated[
     typer.Option(
         "--sensor",
         metavar="NAME|FILE",
-        help="Sensor file with the cameras, and the rough places of the stickers on their planes.",
+        help="Sensor file with the cameras, and rough positions of the stickers on their planes.",
         autocompletion=completion("sensor"),
     ),
 ]
@@ -34,7 +34,7 @@ Colour = Annotated[
     str | None,
     typer.Option(
         "--colour",
-        help="How grey values are made of colours: grey (weighted sum), red, green or blue.",
+        help="How grey values are made from colours: grey (weighted sum), red, green or blue.",
         show_default="images with colours are refused",
     ),
 ]
@@ -182,7 +182,7 @@ def measure(
     taught: Annotated[
         Path, typer.Option("--taught", metavar="FILE", help="taught.json of cmmsim teach.")
     ],
-    out: Annotated[Path, typer.Option("--out", help="Table that is written.")] = Path("poses.csv"),
+    out: Annotated[Path, typer.Option("--out", help="Table to write.")] = Path("poses.csv"),
     pictures: Annotated[
         Path | None,
         typer.Option(

@@ -77,7 +77,7 @@ def _print_groups(
 ) -> None:
     for expression in found.expressions():
         typer.echo(expression)
-    typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
+    typer.echo(f"Parameters that no motion shows: {', '.join(found.unseen) or 'none'}.")
     typer.echo(
         f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that "
         f"a motion can show; singular values find {singular}. Independent columns of the regressor "
@@ -182,7 +182,7 @@ OfResult = Annotated[
     str | None,
     typer.Option(
         metavar="SET|FILE",
-        help="Parameter set of the robot, or result.json of a run, for its estimates.",
+        help="Parameter set of the robot, or the result.json of a run, whose estimates are used.",
         show_default="guess",
     ),
 ]

@@ -146,9 +146,9 @@ def exhibit(cell: Workcell, view: StereoView) -> Exhibit:
         "At least three stickers on each of the planes A, B and C give the planes. Their "
         "intersections give the x axis and the origin, and the normal of A gives z.",
         f"The same from one pair of our images, with {len(marked.ids)} stickers. They lie "
-        f"{rms:.2g} µm (RMS) from their planes, which are fitted with the covariances of the "
-        "points where the paper solves three equations. Every pose by "
-        "pose_method=planes is found so; registration, our default, fits all stickers at once.",
+        f"{rms:.2g} µm (RMS) from their planes. The paper solves three equations for a plane; here "
+        "it is fitted with the covariances of the points. With pose_method=planes, every pose is "
+        "measured in this way. Our default, registration, fits all stickers at once.",
         columns,
         partial(draw, marked),
     )

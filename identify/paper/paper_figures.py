@@ -64,7 +64,7 @@ def cameras(cell: Workcell, view: StereoView) -> Exhibit:
         "A C-track 780 looks at reflectors on the platform and on the base.",
         "The scene of our run, with the rays to the stickers that both cameras see, and both "
         "images. The paper states neither rate, latency nor noise of its sensor; those of "
-        "ctrack780 are assumed and labelled so.",
+        "ctrack780 are assumed, as its file says.",
         columns,
         partial(overview_figure, cell, view.pose, view),
     )
@@ -81,7 +81,7 @@ def mechanical_model(robot: Robot) -> Exhibit:
         "Figure 5",
         "Mechanical model",
         "A model of the robot in SimMechanics, from bodies and joints.",
-        "The bodies that cmmsim export mjcf gives to MuJoCo. It solves the loops as "
+        "The bodies that cmmsim export mjcf gives to MuJoCo. MuJoCo solves the loops as "
         "constraints, and shares no equation with our model.",
         {
             "body": [part.name for part in parts],
@@ -104,7 +104,7 @@ def motion(robot: Robot, data: RunData) -> Exhibit:
         "Animation of the motion",
         "A film of the SimMechanics model.",
         "The six instants of our run at which one component of the pose is farthest from home. The "
-        "page replay.html moves, and shows images and errors with it.",
+        "page replay.html shows the whole motion, with images and errors.",
         {"time [s]": times, **pose_columns(poses[indices])},
         partial(_instants, workcell(robot), times, poses[indices]),
     )
@@ -132,7 +132,7 @@ def engines(runs: PaperRuns) -> Exhibit:
         "Difference of the model from another engine",
         f"At most {PAPER['position_max_um'] / 1e3:g} mm and {PAPER['angle_max_urad'] / 1e3:g} mrad "
         f"at the start, {PAPER['position_steady_um'] / 1e3:g} mm and "
-        f"{PAPER['angle_steady_urad'] / 1e3:g} mrad later, which it calls proof of the model.",
+        f"{PAPER['angle_steady_urad'] / 1e3:g} mrad later. This is called proof of the model.",
         f"At most {found.position_max_um:.2g} µm and {found.angle_max_urad:.2g} µrad. Both engines "
         "begin at the same state, and MuJoCo's steps are fine enough. A difference of 0.1 mm "
         "would here be a mistake in one of them.",
@@ -152,7 +152,7 @@ def trajectories(runs: PaperRuns) -> Exhibit:
         columns |= pose_columns(chosen.excitation.pose(times), whose)
         method = data.scenario.excitation.method
         said.append(
-            f"The {method} search improves it from {chosen.first_index:.3g} to "
+            f"The {method} search improves the index from {chosen.first_index:.3g} to "
             f"{chosen.observability_index:.3g}."
         )
     return Exhibit(
@@ -160,8 +160,8 @@ def trajectories(runs: PaperRuns) -> Exhibit:
         "Exciting trajectory",
         f"A genetic algorithm improves the observability index from {paper.INDEX_FIRST:g} to "
         f"{paper.INDEX_BEST:g} in 324 generations.",
-        f"{' '.join(said)} Indices of robots of different geometry cannot be compared, only their "
-        "improvement. Drawn is the gradient search; the columns hold both.",
+        f"{' '.join(said)} Of robots with different geometry, only the improvements of the index "
+        "can be compared. The figure shows our search; the columns have both trajectories.",
         columns,
         partial(
             excitation_figure,
@@ -177,8 +177,8 @@ def pose_fit(data: RunData) -> Exhibit:
         "Figure 12",
         "Models and measurement on the exciting trajectory",
         "Measured poses, initial model and identified model.",
-        "The same, and below each component what is left of the measurement. At the paper's "
-        "scale the identified model cannot be told from the measurement.",
+        "The same, and below each component the measurement minus the identified model. At the "
+        "paper's scale, model and measurement cannot be told apart.",
         _fit_columns(data.excitation_fit),
         partial(fit.fit_figure, data.excitation_fit),
     )
@@ -192,8 +192,8 @@ def unseen_fit(data: RunData) -> Exhibit:
         "Figure 13",
         "Identified model on the first unseen trajectory",
         "Measured poses and identified model.",
-        "The same, with the initial model, the true poses, and the range that the uncertainty of "
-        "the parameters makes expect.",
+        "The same, with the initial model, the true poses, and the range that is expected from "
+        "the uncertainty of the parameters.",
         _fit_columns(shown),
         partial(fit.fit_figure, shown),
     )

@@ -34,8 +34,8 @@ def initial_parameters(runs: PaperRuns) -> Exhibit:
         "Table 1",
         "Initial parameters",
         "Masses and moments of inertia from the manufacturer, without friction.",
-        "The same numbers. They are the set guess of the robot rss6. Some of these moments of "
-        "inertia no rigid body can have (Ixx + Iyy < Izz); they are kept as data.",
+        "The same numbers, which are the set guess of the robot rss6. Some of these moments of "
+        "inertia are impossible for a rigid body (Ixx + Iyy < Izz), but are kept as data.",
         {
             "parameter": names,
             "unit": [entries[name]["unit"] for name in names],
@@ -54,11 +54,11 @@ def identified_parameters(runs: PaperRuns) -> Exhibit:
     return Exhibit(
         "Table 2",
         "Identified parameters",
-        "It says that 50 of 67 parameters are identified, and lists 49, each as one number "
+        "The paper says that 50 of 67 parameters are identified, and lists 49, each as one number "
         "without an uncertainty.",
-        f"Poses depend on this robot through {found['base_rank']} sums of parameters and three "
-        f"gains, of which one factor is fixed by {found['scale_anchor'].replace('_', ' ')}. More "
-        "than these no method can find, so that 50 separate numbers also contain their initial "
+        f"Poses of this robot depend on {found['base_rank']} sums of parameters and on three "
+        f"gains, whose common factor is fixed by {found['scale_anchor'].replace('_', ' ')}. No "
+        "method can find more than these, so that 50 separate numbers also contain their initial "
         f"guesses. We list a standard deviation for all, and call {known} identified. The "
         "paper's numbers are the truth of our simulated robot, so that each error is known.",
         {
@@ -91,10 +91,10 @@ def errors_of_the_fit(runs: PaperRuns) -> Exhibit:
         "Table 3",
         "RMS of model against measurement on the exciting trajectory",
         "The errors fall by a factor of 2.6 to 4.9, to some 0.4 mm and 0.8 mrad.",
-        "What a perfect model leaves is the noise of single measured poses, in the last column. "
-        "Our robot is simulated: model and plant have the same structure, which a real robot "
-        "does not grant, while the plant integrates more finely and is seen by a sensor with "
-        "errors. A dash stands for a model whose loop is unstable.",
+        "A perfect model leaves the noise of single measured poses, in the rightmost column. Our "
+        "robot is simulated: model and plant have the same structure, which is not so for a real "
+        "robot, but the plant is integrated more finely, and a sensor with errors measures it. A "
+        "dash stands for a model whose loop is unstable.",
         columns,
     )
 
@@ -111,9 +111,10 @@ def errors_of_validation(runs: PaperRuns) -> Exhibit:
     return Exhibit(
         "Table 4",
         "RMS of the identified model on unseen trajectories",
-        "Below 0.8 mm and, it says, 1.4 mrad against the measurement; one value is 1.411 mrad.",
-        "Against the measurement the noise of the sensor remains. Only a simulation also knows "
-        "the true poses: against these the error of the model is far smaller.",
+        "Below 0.8 mm and, according to the text, 1.4 mrad against the measurement; but one value "
+        "is 1.411 mrad.",
+        "Against the measurement, the noise of the sensor remains. Only a simulation also knows "
+        "the true poses, against which the error of the model is far smaller.",
         dict(zip(("trajectory", "what", *AXES), zip(*rows, strict=True), strict=True)),
     )
 
@@ -131,8 +132,8 @@ def variation(runs: PaperRuns) -> Exhibit:
         "parameters are listed that the motion cannot separate; a variation of 0.01 % of such a "
         "parameter suggests that it stayed at its initial guess.",
         "Standard deviation of the estimates over their mean, for parameters that every run "
-        "identifies, beside the value that the stated standard deviations make expect. The "
-        f"largest is {100 * worst:.3g} % of {name}. The paper's robot is another one.",
+        "identifies, beside the value expected from the stated standard deviations. The largest "
+        f"is {100 * worst:.3g} %, for {name}. The paper's robot is another one.",
         {
             "parameter": names,
             "unit": [found.layout.unit(name) for name in names],

@@ -99,7 +99,7 @@ def exhibit(robot: Robot) -> Exhibit:
         "Six legs, each with a wrench (here: crank) that turns about a vertical axis, and a link "
         "between two ball joints. No lengths are given.",
         "The robot rss6, whose geometry was chosen to fit the paper's gains, limit of travel and "
-        "masses. Its numbers are therefore not those of the paper's robot.",
+        "masses. These numbers are therefore not those of the paper's robot.",
         columns,
         partial(draw, robot),
     )

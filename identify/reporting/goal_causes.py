@@ -97,7 +97,7 @@ def _moved_cameras(run: _Run) -> Advice | None:
         return Advice(
             "Stickers are not where the cameras should see them, and no movement of the cameras "
             f"explains it ({100 * watch['explained']:.2g} % at most): their detection or their "
-            "places are wrong.",
+            "known positions are wrong.",
             f"cmmsim replay {run.folder}",
         )
     return Advice(
@@ -112,7 +112,7 @@ def _unfinished_search(run: _Run) -> Advice | None:
         return None
     most = int(run.result.get("settings", {}).get("identification.max_iterations", 30))
     return Advice(
-        f"The search of the parameters did not converge in {most} iterations.",
+        f"The search for the parameters did not converge in {most} iterations.",
         run.again(f"identification.max_iterations={2 * most}"),
     )
 
@@ -124,8 +124,8 @@ def _unsure_drive(run: _Run) -> Advice | None:
     ranked = sorted(drive["probabilities"].items(), key=lambda item: -item[1])
     other = next(law for law, _ in ranked if law != drive["law"])
     return Advice(
-        f"The record cannot tell whether the law of the drives is {drive['law']}, which was taken, "
-        f"or {other}.",
+        "The record cannot tell whether the law of the drives is "
+        f"{drive['law']}, which was used, or {other}.",
         run.again(f"model.drive={other}"),
     )
 
@@ -159,8 +159,8 @@ def _model_or_cameras(run: _Run) -> Advice | None:
     known = {axis: chance for axis, chance in chances.items() if chance is not None}
     where = f", most along {min(known, key=lambda axis: known[axis])}" if known else ""
     return Advice(
-        "The model moves otherwise than the robot, or the cameras have errors beyond their stated "
-        f"noise{where}.",
+        "The model moves differently from the robot, or the cameras have errors beyond their "
+        f"stated noise{where}.",
         f"cmmsim diagnose {run.folder}",
     )
 
@@ -263,7 +263,7 @@ def _noise(run: _Run) -> Advice | None:
 
 def _unstated_error(run: _Run) -> Advice:
     return Advice(
-        "The cameras have errors that they do not state, as those of an inexact calibration.",
+        "The cameras have errors that they do not state, such as those of an inexact calibration.",
         run.repeated("rig.known=calibrated", "calibrated"),
     )
 

@@ -196,8 +196,8 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
         return []
     outside = far_off(parameters)
     text = (
-        f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard "
-        "deviations"
+        f"of {len(judged)}: estimates off the truth by more than {100 * PARAMETER_FRACTION:g} % "
+        f"and more than {PARAMETER_STDS:g} standard deviations"
     )
     text += f", {', '.join(outside)}" if outside else ""
     return [Goal(FAR_OFF, float(len(outside)), "<=", 0.0, "", text)]

@@ -7,13 +7,13 @@ identified.
 from collections.abc import Mapping
 from typing import Any
 
-from identify.estimation.identifiability import RESTS_ON_PRIOR
+from identify.estimation.identifiability import IDENTIFIABLE_SHARE, RESTS_ON_PRIOR
 from identify.loop_parameters import is_gain
 from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
 # Remark on an estimate that depends on the initial guess of other parameters.
-ON_GUESS = "rests on initial guess"
+ON_GUESS = "rests on the initial guess"
 
 Entry = dict[str, Any]
 
@@ -42,8 +42,8 @@ def parameter_table(result: dict[str, Any]) -> Table:
     if any(row[-1] for row in rows):
         note += (
             f"A parameter that {ON_GUESS} is shown by the record only in sums with other "
-            "parameters. It is right if their initial guesses are right within the standard "
-            "deviations stated for them."
+            "parameters. Its estimate is right if the initial guesses of these are right within "
+            "their standard deviations."
         )
     header = (
         "parameter",
@@ -140,8 +140,8 @@ def correlation_table(result: dict[str, Any]) -> Table:
         "Strongest correlations of identified parameters",
         ("parameters", "correlation"),
         rows,
-        "Poses determine the ratios of friction and gains better than their common factor. Their "
-        "errors are therefore strongly correlated.",
+        "Poses determine the ratios of friction and gains better than their common factor. The "
+        "errors of friction and gains are therefore strongly correlated.",
         folded=True,
     )
 
@@ -149,10 +149,10 @@ def correlation_table(result: dict[str, Any]) -> Table:
 # Descriptions of the control laws of the drives.
 DRIVES = {
     "pid": "a PID",
-    "pd": "a PD: no integral",
-    "pi": "a PI: no derivative",
-    "cascade": "a P-PI cascade, position around velocity",
-    "pid_filtered": "a PID whose rate is filtered",
+    "pd": "a PD (without an integral)",
+    "pi": "a PI (without a derivative)",
+    "cascade": "a P-PI cascade (position around velocity)",
+    "pid_filtered": "a PID with a filtered rate",
 }
 
 
@@ -164,7 +164,7 @@ def drive_sentence(identification: Mapping[str, Any]) -> str:
     drive = identification.get("drive")
     if drive is not None and not drive.get("in_loop", True):
         return (
-            "The drives took torques: the record has no information about the law by which they "
+            "The drives took torques, so that the record does not show the law by which they "
             "follow joint commands."
         )
     if drive is None or (drive["decided_by"] == "scenario" and drive["law"] == "pid"):
@@ -185,7 +185,7 @@ def drive_sentence(identification: Mapping[str, Any]) -> str:
         known = (
             "the record tells"
             if drive["sure"]
-            else "the record cannot tell: this is the most probable"
+            else "the record does not decide, and this law is the most probable"
         )
         said += (
             f"; {known} (probability {100 * drive['probabilities'][drive['law']]:.3g} %; {rest})."
@@ -221,8 +221,8 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
             name for name in unknown if name in summed
         ],
         "this record does not determine them well enough: their standard deviation is more than "
-        "half of that of the initial guess, or more than half of their size. More or faster motion "
-        "may help": [n for n in unknown if n in shown],
+        f"{100 * IDENTIFIABLE_SHARE:g} % of that of the initial guess, or of their size. More or "
+        "faster motion may help": [n for n in unknown if n in shown],
         "no motion of this robot depends on them": [
             n for n in unknown if n not in summed | shown | fixed | outside
         ],

@@ -86,8 +86,8 @@ FIT = (
 
 GROUPS = (
     "Parameters in each sum on which the motion depends: one row per sum, one column per "
-    "parameter. The area of a dot is the share of coefficient times initial guess; an open dot is "
-    "subtracted. A star marks a sum that is identified."
+    "parameter. The area of a dot is the share of the sum that coefficient times initial guess "
+    "has; an open dot is subtracted. A star marks a sum that is identified."
 )
 
 CORRELATION = (
@@ -220,9 +220,8 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
         return {}
     bars = (
         f"RMS of the {unseen(data.result).what} on each validation trajectory: bars against the "
-        "truth; "
-        "diamonds as predicted from the stated uncertainty; dashes against the "
-        "measurement, including its noise."
+        "truth; diamonds as predicted from the stated uncertainty; dashes against the measurement, "
+        "including its noise."
     )
     text = (
         FIT.format("first validation trajectory")

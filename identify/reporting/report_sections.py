@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from identify.arrays import Array
+from identify.estimation.identifiability import IDENTIFIABLE_SHARE
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
@@ -124,9 +125,9 @@ def parameter_section(data: RunData) -> Section:
     parameters = found["parameters"]
     known = [p for p in parameters.values() if p["identifiable"]]
     text = [
-        f"The record identifies {tables.identified_counts(found)}. A quantity is identified if the "
-        "record at least halves the standard deviation of its initial guess, and reduces it to "
-        "less than half of the quantity's size.",
+        f"The record identifies {tables.identified_counts(found)}. A quantity is identified if its "
+        f"standard deviation is less than {100 * IDENTIFIABLE_SHARE:g} % of that of its initial "
+        "guess, and of its size.",
         parameter_tables.scale_sentence(found),
         *filter(None, [tables.common_scale_sentence(found)]),
         *filter(None, [parameter_tables.drive_sentence(found)]),
@@ -242,7 +243,7 @@ def _index_text(data: RunData) -> tuple[str, ...]:
     text = (
         "The observability index (eq. 39 of the paper; larger is better) is "
         f"{number(chosen.first_index, 3)} for the first random candidate, "
-        f"{number(chosen.median_index, 3)} for the middle one, and "
+        f"{number(chosen.median_index, 3)} for the median, and "
         f"{number(chosen.observability_index, 3)} for the trajectory that was used."
     )
     if data.repeats_paper:
@@ -300,12 +301,12 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
     if not data.repeats_paper:
         return ()
     ours = (
-        "; its filter and its search for a trajectory differ from the paper's, which the scenario "
-        "paper_settings has"
+        "; its filter and its search for a trajectory differ from those of the paper, which the "
+        "scenario paper_settings has"
     )
     rest = ", filter and search" if data.scenario.name == paper.PAPER_SETTINGS else ours
     return (
         "This run repeats the paper's experiment on a simulated robot of the same kind, with its "
-        f"masses, gains and motion frequencies{rest}. The figures of the paper are given for "
+        f"masses, gains and motion frequencies{rest}. The numbers of the paper are given for "
         "comparison. They are from a real robot, whose truth is not known.",
     )

@@ -133,7 +133,7 @@ def common_error_table(result: dict[str, Any]) -> Table:
     note = (
         "True minus known value, in the unit at the end of the name; geometric errors are in m and "
         "rad. Centres of mass are first moments of all bodies of a kind. A visual servo "
-        "compensates errors of the poses, so that the record can tell little of them."
+        "compensates errors of the poses, which the record therefore hardly shows."
         f"{_shares(found)}"
     )
     header = ("error", "prior standard deviation", "estimate ± standard deviation")
@@ -228,11 +228,11 @@ def prediction_table(result: dict[str, Any]) -> Table:
         # Without a prediction, the deviation is that from the identified model.
         actual = rms_row(predicted if "position_rms_um" in predicted else run["true"])
         rows.append(
-            (f"{n}: found", *_rms(actual), number(predicted.get("normalised_squared_error")))
+            (f"{n}: actual", *_rms(actual), number(predicted.get("normalised_squared_error")))
         )
     return Table(
         "Predicted and actual distance of the true robot from the predicted poses, RMS",
-        ("run", *AXIS_HEADER, "found²/predicted²"),
+        ("run", *AXIS_HEADER, "actual²/predicted²"),
         tuple(rows),
         "Poses are predicted by the identified model and the estimated errors common to all "
         "frames. The predicted distance follows from the uncertainty of both, and from the noise "

@@ -251,8 +251,8 @@ def _cause(consistent: bool | None, result: dict[str, Any]) -> str:
             "alone cannot tell."
         )
     return (
-        "The errors of the cameras are larger than they state, or not random: the cause can be the "
-        "cameras or the model."
+        "The errors of the cameras are larger than the cameras state, or not random: the cause can "
+        "be the cameras or the model."
     )
 
 

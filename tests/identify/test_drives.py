@@ -218,9 +218,8 @@ def test_the_report_says_how_the_law_is_known():
     }
     said = drive_sentence({"drive": usual | told})
     assert said == (
-        "The law of the drives is a PD: no integral; the record cannot tell: this is the most "
-        "probable (probability "
-        "70 %; pid 30 %)."
+        "The law of the drives is a PD (without an integral); the record does not decide, and this "
+        "law is the most probable (probability 70 %; pid 30 %)."
     )
     left = {"joint_pid.li": {"identifiable": False}, "joint_pid.lp": {"identifiable": True}}
     reasons = unidentified(

@@ -71,7 +71,7 @@ CASES = {
         lambda r: unexplained(
             r, drive={"law": "pid", "sure": False, "probabilities": {"pid": 0.6, "pd": 0.4}}
         ),
-        "law of the drives is pid, which was taken, or pd.",
+        "law of the drives is pid, which was used, or pd.",
         "cmmsim identify --out runs/mine --set model.drive=pd",
     ),
     "a cause of the catalogue with a setting": (

@@ -207,7 +207,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
         replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603))
     )
     chosen = (
-        "0.461 for the first random candidate, 0.46 for the middle one, and 0.529 for the "
+        "0.461 for the first random candidate, 0.46 for the median, and 0.529 for the "
         "trajectory that was used"
     )
     shown = (
