@@ -308,11 +308,11 @@ def compare_excitation(
     covariance = setup.sensor_plan.covariance(setup.robot.home_pose)
     known = knowledge(setup.side, scenario.identification, times, covariance)
     found = compare_methods(design, known, setup.seed, progress)
-    figures = {**asdict(found), "scenario": scenario.name}
+    entry = {**asdict(found), "scenario": scenario.name}
     figure = comparison_figure(design.robot, design.settings, found)
-    save_files(folder, {"comparison.json": figures, "comparison.png": figure})
+    save_files(folder, {"comparison.json": entry, "comparison.png": figure})
     paper = PAPER if scenario.robot == PAPERS_ROBOT else None
-    tell(figures, json, quiet, lambda: _print_methods(found, folder, paper))
+    tell(entry, json, quiet, lambda: _print_methods(found, folder, paper))
 
 
 def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:

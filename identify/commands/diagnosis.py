@@ -49,9 +49,9 @@ def diagnose(
     Each cause of a catalogue, such as the zero of a joint or the clock of the commands, is judged
     by the share of the misfit that it explains. The best one is fitted beside the parameters, then
     the others are judged again. cmmsim identify does the same if noise does not explain the record,
-    unless the drift watch of the cameras has warned. The output begins with a line that says so if
-    no cause is needed. A cause of your own is a function (run, size) that returns the model of the
-    run with this cause, see identify.diagnosis.diagnose.
+    unless the drift watch of the cameras has warned. If no cause is needed, the first line says so.
+    A cause of your own is a function (run, size) that returns the model of the run with this cause,
+    see identify.diagnosis.diagnose.
 
     Reads scenario.toml, experiment.nc and result.json of the folder.
 

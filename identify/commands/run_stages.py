@@ -239,9 +239,9 @@ def identify(
     log of another program: an export of Motive or Vicon, or a bag of ROS 2 or MCAP.
 
     Units are m, rad and s. If the rows are one frame apart, begin at rest and have a reference, the
-    model closes its own loop. Otherwise, the logged commands drive the model: times may have any
-    distance, the record may begin in motion, and rows may be missing. A lost frame has empty
-    measured columns. If a rule is broken, the error names the line or the frame.
+    model closes its own loop. Otherwise, the logged commands drive the model: rows may have any
+    times or be missing, and the record may begin in motion. A lost frame has empty measured
+    columns. If a rule is broken, the error names the line or the frame.
 
     Writes result.json, which is also the JSON, and covariance.nc into the folder. From a record of
     your own it also writes scenario.toml, experiment.nc and model.nc; continue with cmmsim report,

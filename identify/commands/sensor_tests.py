@@ -252,9 +252,9 @@ def _columns(condition: "Condition") -> dict[str, float]:
 
 def _row(score: "Score") -> dict[str, Any]:
     """Return a score as a flat row."""
-    figures = asdict(score)
-    del figures["condition"]
-    return {"detector": figures.pop("detector"), **_columns(score.condition), **figures}
+    values = asdict(score)
+    del values["condition"]
+    return {"detector": values.pop("detector"), **_columns(score.condition), **values}
 
 
 def _print_marks(scores: "list[MarkScore]", poses: int) -> None:
