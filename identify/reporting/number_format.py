@@ -14,7 +14,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Format a number with so many significant digits. None, NaN and infinity are "-"."""
+    """Format a number with ``digits`` significant digits, or "-" if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return "-"
     mantissa, exponent, power = f"{value:.{digits}g}".partition("e")

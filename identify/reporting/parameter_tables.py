@@ -82,7 +82,7 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     )
 
 
-# Gain whose variance shows whether the scale is fixed: if joints share their gains, and otherwise.
+# Gain whose variance shows whether the scale is fixed, for shared gains and for gains per joint.
 GAINS = ("joint_pid.lp", "joint1.lp")
 
 # Descriptions of the scale anchors.

@@ -219,7 +219,7 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
 def prediction_table(result: dict[str, Any]) -> Table:
     """Compare the predicted with the actual deviation of the true robot from the predicted poses.
 
-    Each validation trajectory has a row for either.
+    There are two rows for each validation trajectory.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):

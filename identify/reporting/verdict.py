@@ -89,7 +89,7 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     explained = all(goal.passed for goal in explanation_goals(result))
     sentences = [_residual_sentence(result, explained, consistent)]
     if unseen:
-        # That a model does not explain its record is stated first, because it then is wrong.
+        # If the model does not explain its record, it is wrong, and this is stated first.
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [
         f"Not met: {sentence(goal)}"
@@ -128,9 +128,9 @@ def sentence(goal: goals.Goal) -> str:
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
-    """Return the number of identified parameters, after two RMS errors of the worst axis.
+    """Return two RMS errors of the worst axis, and the number of identified parameters.
 
-    With validation runs, these are the errors of model and measured poses against the truth,
+    With validation runs, the errors are those of model and measured poses against the truth,
     otherwise those of both models against the measured poses.
     """
     identification = result["identification"]
@@ -190,7 +190,7 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
 
 
 def _distance(rows: Array, turns: bool) -> str:
-    """Format the largest of errors (n, 6) [µm, µrad]. Angles are left out unless it ``turns``."""
+    """Format the largest of errors (n, 6) [µm, µrad]. Without ``turns``, angles are left out."""
     position = float(rows[:, :3].max())
     orientation = float(rows[:, 3:].max())
     return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
