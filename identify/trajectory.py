@@ -109,7 +109,7 @@ class FourierTrajectory:
 
 
 def box_of(chart: Chart, position_m: float, orientation_rad: float) -> Array:
-    """Return the largest distances (m,) of the coordinates from home, m and rad."""
+    """Return the largest distance of each coordinate (m,) from home, m or rad."""
     return np.array([position_m if unit == "m" else orientation_rad for unit in chart.units])
 
 

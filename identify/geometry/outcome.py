@@ -22,7 +22,7 @@ from identify.geometry.static_experiment import true_poses
 from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
-CURVE = 12  # number of entries in the list of expected errors by the number of random poses
+CURVE = 12  # largest number of entries in the list of expected errors after random poses
 NOISY = 4.0  # excess of the noise ratio, in standard deviations, above which a warning is given
 
 

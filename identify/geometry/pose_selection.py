@@ -96,8 +96,8 @@ class Candidates:
 class Designer:
     """Designer of pose sets for a model.
 
-    ``covariance`` (6, 6) is the covariance of the mean pose, and ``joint_std`` (n,) the standard
-    deviation of the encoders' mean readings. ``criterion`` names the index.
+    ``covariance`` (6, 6) is that of a measured pose, the mean of its frames. ``joint_std`` (n,) is
+    the standard deviation of the encoders' mean readings. ``criterion`` names the index.
     """
 
     model: PoseModel

@@ -57,7 +57,7 @@ class Encoders:
         """
         if not self.resolution:
             return self.noise / readings**0.5
-        # The squared harmonics decrease as 1 / k^2, so thirty are enough.
+        # The squared harmonics decrease as 1 / k^2, so 29 are enough.
         waves = np.pi * np.arange(1, 30)
         steps = self.noise / self.resolution
         kept = self.resolution**2 * np.sum(np.exp(-4 * (waves * steps) ** 2) / waves**2) / 2

@@ -19,7 +19,7 @@ from identify.files.run_folder import load_result
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
 # Two poses differ if a joint differs by more than this number of standard deviations.
 APART = 10.0
-ROUNDING = 1e-9  # lower bound of this difference, rad or m
+ROUNDING = 1e-9  # lower bound of the difference by which two poses differ, rad or m
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:
 
 # Largest allowed difference between read and expected motion, as a fraction of the expected motion.
 WRONG = 0.2
-# Lower bound of the expected motion (rms) in this fraction, as a fraction of the travel.
+# Least expected motion (rms) to which the difference is related, as a fraction of the travel.
 STILL = 0.1
 
 # Ratios of readings in wrong units to right readings. The key is True for sliding actuators.

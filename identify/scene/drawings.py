@@ -291,7 +291,6 @@ def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float 
         linewidths=0.6,
     )
     if arrows is not None and len(centres):
-        # Errors of a hundredth of a pixel are visible only if enlarged.
         errors = arrows * (centres - found.expected[side])
         axes.quiver(
             *centres.T,

@@ -79,7 +79,7 @@ class Painter:
         lit = normals[facing] @ LIGHT / lengths
         bright = SHADE + (1 - SHADE) * np.maximum(lit, 0.0)
         base = np.array(to_rgb(colour))
-        # Closed triangles have an outline, which fills the seams between pieces.
+        # The outline of a closed triangle fills the seams between pieces.
         closed = self.pixels(triangles[facing])[:, [0, 1, 2, 0]]
         for flat, middle, brightness in zip(closed, middles[facing], bright, strict=True):
             self._add(middle, flat, (*(brightness * base), 1.0), None, 0.5, towards)

@@ -308,7 +308,7 @@ def estimators_figure(scores: Sequence[Score]) -> "Figure":
 
     A value that is missing, for example of an unstable model, or zero has no point.
     """
-    from matplotlib.figure import Figure  # rows of studies compare and draw nothing
+    from matplotlib.figure import Figure  # late, because rows of studies draw nothing
 
     figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
     heights = np.arange(len(scores))[::-1]

@@ -91,7 +91,7 @@ class Variation:
 def variation(results: Sequence[IdentificationResult]) -> Variation:
     """Return the variation of estimates from several identifications of one robot.
 
-    Raises EstimationError if there are fewer than three.
+    Raises EstimationError for fewer than three identifications.
     """
     check_count(len(results))
     estimates = np.array([r.estimate for r in results])
@@ -122,7 +122,7 @@ def identify_each(
 ) -> list[IdentificationResult]:
     """Identify from each record separately.
 
-    Raises the errors of `identify`, and EstimationError if there are too few records.
+    Raises the errors of `identify`, and EstimationError for fewer than three records.
     """
     check_count(len(records))
     results = []

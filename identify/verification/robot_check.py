@@ -37,7 +37,7 @@ NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that coun
 def check_robot(
     robot: Robot, parameters: Array, around: CheckSettings, progress: Progress | None = None
 ) -> list[Finding]:
-    """Return all findings about a robot with all its parameters."""
+    """Return all findings about a robot. `parameters` are dynamic parameters, then gains."""
     # Each check is a function, so that progress can be shown between checks.
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
