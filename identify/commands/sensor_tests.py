@@ -131,6 +131,7 @@ def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
     typer.echo(f"report: {folder / 'acceptance.md'}")
 
 
+# Default conditions of `detectors`.
 RADII_PX = (2.5, 5.0, 10.0)
 NOISES_PERCENT = (0.2, 1.0, 5.0)
 TILTS_DEG = (0.0, 30.0, 60.0)

@@ -67,6 +67,7 @@ def _leg(axes: Any, leg: Array) -> None:
 
 
 def _one(axes: Any, leg: Array, home: Array) -> None:
+    """Draw one leg with the points and vectors of the text, and the middles of its rods."""
     _leg(axes, leg)
     base, tip, joint = leg
     for name, point in zip(("Bᵢ", "Tᵢ", "Aᵢ"), leg, strict=True):

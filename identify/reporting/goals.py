@@ -32,6 +32,7 @@ TEACHING = "teaching"  # kind of the errors of teaching, which every run has, an
 
 COMMON_ERRORS = "the estimated errors that all frames share"
 
+# Names of the goals.
 UNSEEN_POSITION = "validation motion, position"
 UNSEEN_ORIENTATION = "validation motion, orientation"
 SENSOR_POSITION = "cameras, position"

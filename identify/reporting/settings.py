@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 from identify.scenario import load_scenario, scenario_names
 
-# Name of the built-in scenario with the settings of the paper. Scenarios without a built-in name
-# are compared with it.
+# Built-in scenario of the paper, with which scenarios without a built-in name are compared.
 BUILT_IN_PAPER = "paper"
 
 

@@ -290,10 +290,7 @@ def _rms(values: list[float]) -> list[str]:
 
 
 def sums_of(identification: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the base parameters that combine several parameters.
-
-    A base parameter of one member is a parameter itself, and is left out.
-    """
+    """Return the base parameters that combine several parameters."""
     groups = identification.get("groups", {}).values()
     return [group for group in groups if len(group["coefficients"]) > 1]
 

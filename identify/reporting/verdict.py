@@ -233,6 +233,7 @@ def _moved(result: dict[str, Any]) -> bool:
 
 
 def _cause(consistent: bool | None, result: dict[str, Any]) -> str:
+    """State the possible cause of residuals that are more than noise."""
     # If the cameras have moved, the measurement is wrong for any model.
     if warning := _drift_warning(result):
         again = "Calibrate them again; the" if _moved(result) else "The"
@@ -260,6 +261,7 @@ EXPLAINED = "The identified model explains the record to within the cameras' noi
 
 
 def _disagreement(consistent: bool | None, result: dict[str, Any]) -> str:
+    """Return the headline for a model that does not explain the record."""
     if _drift_warning(result):
         found = (
             "the cameras have lost their calibration"

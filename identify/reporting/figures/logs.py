@@ -17,7 +17,7 @@ from identify.reporting.figures.style import (
     panel_grid,
 )
 
-LENGTH, ANGLE = slice(0, 3), slice(3, 6)
+LENGTH, ANGLE = slice(0, 3), slice(3, 6)  # components of a pose
 
 
 def interval_figure(pose_time: Array, command_time: Array) -> Figure:
