@@ -160,12 +160,14 @@ def cmmsim_sensor(
 ) -> Sensor:
     """Sensor of the test's scenario at the start of a run.
 
-    Its noise depends on the seed of the test. All tests share the results of teaching.
+    Its noise depends on the seed of the test. Tests with the same sensor share the results of
+    teaching.
     """
     from identify.setup import Setup
 
+    # all that `SensorPlan.make` depends on: the robot's legs can hide stickers
     key = cmmsim_scenario.model_dump_json(
-        include={"sensor", "sensor_changes", "timing", "renderer"}
+        include={"robot", "sensor", "sensor_changes", "timing", "renderer", "pose_method", "rig"}
     )
     plan = Setup(cmmsim_scenario).sensor_plan
     if key not in cmmsim_taught:

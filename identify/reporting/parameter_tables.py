@@ -7,6 +7,7 @@ identified.
 from collections.abc import Mapping
 from typing import Any
 
+from identify.estimation.explanation import MISFIT, Misfit
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, RESTS_ON_PRIOR
 from identify.loop_parameters import is_gain
 from identify.reporting.number_format import interval, number, rounded, with_deviation
@@ -205,8 +206,8 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     alone = {name for weights in coefficients for name in weights if len(weights) == 1}
     summed = {name for weights in coefficients for name in weights if len(weights) > 1}
     unknown = [name for name, p in parameters.items() if not p["identifiable"]]
-    # If no parameter is identified, it is assumed that the model does not explain the record.
-    if unknown and len(unknown) == len(parameters):
+    misfit = [identification[name] for name in MISFIT if name in identification]
+    if misfit and Misfit(*misfit).decides:
         return [("the model does not explain the record, and no estimate can be trusted", unknown)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
     shown = (alone | set(filter(is_gain, parameters))) - fixed

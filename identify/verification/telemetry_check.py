@@ -101,10 +101,10 @@ def _gaps(logged: LoggedRun) -> Iterator[Finding]:
     lost = max(due - int(poses.ok.sum()), 0)
     yield Finding(
         "lost poses",
-        lost <= MINIMUM_GOOD_SHARE * due,
+        lost <= (1 - MINIMUM_GOOD_SHARE) * due,
         lost / due,
         f"{lost} of {due} poses are empty or missing, in {len(logged.gaps)} gaps",
-        limit=MINIMUM_GOOD_SHARE,
+        limit=1 - MINIMUM_GOOD_SHARE,
     )
     if not len(logged.gaps):
         return

@@ -236,9 +236,13 @@ def test_the_sensor_is_taught_once_and_its_noise_is_that_of_the_test(project):
         TAUGHT.append(cmmsim_sensor.taught)
         accuracy.record("x", cmmsim_sensor.measure(cmmsim_sensor.home).pose[0] * 1e6, unit="um")
         assert all(taught is TAUGHT[0] for taught in TAUGHT)
+
+    @pytest.mark.cmmsim(robot="rss6_coplanar")
+    def test_legs_of_another_robot(cmmsim_sensor):
+        assert cmmsim_sensor.taught is not TAUGHT[0]
     """
     done = project(body, "--accuracy-save", "before")
-    done.assert_outcomes(passed=2)
+    done.assert_outcomes(passed=3)
     one, two = (line.split()[1] for line in done.outlines if line.startswith("  x "))
     assert one != two
     again = project(body, "--accuracy-compare", "before")

@@ -572,7 +572,10 @@ def test_what_is_not_identified_has_its_reason():
     assert [names for _, names in reasons] == [["summed"], ["weak", "joint_pid.li"], ["unseen"]]
     for entry in entries.values():
         entry["identifiable"] = False
-    ((reason, names),) = parameter_tables.unidentified({"parameters": entries, "groups": groups})
+    found = {"parameters": entries, "groups": groups}
+    found |= {"noise_ratio": 3.3, "expected_noise_ratio": 1.1, "noise_ratio_std": 0.1}
+    assert len(parameter_tables.unidentified(found)) > 1, "a short record is no wrong model"
+    ((reason, names),) = parameter_tables.unidentified(found | {"noise_ratio": 3.4})
     assert reason.startswith("the model does not explain the record")
     assert len(names) == 5
 

@@ -243,7 +243,7 @@ def budget_figure(budget: Budget, identified: Mapping[str, bool]) -> Figure:
             color=colours[number % len(colours)],
             edgecolor=PAPER,
             linewidth=0.3,
-            hatch=HATCHES[number // len(colours) % len(HATCHES)],
+            hatch=HATCHES[(number + number // len(colours)) % len(HATCHES)],
             label=budget.words[source],
         )
         left += shares[:, source]

@@ -81,12 +81,12 @@ def path_figure(time: Array, poses: Array) -> Figure:
         )
         path = 1e3 * (poses[:, columns] - poses[0, columns])
         if len(columns) == 1:
-            path = np.column_stack([time, path])
+            path = np.column_stack([elapsed, path])
         _draw_path(axes, path, marks)
         labels = [f"{COMPONENTS[i]} [{unit}]" for i in columns]
-        for axis, label in zip(
-            "xyz", labels if len(columns) > 1 else ["time [s]", *labels], strict=False
-        ):
+        if len(columns) == 1:
+            labels = ["time from the start [s]", *labels]
+        for axis, label in zip("xyz", labels, strict=False):
             getattr(axes, f"set_{axis}label")(label)
         letter = f"({'ab'[panel - 1]}) " if len(parts) > 1 else ""
         axes.set_title(f"{letter}{name} from the start")
@@ -97,7 +97,7 @@ def path_figure(time: Array, poses: Array) -> Figure:
             axes.set_aspect("equal" if len(columns) == 2 else "auto", adjustable="datalim")
         drawn.append((axes, path))
     for axes, path in drawn:
-        _label_times(axes, path, marks, time)
+        _label_times(axes, path, marks, elapsed)
     return figure
 
 
@@ -121,7 +121,7 @@ AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], 
 
 
 def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Write the time beside each mark of a path, unless other labels and marks leave no room."""
+    """Write its time beside each mark of a path, unless other labels and marks leave no room."""
     axes.figure.draw_without_rendering()
     flat = path[marks]
     if path.shape[1] == 3:
@@ -129,7 +129,7 @@ def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -
     points = axes.transData.transform(flat) * 72 / axes.figure.dpi
     taken = [(point - 2.0, point + 2.0) for point in points]
     for k, point, anchor in zip(marks, points, flat, strict=True):
-        label = "start" if k == marks[0] else f"{time[k] - time[0]:.3g} s"
+        label = "start" if k == marks[0] else f"{time[k]:.3g} s"
         half = np.array([0.31 * LABEL * len(label), 0.6 * LABEL])
         for step in (step for far in (3.0, 9.0, 15.0) for step in AROUND * (far + half)):
             low, high = point + step - half, point + step + half
