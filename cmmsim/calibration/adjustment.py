@@ -273,8 +273,9 @@ def _minimise(
             if gain < SMALLEST_GAIN:
                 return state, step
         elif damping > 1e6 or abs(common @ normal.rhs[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost:
-            # Either not even a tiny step decreases the cost, or the linear model predicts almost
-            # no decrease, so that the increase is a rounding error.
+            # Either not even a tiny step decreases the cost, because the residuals are rounding
+            # errors of points without noise, or the linear model predicts almost no decrease, so
+            # that the increase is a rounding error.
             return state, step
         else:
             damping *= 10.0

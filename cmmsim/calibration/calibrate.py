@@ -144,7 +144,8 @@ def _without_misfits(
     """
     judged = list(pairs)
     boards = start.left_from_boards.copy()
-    for _ in range(ROUNDS):
+    # the last adjustment follows the last rejection, so that no rejected image takes part in it
+    for rejections in range(ROUNDS + 1):
         _require_pairs(judged, options)
         seen = sorted(views_of(judged, 0).keys() | views_of(judged, 1).keys())
         sightings = sightings_of([judged[k] for k in seen])
@@ -157,7 +158,7 @@ def _without_misfits(
         rms = _image_rms(solved, sightings)
         usual = float(np.nanmedian(rms))
         worst = np.argwhere(rms > max(LARGEST_RMS_RATIO * usual, ROUNDING_PX))
-        if not len(worst):
+        if not len(worst) or rejections == ROUNDS:
             break
         for side, k in worst:
             reason = (

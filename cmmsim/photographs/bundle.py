@@ -19,11 +19,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cmmsim.errors import LostError
 from cmmsim.geometry.disc_image import centre_offset, sticker_outlines
 from cmmsim.geometry.pose import Array, rotation_exp, skew
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 
-# The adjustment ends after this many steps, converged or not.
+# The adjustment fails after this many steps. Three are usual.
 MOST_STEPS = 12
 # The adjustment ends when a step changes all coordinates of stickers by less than this, m.
 CONVERGED = 1e-9
@@ -160,6 +161,7 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
     ``known`` is the rig as calibrated, and ``prior`` (24, 24) the covariance of its parameters.
     Parameters with zero variance do not change. The covariance of the result assumes the stated
     noise. The ``factor`` of the result is well above 1 if the residuals are larger than this noise.
+    Raises LostError if the steps do not converge.
     """
     state = start
     free = np.flatnonzero(np.diag(prior) > 0.0)
@@ -169,6 +171,11 @@ def adjust(seen: Observations, start: BundleState, known: StereoRig, prior: Arra
         if np.abs(places).max() < CONVERGED:
             break
         state = state.moved(known, places, poses, rig)
+    else:
+        raise LostError(
+            f"the adjustment of the photographs has not converged in {MOST_STEPS} steps: the last "
+            f"one moves a sticker by {1e3 * np.abs(places).max():.2g} mm"
+        )
     residuals = state.residuals(seen)
     squares = np.einsum(
         "smi,smij,smj->m", residuals, np.linalg.inv(seen.covariances), residuals, optimize=True

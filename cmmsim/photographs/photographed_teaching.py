@@ -181,8 +181,8 @@ def _taught(
 ) -> PhotographedTeaching:
     """Match and adjust the stickers, and fit the planes of the frames.
 
-    Raises LostError if a body is not found, if a plane has too few stickers, or if fewer than two
-    pairs agree.
+    Raises LostError if a body is not found, if a plane has too few stickers, if fewer than two
+    pairs agree, or if an adjustment does not converge.
     """
     base, platform = whole
     pairs = [candidates(one, observer) for one in spots]

@@ -73,18 +73,19 @@ def adjust_robustly(
     """Adjust a state to the observations that agree; ``names`` (K,) are those of the pairs.
 
     The ``factor`` of the result is that before the noise is enlarged. Raises LostError if fewer
-    than two pairs remain.
+    than two pairs remain, or if an adjustment does not converge.
     """
     kept = np.ones(len(seen.pair), dtype=bool)
     left_out: tuple[dict[int, str], dict[int, str]] = ({}, {})
     state = start
-    for _ in range(ROUNDS):
+    # the last adjustment follows the last rejection, so that it uses no centre that is left out
+    for rejections in range(ROUNDS + 1):
         used = seen.selected(kept)
         bundle = adjust(used, state, known, prior)
         state = bundle.state
         scale = max(1.0, float(np.median(bundle.squares)) / MEDIAN_SQUARE)
         worst = _worst(used, bundle.squares / scale)
-        if not len(worst):
+        if not len(worst) or rejections == ROUNDS:
             break
         kept[np.flatnonzero(kept)[worst]] = False
         left_out = _left_out(seen, state, kept, names)

@@ -2,18 +2,20 @@
 together, stickers that moved.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import EllipseFits
+from cmmsim.errors import LostError
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
-from cmmsim.photographs import photographed_teaching
+from cmmsim.photographs import bundle, photographed_teaching, rejection
 from cmmsim.photographs.pairs import Photograph
 from tests.cmmsim.photographed import spread_poses
+from tests.cmmsim.sensors import refused
 
 COUNT = 8
 
@@ -138,6 +140,27 @@ def test_a_sticker_that_moved_between_pairs_is_left_out_and_measured_without(
     one = taught.measure(taught.home)
     assert one.ok
     assert (f"{plane}{sticker + 1}" in one.target_ids) == (body == "base")
+
+
+@pytest.mark.parametrize("rounds", [1, 40])
+def test_a_centre_that_is_left_out_takes_no_part_in_the_result(sensor, good, rounds, monkeypatch):
+    monkeypatch.setattr(rejection, "ROUNDS", rounds)
+    left, right = good[2]
+    wrong = left.centres.copy()
+    wrong[0] += (0.6, 0.0)
+    found = teach(sensor, [*good[:2], (replace(left, centres=wrong), right), *good[3:]])
+    used = len(teach(sensor, good).observations.pair)
+    assert len(found.observations.pair) == len(found.bundle.squares) == used - 1
+
+
+def test_an_adjustment_that_does_not_converge_fails(sensor, good):
+    found = teach(sensor, good)
+    far = replace(found.bundle.state, places=2.0 * found.bundle.state.places)
+    refused(
+        lambda: bundle.adjust(found.observations, far, sensor.rig, np.zeros((24, 24))),
+        r"has not converged in 12 steps: the last one moves a sticker by [\d.e+]+ mm",
+        LostError,
+    )
 
 
 def test_a_sensor_can_be_taught_again_after_it_lacked_a_sticker(good):

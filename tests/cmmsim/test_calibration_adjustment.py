@@ -137,7 +137,9 @@ def test_each_picture_may_be_read_in_any_order_of_a_symmetric_board():
     assert np.abs((calibrate(board, mixed, SIZE).values - plain.values) / plain.std).max() < 0.01
 
 
-def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons():
+@pytest.mark.parametrize("rounds", [1, 5])
+def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons(rounds, monkeypatch):
+    monkeypatch.setitem(calibrate.__globals__, "ROUNDS", rounds)
     pairs, rng = noisy_pairs(9), np.random.default_rng(9)
     plain, worse = calibrate(BOARD, pairs, SIZE), list(pairs)
     worse[3] = PairView("03.png", pairs[3].left, pairs[4].right)
@@ -149,6 +151,7 @@ def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons():
     assert re.fullmatch(
         r"left: rms 2\.\d\d px, more than 4 times the median of 0\.0\d px", found.rejected["07.png"]
     )
+    assert [list(view.rms_px) for view in found.used if view.name == "07.png"] == [["right"]]
     assert np.abs((found.values - plain.values) / plain.std).max() < 3.0
 
 
