@@ -38,7 +38,7 @@ class Board(Section):
     spacing     distance between neighbouring points, m; for asymmetric_dots the distance between
                 rows, while dots of the same row are twice as far apart
     radius      radius of the dots, m; only for dots
-    dark        True if dots are darker than the board; without effect for boards of squares
+    dark        True if dots are darker than the board, the default; only for dots
     marker      side of the markers with their dark border, m; only for charuco
     dictionary  OpenCV's name of the markers' dictionary, such as "5X5_100" or "APRILTAG_36h11";
                 only for charuco
@@ -79,10 +79,10 @@ class Board(Section):
 
     @model_validator(mode="after")
     def _dots_fit(self) -> Board:
-        """Raise ValueError for dots that nearly touch, or for a radius that is missing or extra."""
+        """Raise ValueError for a radius that is missing or too large, or for extra keys of dots."""
         if self.has_squares:
-            if self.radius is not None:
-                raise ValueError(f"a {self.kind} has no dots; remove radius")
+            if self.radius is not None or "dark" in self.model_fields_set:
+                raise ValueError(f"a {self.kind} has no dots; remove radius and dark")
         elif self.radius is None:
             raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
         elif self.radius > 0.4 * self.nearest:

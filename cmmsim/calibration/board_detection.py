@@ -290,9 +290,9 @@ def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
     image and in the whole image.
     """
     rough = read_at_once(bright, board) if board.kind == "dots" else None
-    for side in (FIND_SIDE_PX, max(bright.shape)):
+    for scale in sorted({min(1.0, FIND_SIDE_PX / max(bright.shape)), 1.0}):
         if rough is None:
-            rough = found_by_opencv(bright, board, min(1.0, side / max(bright.shape)))
+            rough = found_by_opencv(bright, board, scale)
     return rough
 
 

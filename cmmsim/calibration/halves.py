@@ -177,7 +177,7 @@ class Halves:
     """
 
     squares: np.ndarray
-    distances: Sequence[Distances] = ()
+    distances: Sequence[Distances]
 
     @property
     def mean_square(self) -> float:

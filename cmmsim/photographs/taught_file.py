@@ -87,34 +87,36 @@ def _taught(content: dict[str, Any]) -> Taught:
     """Return the result of teaching that the content of a file states."""
     setup = content["setup"]
     rig = content["rig"]
-    by_rig = content["by_rig"]
-
-    def numbers(name: str, *shape: int) -> Array:
-        values = np.array(content[name], dtype=float).reshape(shape)
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} is not finite")
-        return values
-
     return Taught(
         str(content["sensor"]),
-        numbers("base_from_camera", 4, 4),
-        numbers("base_covariance", 6, 6),
-        numbers("platform_places", -1, 3),
-        numbers("place_covariances", -1, 3, 3),
-        numbers("platform_covariance", 6, 6),
-        numbers("base_places", -1, 3),
+        _numbers(content, "base_from_camera", 4, 4),
+        _numbers(content, "base_covariance", 6, 6),
+        _numbers(content, "platform_places", -1, 3),
+        _numbers(content, "place_covariances", -1, 3, 3),
+        _numbers(content, "platform_covariance", 6, 6),
+        _numbers(content, "base_places", -1, 3),
         "" if setup is None else json.dumps(setup, sort_keys=True),
         None if rig is None else _known(rig),
-        None if by_rig is None else np.array(by_rig, dtype=float),
+        None
+        if content["by_rig"] is None
+        else _numbers(content, "by_rig", -1, len(PARAMETER_NAMES)),
         tuple(str(name) for name in content["platform_stickers"]),
-        None if content["sticker_radius"] is None else float(content["sticker_radius"]),
+        None if content["sticker_radius"] is None else float(_numbers(content, "sticker_radius")),
     )
 
 
 def _known(content: dict[str, Any]) -> KnownRig:
-    values = np.array([content["parameters"][name] for name in PARAMETER_NAMES], dtype=float)
+    values = np.array([_numbers(content["parameters"], name) for name in PARAMETER_NAMES])
     width, height = (int(side) for side in content["size_px"])
     left, right = (camera_from(each, width, height) for each in values[:18].reshape(2, 9))
     rig = StereoRig(left, right, rigid(rotation_exp(values[21:]), values[18:21]))
     covariance = np.array(content["covariance"], dtype=float)
-    return KnownRig(rig, covariance, float(content["exposure_std_s"]))
+    return KnownRig(rig, covariance, float(_numbers(content, "exposure_std_s")))
+
+
+def _numbers(content: dict[str, Any], name: str, *shape: int) -> Array:
+    """Return an entry as an array. Raises ValueError if a number is missing or not finite."""
+    values = np.array(content[name], dtype=float).reshape(shape)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} is not finite")
+    return values

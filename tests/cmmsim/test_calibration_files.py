@@ -60,6 +60,7 @@ def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
         (("5X5_100", "5x5_30"), "unknown dictionary '5x5_30': valid are 4X4_100, .*APRILTAG_36H11"),
         (("columns = 8", "columns = 30"), "31 x 7 squares have 108 markers, .*5X5_100 has 100"),
         (("spacing", "radius = 0.01\nspacing"), "a charuco has no dots"),
+        (("spacing", "dark = false\nspacing"), "a charuco has no dots; remove radius and dark"),
     ],
 )
 def test_bad_charuco_board_is_refused_with_evidence(tmp_path, changed, evidence):

@@ -196,6 +196,14 @@ def test_both_shapes_of_opencvs_answer_are_one(monkeypatch):
         assert np.abs(pixel_errors(PERFECT, ASYMMETRIC, *drawn)).max() < 0.1
 
 
+@pytest.mark.parametrize(("width", "scales"), [(1600, [1.0]), (2000, [0.8, 1.0])])
+def test_opencv_searches_each_size_of_an_image_once(width, scales, monkeypatch):
+    tried = []
+    monkeypatch.setattr(board_detection, "found_by_opencv", lambda *tail: tried.append(tail[2]))
+    assert board_detection.search_dots(np.zeros((40, width), np.uint8), DOTS) is None
+    assert tried == scales
+
+
 def test_a_chessboard_whose_squares_were_counted_in_place_of_its_corners_is_told():
     squares = np.kron(np.indices((7, 9)).sum(axis=0) % 2, np.ones((40, 40)))
     image = np.pad(255 * squares, 60, constant_values=255).astype(np.uint8)

@@ -2,7 +2,9 @@
 measured with them.
 """
 
+import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from cmmsim.from_photographs import sensor_for
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import apply, invert, pose_to_transform, rotation_log
 from cmmsim.photographs.pairs import numbered
+from cmmsim.photographs.taught_file import taught_as_dict
 from cmmsim.uncertainty.known_rig import PHOTOGRAPHED, KnownRig
 from tests.cmmsim.photographed import photographed, spread_poses
 from tests.cmmsim.plain import rigid_start
@@ -248,6 +251,37 @@ def test_a_sensor_file_states_the_covariance_of_its_cameras(tmp_path):
         lambda: sensor_for(path),
         "mine.toml: rig.covariance.matrix: .*left.fx_px is negative",
         cmmsim.SensorFileError,
+    )
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        ("by_rig", 3, 5),
+        ("sticker_radius",),
+        ("rig", "exposure_std_s"),
+        ("rig", "parameters", "left.k1"),
+        ("rig", "parameters", "right_from_left.tx_m"),
+    ],
+)
+def test_a_taught_file_with_a_number_that_is_not_finite_is_refused(tmp_path, entry):
+    exact = cmmsim.Taught.without_error("mine", np.eye(4), np.zeros((3, 3)), np.zeros((0, 3)))
+    known = KnownRig(statistical().rig, np.zeros((24, 24)))
+    taught = replace(exact, known=known, by_rig=np.zeros((15, 24)), radius=0.003)
+    part = content = taught_as_dict(taught)
+    path = tmp_path / "taught.json"
+    path.write_text(json.dumps(content))
+    assert cmmsim.read_taught(path).known.rig.parameters == pytest.approx(known.rig.parameters)
+    *parents, last = entry
+    for key in parents:
+        part = part[key]
+    part[last] = np.nan
+    path.write_text(json.dumps(content))
+    name = next(key for key in reversed(entry) if isinstance(key, str))
+    refused(
+        lambda: cmmsim.read_taught(path),
+        f"no taught.json of `cmmsim teach`: ValueError {name} is not finite",
+        cmmsim.TeachingError,
     )
 
 
