@@ -225,8 +225,9 @@ class Sensor(Instrument):
         # One random number per frame, so that runs over different poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
-            share = f"a share of {self.timing.dropout:.3g} drops out"
-            measured = lost_measurement(f"dropped frame ({share})")
+            measured = lost_measurement(
+                f"dropped frame (with a probability of {self.timing.dropout:.3g})"
+            )
         else:
             measured = self._tracker.measure(images)
         if self._watch is not None:
