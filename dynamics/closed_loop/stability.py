@@ -27,6 +27,7 @@ from dynamics.robot import Robot
 
 SLOWEST_HZ = 0.5  # lowest frame rate, Hz, in the search for the limit of stability
 MOST_GAIN = 100.0  # largest factor of the gains in the search; the smallest is 1 / MOST_GAIN
+MOST_LATE = 50  # largest number of frames in the latency, up to which higher rates are tried
 SEARCH_RATIO = 1.1  # ratio of consecutive values in a search, before bisection finds the limit
 
 
@@ -156,8 +157,10 @@ def lowest_frame_rate(
 
     The search begins at the rate of the settings. If the loop is stable there, the result is lower,
     and SLOWEST_HZ if all rates down to that are stable. If it is unstable there, the result is the
-    next higher rate at which the loop becomes stable, or NaN if none is found. The highest rate in
-    the search is 100 times the first, or the rate at which the latency is 50 frames.
+    next higher rate at which the loop becomes stable, or NaN if none is found. It can be unstable
+    again farther away, because the search ends at the first limit. The highest rate in the search
+    is 100 times the first, or the rate at which the latency is MOST_LATE frames, if it is higher
+    than the first.
     """
     rate = settings.timing.frame_rate_hz
     near = _near_rest(robot, parameters, pose, settings.drives)
@@ -166,11 +169,10 @@ def lowest_frame_rate(
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
         return _radius(near, replace(settings, timing=timing))
 
-    # the size of the map grows with the number of frames in the latency, which is at most 50 here
-    fastest = min(
-        100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf
-    )
-    return last_stable(radius, rate, SLOWEST_HZ, fastest)
+    # the size of the map grows with the number of frames in the latency
+    latency = settings.timing.latency_s
+    fastest = min(100 * rate, MOST_LATE / latency if latency else np.inf)
+    return last_stable(radius, rate, SLOWEST_HZ, max(fastest, rate))
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
@@ -185,7 +187,9 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
     if radius < 1:
         return f"{eigenvalue_text}: the loop is stable near the start"
     rate = lowest_frame_rate(*arguments)
-    elsewhere = f"stable from {rate:.3g} Hz on" if rate > 0 else "stable at no frame rate"
+    elsewhere = (
+        f"becomes stable at {rate:.3g} Hz" if rate > 0 else "no higher frame rate makes it stable"
+    )
     return f"{eigenvalue_text}: the loop is unstable at {hz:g} Hz, and {elsewhere}"
 
 
@@ -321,14 +325,15 @@ def last_stable(
     The limit is the first value at which the radius passes 1. If the loop is stable at the start,
     the search goes to `stable_end`, and returns that end if the loop is stable all the way. If it
     is unstable at the start, the search goes to `other_end`, and returns NaN if it finds no limit.
-    The search can miss a narrow range of values, because it proceeds in steps of SEARCH_RATIO.
+    The search can miss a narrow range of values, because it proceeds in steps of SEARCH_RATIO, and
+    does not look beyond the end.
     """
     stable = radius(start) < 1
     value = start
     end = stable_end if stable else other_end
-    ratio = SEARCH_RATIO if end > start else 1 / SEARCH_RATIO
-    while (value < end) == (ratio > 1):
-        following = value * ratio
+    nearest, ratio = (min, SEARCH_RATIO) if end > start else (max, 1 / SEARCH_RATIO)
+    while value != end:
+        following = nearest(value * ratio, end)
         if (radius(following) < 1) != stable:
             low = value
             high = following

@@ -79,10 +79,11 @@ def check_loop(
         text = text.replace(" until the loop is unstable", " for a stable loop")
     yield Finding("gain margin", factor > 1, factor, text, limit=1.0, relation=">")
     rate = stability.lowest_frame_rate(*arguments)
+    change = "stays stable down to" if radius < 1 else "becomes stable at"
     text = (
-        f"the loop is stable from {rate:.3g} Hz on with this latency"
+        f"with this latency, the loop {change} {rate:.3g} Hz"
         if rate > 0
-        else "no frame rate makes the loop stable"
+        else "no higher frame rate makes the loop stable"
     )
     yield Finding(
         "frame rate",

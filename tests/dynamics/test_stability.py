@@ -57,6 +57,25 @@ def test_small_deviations_follow_the_map_from_frame_to_frame(loop, hold, latency
     np.testing.assert_allclose((moved - still) / off, expected, atol=2e-5)
 
 
+@pytest.mark.parametrize(("radius", "ends_at"), [(0.5, 0.5), (2.0, 100.0)])
+def test_the_search_for_a_limit_ends_at_its_end(radius, ends_at):
+    tried = []
+    found = stability.last_stable(lambda at: tried.append(at) or radius, 60.0, 0.5, 100.0)
+    np.testing.assert_equal(found, ends_at if radius < 1 else np.nan)
+    assert tried[-1] == ends_at
+
+
+def test_no_lower_rate_is_tried_for_an_unstable_loop_of_many_frames_of_latency(loop, monkeypatch):
+    tried = []
+    monkeypatch.setattr(
+        stability, "_radius", lambda _, given: tried.append(given.timing.frame_rate_hz) or 2.0
+    )
+    settings = LoopSettings(SERVO, FrameTiming(60.0, 55 * PERIOD))
+    robot = loop.robot
+    rate = stability.lowest_frame_rate(robot, loop.parameters, settings, robot.home_pose)
+    np.testing.assert_equal((rate, min(tried)), (np.nan, 60.0))
+
+
 def test_the_loop_is_lost_where_the_limits_say(loop):
     """Gains and frame rate on both sides of their limits, in runs: small deviations die out, or
     grow until the robot leaves its reach."""

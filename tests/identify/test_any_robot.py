@@ -356,7 +356,7 @@ def test_a_loop_that_is_lost_says_its_eigenvalue_and_the_frame_rate_that_would_h
     reference = trajectory(0).reference(np.arange(600) / 60)
     with pytest.raises(
         LoopFailure,
-        match=r"eigenvalue .* is 1\.\d+, must be below 1: .* at 60 Hz, and stable from \d+ Hz on",
+        match=r"eigenvalue .* is 1\.\d+, must be below 1: .* at 60 Hz, and becomes stable at \d+ Hz",
     ):
         plant.run(reference)
 
