@@ -181,6 +181,8 @@ def equilibrium(
 
     Raises
     ------
+    ShapeError
+        If `pose` is not six finite numbers.
     UnreachablePoseError, SingularPoseError, ParameterError, SimulationError
         As for `simulate_servo`.
 
