@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dynamics.checks import shown
 from dynamics.engines.mechanism import Connection, Freedom, Mechanism, Solid
@@ -20,6 +21,7 @@ from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 MOST_BODIES = 120  # largest number of bodies of a robot
+MOST_FILES = 50  # largest number of files that a file includes, also through other files
 
 
 def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
@@ -43,12 +45,13 @@ def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
         raise RobotFileError(f"{path}: {error}") from None
 
 
-def _refuse_large(path: Path, including: tuple[Path, ...] = ()) -> int:
+def _refuse_large(path: Path, read: set[Path] | None = None) -> int:
     """Count the bodies of a file and of the files that it includes.
 
-    `including` are the files that include this one. Raises RobotFileError if the file has more than
-    MOST_BODIES bodies, or includes a file of another folder, itself, or files over too many levels.
+    `read` are the files that were read before. Raises RobotFileError if the file has more than
+    MOST_BODIES bodies, or includes a file of another folder, a file twice, or too many files.
     """
+    read = {path} if read is None else read
     content = read_bytes(path, str(path), RobotFileError, LARGEST_XML)
     bodies = 0
     for element in parse_xml(content, str(path), RobotFileError).iter():
@@ -59,14 +62,15 @@ def _refuse_large(path: Path, including: tuple[Path, ...] = ()) -> int:
             if (
                 name.is_absolute()
                 or ".." in name.parts
-                or included in including
-                or len(including) > 8
+                or included in read
+                or len(read) > MOST_FILES
             ):
                 raise RobotFileError(
                     f"{path} includes {shown(str(name))}; it may only include files of its own "
-                    "folder, and each of them once"
+                    f"folder, at most {MOST_FILES}, and each of them once"
                 )
-            bodies += _refuse_large(included, (*including, path, included))
+            read.add(included)
+            bodies += _refuse_large(included, read)
     if bodies > MOST_BODIES:
         raise RobotFileError(f"{path} has {bodies} bodies, a robot has at most {MOST_BODIES}")
     return bodies
@@ -163,27 +167,36 @@ def _joint_name(model: Any, joint: int) -> str:
 def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
     """Connection that closes a loop between two sites or two bodies, as a ball joint or a weld.
 
-    Raises RobotFileError if the loop is open at home. A weld of two bodies is not checked.
+    Raises RobotFileError if the loop is open at home.
     """
+    weld = model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD)
     first, second = (int(ids[equality]) for ids in (model.eq_obj1id, model.eq_obj2id))
     name = model.equality(equality).name or f"equality {equality}"
     if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
         points = [data.site_xpos[site] for site in (first, second)]
+        axes = [data.site_xmat[site].reshape(3, 3) for site in (first, second)]
         first, second = (int(model.site_bodyid[site]) for site in (first, second))
-    elif model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD):
-        return Connection(first, second, ())
     else:
-        anchors = model.eq_data[equality].reshape(-1)[:6].reshape(2, 3)
-        bodies = zip((first, second), anchors, strict=True)
-        points = [
-            data.xpos[body] + data.xmat[body].reshape(3, 3) @ anchor for body, anchor in bodies
-        ]
+        given = model.eq_data[equality]
+        # MuJoCo writes the anchor of a weld in the second body first
+        anchors = given[:6].reshape(2, 3)[:: -1 if weld else 1]
+        axes = [data.xmat[body].reshape(3, 3) for body in (first, second)]
+        bodies = zip((first, second), axes, anchors, strict=True)
+        points = [data.xpos[body] + turn @ anchor for body, turn, anchor in bodies]
+        if weld:
+            axes[0] = axes[0] @ Rotation.from_quat(given[6:10], scalar_first=True).as_matrix()
     gap = float(np.linalg.norm(points[0] - points[1]))
     if gap > SAME:
         raise RobotFileError(
             f"the loop {name} is open by {gap:.3g} m at home, must be closed to {SAME:g} m"
         )
-    if model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD):
+    if weld:
+        turn = float(Rotation.from_matrix(axes[0].T @ axes[1]).magnitude())
+        if turn > SAME:
+            raise RobotFileError(
+                f"the loop {name} is turned by {turn:.3g} rad at home, must be closed to {SAME:g} "
+                "rad"
+            )
         return Connection(first, second, ())
     return Connection(first, second, (Freedom("ball", name, points[0].copy(), np.full(3, np.nan)),))
 

@@ -293,6 +293,21 @@ def test_a_hand_written_model_accelerates_as_mujocos_bodies_in_closed_loops(tmp_
             r"loop2 is open by",
         ),
         (
+            '<connect site1="link_end3" site2="platform_joint3" name="loop3" />',
+            '<weld body1="link3" body2="platform" relpose="0 0 9 1 0 0 0" name="loop3" />',
+            r"loop3 is open by",
+        ),
+        (
+            '<connect site1="link_end3" site2="platform_joint3" name="loop3" />',
+            '<weld site1="link_end3" site2="platform_joint3" name="loop3" />',
+            r"loop3 is turned by",
+        ),
+        (
+            "<equality>",
+            '<include file="a.xml"/><include file="a.xml"/><equality>',
+            r"includes 'a\.xml'; it may only include .* at most 50, and each of them once",
+        ),
+        (
             "<equality>",
             '<equality><joint joint1="joint1" joint2="joint2"/>',
             r"equality 0 is of the kind joint",
@@ -312,6 +327,7 @@ def test_a_model_of_no_known_kind_is_refused_in_one_line(robot, old, new, words,
     )
     assert old in text
     (tmp_path / "robot.xml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    (tmp_path / "a.xml").write_text("<mujocoinclude/>", encoding="utf-8")
     assert re.search(words, refusal(RobotFileError, robot_of_mjcf, tmp_path / "robot.xml"))
 
 
