@@ -7,7 +7,6 @@ is read or refused within seconds.
 import json
 import re
 import tomllib
-from collections import Counter
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
@@ -171,17 +170,12 @@ def parse_json(text: str, source: str, error_class: type[Exception]) -> Any:
 def parse_yaml(content: bytes, source: str, error_class: type[Exception]) -> Any:
     """Content of YAML text with mappings, lists and names. Every scalar is returned as text.
 
-    Raises `error_class` for content that is not YAML, for aliases, for a key that occurs twice at
-    the top level, and for more than `DEEPEST` levels.
+    Raises `error_class` for content that is not YAML, for aliases, for a key that occurs twice in a
+    mapping, and for more than `DEEPEST` levels.
     """
     try:
         _check_events(yaml.parse(content, Loader=_YamlLoader), source, error_class)
-        node = yaml.compose(content, Loader=_YamlLoader)
-        if isinstance(node, yaml.MappingNode):
-            keys = Counter(str(key.value) for key, _ in node.value)
-            twice = [key for key, count in keys.items() if count > 1]
-            if twice:
-                raise error_class(f"{source} has the key {twice[0][:60]!r} twice")
+        _check_keys(yaml.compose(content, Loader=_YamlLoader), source, error_class)
         return yaml.load(content, Loader=_YamlLoader)
     except (yaml.YAMLError, ValueError) as error:
         raise error_class(f"cannot read {source}: {' '.join(str(error).split())}") from None
@@ -197,6 +191,22 @@ def _check_events(events: Iterable[Any], source: str, error_class: type[Exceptio
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
             raise error_class(f"{source} has lists and mappings more than {DEEPEST} deep")
+
+
+def _check_keys(node: yaml.Node | None, source: str, error_class: type[Exception]) -> None:
+    """Raise `error_class`, with line and key, for a key that occurs twice in a mapping."""
+    if isinstance(node, yaml.MappingNode):
+        keys = set()
+        for key, value in node.value:
+            name = str(key.value)
+            if name in keys:
+                line = key.start_mark.line + 1
+                raise error_class(f"{source} line {line} has the key {name[:60]!r} twice")
+            keys.add(name)
+            _check_keys(value, source, error_class)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_keys(item, source, error_class)
 
 
 def parse_xml(content: bytes, source: str, error_class: type[Exception]) -> Xml.Element:

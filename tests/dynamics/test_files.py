@@ -82,7 +82,8 @@ def test_a_file_that_is_large_endless_or_none_is_refused(tmp_path):
     [
         ("a: &a [x]\nb: [*a, *a]", "alias, *a"),
         ("[" * 90_000, "deep"),
-        ("a: [x]\na: [y]", "the key 'a' twice"),
+        ("a: [x]\na: [y]", "file x line 2 has the key 'a' twice"),
+        ("a:\n- b: x\n  c: y\n  b: z", "file x line 4 has the key 'b' twice"),
         ("a: [x", "cannot read"),
     ],
 )
