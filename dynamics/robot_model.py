@@ -114,7 +114,7 @@ class RobotModel:
             floats(name, value, theta.shape, error=ShapeError)
             for name, value in (("theta_dot", theta_dot), ("theta_ddot", theta_ddot))
         )
-        pose = self.robot.forward_kinematics(theta, initial_pose)
+        pose = self.robot._regular(self.robot.forward_kinematics(theta, initial_pose))
         basis = self.robot.geometry.chart.basis
         jacobian = self.robot.joint_jacobian(pose) @ basis
         twist = _solved(jacobian, rate) @ basis.T

@@ -7,9 +7,11 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 import yaml
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dynamics import RobotModel, load_robot
+from dynamics.errors import SingularPoseError
 from dynamics.inertia import physical_inertias, travel_states
 
 ROBOTS = ["rrr3", "rss6", "ups6", "delta3", "pus6"]
@@ -45,6 +47,18 @@ def test_all_numbers_of_an_identification_are_taken_as_dynamic_parameters():
     assert (one.name_in(), one.name_out()) == (["pose", "twist", "twist_dot"], ["torque"])
     np.testing.assert_allclose(one(pose.T, twist.T, gain.T).full().T, torque, rtol=1e-9, atol=1e-9)
     assert model.casadi("pose_jacobian").name_in() == ["pose"]
+
+
+def test_a_motion_of_the_joints_at_a_singular_pose_is_refused(monkeypatch):
+    robot = load_robot("rrr3")
+
+    def turned(gamma):
+        return np.array([*robot.home_pose[:5], gamma])
+
+    singular = brentq(lambda g: np.linalg.det(robot.coordinate_jacobian(turned(g))), -0.7, -0.4)
+    monkeypatch.setattr(type(robot), "forward_kinematics", lambda *_: turned(singular))
+    with pytest.raises(SingularPoseError, match="the robot is singular at pose"):
+        RobotModel(robot).platform_motion(*np.zeros((3, 3)))
 
 
 @pytest.mark.parametrize("name", ROBOTS)
