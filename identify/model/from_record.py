@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from dynamics import DynamicsError
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference
 from identify.arrays import Array
-from identify.errors import EstimationError
+from identify.errors import EstimationError, RecordError
 from identify.filtering import filtered_derivatives, interpolated
 from identify.model.common_error_prior import with_recorded_errors
 from identify.model.loop_model import LoopModel
@@ -184,7 +184,10 @@ def _filtered_motion(
 def _stretches(
     record: xr.Dataset, side: ModelSide, settings: LoopSettings, covariance: Array
 ) -> tuple[Stretch, ...]:
-    """Return the stretches of a record, each with the start that its first poses suggest."""
+    """Return the stretches of a record, each with the start that its first poses suggest.
+
+    Raises RecordError for a stretch with fewer than two measured poses.
+    """
     robot = side.robot
     guess = robot.parameter_sets[side.model.start_parameters].vector
     law = settings.drives.joint_law(robot.layout.split(guess)[3])
@@ -198,6 +201,11 @@ def _stretches(
     for number, label in enumerate(np.unique(numbers), start=1):
         rows = np.flatnonzero(numbers == label)
         good = rows[ok[rows]]
+        if len(good) < 2:
+            raise RecordError(
+                f"stretch {label} of the record, from {times[rows[0]]:.6g} to "
+                f"{times[rows[-1]]:.6g} s, has {len(good)} measured poses, and its start needs 2"
+            )
         newest = np.maximum(np.searchsorted(acting, times[good], side="right") - 1, 0)
         stretch = begun_stretch(
             robot,

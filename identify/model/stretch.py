@@ -120,7 +120,8 @@ def begun_stretch(
 
     robot, number, rows             As for `Stretch`.
     times, measured (k,) and (k, 6)
-                                    Times and poses of the stretch, without lost ones.
+                                    Times and poses of the stretch, without lost ones, two or
+                                    more.
     covariance (6, 6)               Covariance of a pose.
     commands (k, n)                 Commands that act at these times.
     law                             Law of the drives with the gains of the initial guess.
@@ -145,7 +146,7 @@ def begun_stretch(
         number=number,
         rows=rows,
         coordinates=fit[0],
-        rates=fit[1] if len(fit) > 1 else np.zeros(fit.shape[1]),
+        rates=fit[1],
         integral=-law.lp * per_torque * error[0],
         std=np.concatenate(
             [WIDE * norms[0] * noise, WIDE * norms[1] * noise, WIDE * per_torque * lag]

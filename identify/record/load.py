@@ -138,7 +138,7 @@ def _number(name: str, value: object, unit: str, least: float = 0.0) -> float:
     number = as_number(value)
     if not least <= number < 1e6:
         raise RecordError(
-            f"the record's attribute {name} is {shown(value)}, must be a number >= {least:g} in "
-            f"{unit}"
+            f"the record's attribute {name} is {shown(value)}, must be a number >= {least:g} and "
+            f"< 1e6 in {unit}"
         )
     return number

@@ -13,7 +13,7 @@ from identify.diagnosis.diagnose import diagnose
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.model.from_record import _likely_delay, identified_model
+from identify.model.from_record import _likely_delay, _stretches, identified_model
 from identify.record.frame_times import likelier_times
 from identify.record.from_telemetry import reading_notes
 from identify.record.recording import is_timed, poses
@@ -247,3 +247,14 @@ def test_the_delay_of_a_record_shorter_than_its_clock_is_uncertain_is_found():
     times = np.linspace(0, 2, 121)
     model, measured = (np.tile(np.sin(6 * (times - by))[:, None], 6) for by in (0, 0.05))
     assert abs(_likely_delay(times, model, measured, 4.0) - 0.05) < 1e-3
+
+
+def test_a_stretch_with_one_measured_pose_is_refused():
+    telemetry = logged(*run_plant(scenario_of(), 0, duration_s=3.0))
+    record = record_from(replace(telemetry, reference=None))
+    ok = np.zeros(record.sizes["time"], dtype=np.int8)
+    ok[5] = 1
+    lost = record.assign(measured_ok=("time", ok))
+    side = side_of(scenario_of())
+    with pytest.raises(RecordError, match=r"stretch 1 .* has 1 measured poses, .* needs 2"):
+        _stretches(lost, side, side.settings, np.eye(6))
