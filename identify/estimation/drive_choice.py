@@ -108,16 +108,19 @@ def choose_drive(
             except (EstimationError, DynamicsError) as error:
                 failed.append(f"{law}: {error}")
             advance()
-        if not first:
+        limit = HOPELESS * min((one.solution.costs[-1] for one in first.values()), default=0.0)
+        evidences = {}
+        for law, one in first.items():
+            if one.solution.costs[-1] > limit:
+                continue
+            try:
+                evidences[law] = evidence(_searched(problem_of(law), one.solution.parameters))
+            except (EstimationError, DynamicsError) as error:
+                failed.append(f"{law}: {error}")
+        if not evidences:
             raise EstimationError(
                 f"the model is unstable under every law of the drives: {'; '.join(failed)}"
             )
-        limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
-        evidences = {
-            law: evidence(_searched(problem_of(law), one.solution.parameters))
-            for law, one in first.items()
-            if one.solution.costs[-1] <= limit
-        }
         # Laws that were left out count as finished.
         advance(len(laws))
     return DriveChoice(*_weighed(evidences, laws))

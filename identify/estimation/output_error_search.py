@@ -103,7 +103,8 @@ def output_error_searches(
             cost = searched.solution.costs[-1]
             if searched.missed and any(_bends_far(run) for run in driven.runs):
                 driven = driven.having(errors_in_models(final.problem, ended))
-                found["command_driven"] = search_with_common_errors(driven, [ended], advance)
+                if np.isfinite(driven.cost(ended)):
+                    found["command_driven"] = search_with_common_errors(driven, [ended], advance)
             elif searched.missed and searched.problem.cost(ended) < cost:
                 found["command_driven"] = search_with_common_errors(driven, [ended], advance)
     return found
@@ -252,7 +253,8 @@ def _with_common_errors(
 ) -> tuple[OutputErrorProblem, Array]:
     """Return the problem with its common errors, and the best of several starts (p,).
 
-    The modes of the errors are evaluated at the best start. At least one start must be stable.
+    The modes of the errors are evaluated at the best start. Raises EstimationError if the model is
+    unstable with all starts.
     """
     if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
         return problem, problem.bounds.nearest(starts[0])
@@ -261,6 +263,10 @@ def _with_common_errors(
     cost = problem.cost(first, ahead=_reuses_sensitivities(problem))
     stable = [first] if np.isfinite(cost) else []
     stable += [start for start in others if np.isfinite(problem.cost(start))]
+    if not stable:
+        raise EstimationError(
+            f"the model is unstable with every start of the search: {_why(problem, first)}"
+        )
     whitened = problem.with_common_errors(stable[0])
     best = min(stable, key=whitened.cost)
     return (whitened if best is stable[0] else problem.with_common_errors(best)), best

@@ -4,15 +4,17 @@ record's evidence.
 
 import os
 from concurrent.futures import ProcessPoolExecutor
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dynamics.closed_loop import stability
+from dynamics.closed_loop import LoopFailure, stability
 from dynamics.closed_loop.drives import DRIVES, READS, cascade_gains
 from identify.errors import EstimationError, ScenarioError
+from identify.estimation import drive_choice
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.identification import identify, output_error_problem
 from identify.loop_parameters import settled_drive
@@ -237,3 +239,26 @@ def test_a_record_of_which_no_law_gives_a_model_is_refused_with_the_reasons():
         match="the model is unstable under every law of the drives: pid: nothing under pid; ",
     ):
         choose_drive(problem_of, quick(**{"model.drive": "auto"}).model, SilentProgress())
+
+
+def test_a_law_whose_model_is_unstable_at_the_optimum_is_left_out(monkeypatch):
+    scenario = quick(**{"model.drive": "auto"})
+    problem = problem_of([run_plant(scenario, 0, duration_s=2.2)[0]], scenario)
+    search = SimpleNamespace(solution=SimpleNamespace(costs=[1.0], parameters=None))
+    outcomes = iter([LoopFailure("unstable", 0, 0)])
+
+    def evidence(found):
+        for failure in outcomes:
+            raise failure
+        return drive_choice.Evidence(1.0, 1.0, 0.0)
+
+    for name, stand_in in (
+        ("linear_warm_start", lambda problem: None),
+        ("_searched", lambda problem, start: search),
+        ("evidence", evidence),
+    ):
+        monkeypatch.setattr(drive_choice, name, stand_in)
+    found = choose_drive(lambda law: problem, scenario.model, SilentProgress())
+    left_out, *others = found.probabilities.values()
+    assert left_out == 0.0
+    assert min(others) > 0

@@ -40,6 +40,7 @@ from identify.estimation.output_error_search import (
     output_error_searches,
     runnable_start,
     search,
+    search_with_common_errors,
     shoot,
 )
 from identify.estimation.prior import holding_torque, typical_sizes
@@ -294,6 +295,15 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     for name, judged in (("command_driven", commanded), ("closed_loop", problem)):
         from_truth = search(judged, truth(), silent)
         assert found[name].costs[-1] < from_truth.costs[-1] + 0.1
+
+
+def test_a_search_without_a_stable_start_is_refused_with_the_reason():
+    scenario = quick()
+    problem = problem_of([run_plant(scenario, seed=1, duration_s=2.2)[0]], scenario)
+    unstable = problem.guess.values.copy()
+    unstable[64:] *= 100
+    with pytest.raises(EstimationError, match="unstable with every start of the search: .*reach"):
+        search_with_common_errors(problem, [unstable, unstable], silent)
 
 
 def test_a_model_that_no_segment_bears_is_named():
