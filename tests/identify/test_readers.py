@@ -413,6 +413,10 @@ WRONG_TABLES = [
         "'[?]' is not a convention: quaternion_xyzw, quaternion_wxyz, matrix",
     ),
     (
+        described_as('convention = "euler_XYZ"', 'convention = "euler_xxy"'),
+        "'euler_xxy' is not a convention: quaternion_xyzw, quaternion_wxyz, matrix",
+    ),
+    (
         described_as('convention = "euler_XYZ"', 'convention = "quaternion_xyzw"'),
         "orientation names 3 columns, but the convention quaternion_xyzw has 4",
     ),
