@@ -193,11 +193,6 @@ class Optics:
         if not (self.psf_px >= 0.0 and 0.0 <= self.vignetting < 1.0):
             raise CmmError(f"optics need psf_px >= 0 and vignetting from 0 to below 1, got {self}")
 
-    @property
-    def margin_px(self) -> int:
-        """Distance at which the point spread in focus is cut off, px (an integer)."""
-        return self.reach_px(self.psf_px)
-
     @staticmethod
     def reach_px(psf_px: float) -> int:
         """Return the distance at which a point spread is cut off, px (an integer)."""

@@ -255,6 +255,11 @@ class ImageFormation:
         depths = np.clip(points[distances.argmin(axis=1), 2], low, high)
         return self.optics.spreads_px(side.camera.focal_px, depths)
 
+    def reach_px(self, camera: PinholeCamera) -> int:
+        """Return the largest distance, in whole px, at which light of a point is seen."""
+        ghost = max(map(abs, self.optics.ghost_offset)) if self.optics.ghost > 0.0 else 0
+        return self._margin_px(camera) + ghost
+
     def _margin_px(self, camera: PinholeCamera) -> int:
         """Return the largest distance, in whole px, from which light outside reaches a window."""
         depths = self.drawable.distance * np.array(DEPTHS)

@@ -120,7 +120,7 @@ def plates_image(
         formation.background,
         dtype=np.float32,
     )
-    margin = formation.optics.margin_px
+    margin = formation.reach_px(camera)
     reached = [_reached_tiles(camera, camera_from_body, plate, margin) for plate in plates]
     corners = np.unique(np.concatenate(reached), axis=0)
     side = Side(camera, camera_from_body[None], corners)

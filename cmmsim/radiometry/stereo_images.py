@@ -107,7 +107,12 @@ class StereoFrame:
         import cv2
 
         highest = max(self.left.max(), self.right.max(), 255)
-        both = np.hstack([self.left, self.right]) * (255.0 / highest)
+        height = max(len(self.left), len(self.right))
+        # the images of two different cameras can have different sizes
+        sides = [
+            np.pad(image, ((0, height - len(image)), (0, 0))) for image in (self.left, self.right)
+        ]
+        both = np.hstack(sides) * (255.0 / highest)
         scale = min(1.0, SHOWN_WIDTH_PX / both.shape[1])
         size = round(scale * both.shape[1]), round(scale * both.shape[0])
         smaller = cv2.resize(both, size, interpolation=cv2.INTER_AREA)

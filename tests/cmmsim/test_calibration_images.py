@@ -24,14 +24,17 @@ from cmmsim.calibration import (
     rendered_boards,
     sensor_template,
 )
+from cmmsim.calibration.rendered_boards import board_drawable
 from cmmsim.detection.start_kernels import isolate_dots
 from cmmsim.files.sensor_file import sensor_text
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.lens_distortion import Distortion
-from cmmsim.geometry.pose import apply, rotation_log
+from cmmsim.geometry.pose import apply, rigid, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
 from cmmsim.imaging.analytic import ANALYTIC
+from cmmsim.imaging.formation import ImageFormation
+from cmmsim.imaging.prints import Print, plates_image, print_renderer
 from tests.cmmsim.sensors import NOISE
 
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
@@ -412,3 +415,15 @@ def test_photograph_like_images_give_the_true_cameras(board, renderer, count):
     assert len(found.rejected) <= 3
     assert np.abs(normalised_errors(found, BENT)).max() < 5.0
     assert found.adjustment.sigma_px < 0.15
+
+
+def test_ghosts_of_a_plate_are_drawn_beside_the_tiles_of_the_plate():
+    page = Print(np.ones((1, 1), dtype=np.float32), 0.05, np.eye(4))
+    optics = Optics(ghost=0.5, ghost_offset=(100, 0))
+    formation = ImageFormation(print_renderer([page]), board_drawable(DOTS, 2.0), 0.0, optics)
+    plate = page.side * np.column_stack([page.corners, np.zeros(4)])
+    camera = PinholeCamera(1000.0, 127.5, 127.5, 256, 256)
+    placed = rigid(np.eye(3), np.array([-0.2, -0.025, 2.0]))
+    image = plates_image(formation, camera, placed, [plate], 6)
+    assert image[:, 20:60].sum() > 600
+    np.testing.assert_allclose(image[:, 120:160], 0.5 * image[:, 20:60], atol=1e-6)

@@ -153,3 +153,5 @@ def test_a_frame_shows_both_images_without_a_display_and_as_a_picture_in_noteboo
     assert picture.shape == (32, 1600)
     assert (picture[:, :399] == 0).all()
     assert (picture[:, 401:] == 255).all()
+    lower = cmmsim.StereoFrame(left[:20], np.full_like(left, full))
+    assert cv2.imdecode(np.frombuffer(lower._repr_png_(), np.uint8), 0).shape == (32, 1600)
