@@ -144,4 +144,4 @@ def test_a_leg_with_ways_without_number_is_refused():
     ways = legs_of(mechanism, 1, np.eye(3, 4))
     refusal = refused(list, ways)
     assert "joints and 24 bodies" in refusal
-    assert "needs at most 26 joints" in refusal
+    assert "would have at most 26 joints" in refusal

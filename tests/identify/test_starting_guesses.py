@@ -302,7 +302,7 @@ def test_a_search_without_a_stable_start_is_refused_with_the_reason():
     problem = problem_of([run_plant(scenario, seed=1, duration_s=2.2)[0]], scenario)
     unstable = problem.guess.values.copy()
     unstable[64:] *= 100
-    with pytest.raises(EstimationError, match="unstable with every start of the search: .*reach"):
+    with pytest.raises(EstimationError, match=r"unstable with every start of the search: .*reach"):
         search_with_common_errors(problem, [unstable, unstable], silent)
 
 
