@@ -14,7 +14,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.diagnosis.asking import Asked
 from identify.diagnosis.cause import Cause
-from identify.diagnosis.fit import Point, fit, with_last_columns
+from identify.diagnosis.fit import OutOfReachError, Point, fit, with_last_columns
 from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import NEAR, Ranked, Rows, indistinguishable, misfit_of
 from identify.estimation.output_error_problem import OutputErrorProblem
@@ -24,6 +24,10 @@ CLOSE = 0.8
 LOOSE = 0.3  # the same share, where the best candidate leaves some of the misfit when it is fitted
 # Share of a misfit which, if the best candidate leaves more, lets others be fitted from afar.
 MOST_LEFT = 0.2
+# Share of the misfit that the causes must explain for it to count as explained. A cause that is
+# there leaves noise once it is fitted. Groups of many numbers can take up most of the effect of a
+# cause outside the catalogue.
+MOST_OF_IT = 0.9
 # Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
 RIVALS = 3
 # Share of a fitted cost by which two fits can differ, as each follows the motion only so far.
@@ -102,7 +106,8 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
     if leaves:
         others = (*others, *alike[1 : 1 + RIVALS])
     fits = [(alike[0], first)]
-    fits += [(one, _trial(problem, point, asked, places, one)) for one in others]
+    reach = _of_use(now, first, rows)
+    fits += [(one, _trial(problem, point, asked, places, one, reach)) for one in others]
     helping = [(one, fit) for one, fit in fits if fit is not None]
     least = min((fit.point.cost for _, fit in helping), default=point.cost)
     left = beyond_noise(rows, point.cost)
@@ -125,6 +130,19 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
     like = tuple(one for one in alike if one is not lead and id(one) not in apart)
     best = Way(*helping[0], like)
     return (best, *(Way(*pair, ()) for pair in helping[1 : 1 + RIVALS]))
+
+
+def _of_use(now: State, first: FittedCandidate | None, rows: Rows) -> float:
+    """Return the cost above which the fit of another candidate than the first is of no use.
+
+    It must be as good as the first, or be a cause with which a selection can begin anew.
+    """
+    if first is None:
+        return np.inf
+    near = first.point.cost + max(NEAR, INEXACT * first.point.cost)
+    if now.chosen:
+        return near
+    return max(near, rows.count + (1 - MOST_OF_IT) * beyond_noise(rows, now.point.cost))
 
 
 def beyond_noise(rows: Rows, cost: float) -> float:
@@ -157,7 +175,7 @@ def _from_afar(
             causes = list(now.asked.causes)
             causes[place] = replace(cause, tried=(size,))
             asked = replace(now.asked, causes=tuple(causes))
-            fit = _trial(problem, now.point, asked, now.places, one)
+            fit = _trial(problem, now.point, asked, now.places, one, least)
             if fit is None or fit.point.cost >= least:
                 continue
             found.append((one, fit))
@@ -168,11 +186,17 @@ def _from_afar(
 
 
 def _trial(
-    problem: OutputErrorProblem, now: Point, asked: Asked, places: tuple[int, ...], best: Ranked
+    problem: OutputErrorProblem,
+    now: Point,
+    asked: Asked,
+    places: tuple[int, ...],
+    best: Ranked,
+    reach: float = np.inf,
 ) -> FittedCandidate | None:
     """Fit a candidate beside the causes at some places, or return None where that does not help.
 
-    now: optimum with those at places. asked: causes there.
+    now: optimum with those at places. asked: causes there. reach: cost above which the fit is of no
+    use.
     """
     causes = asked.causes
     # a group may be asked after one of its members
@@ -190,10 +214,10 @@ def _trial(
     try:
         held = np.isin(np.arange(len(sizes)), len(now.sizes) + np.flatnonzero(tried))
         kept, point = fitted(
-            problem, now.parameters, causes, (*places, *added), sizes, expected, held, linear
+            problem, now.parameters, causes, (*places, *added), sizes, expected, held, linear, reach
         )
-    except DynamicsError:
-        # the model with the cause does not run
+    except (DynamicsError, OutOfReachError):
+        # the model with the cause does not run, or does not come near the record
         return None
     enough = now.cost - point.cost > np.log(len(now.residual))
     return FittedCandidate(added, kept, point) if enough and set(added) & set(kept) else None
@@ -237,13 +261,15 @@ def fitted(
     expected: Array,
     held: NDArray[np.bool_],
     linear: Linearisation | None,
+    reach: float = np.inf,
 ) -> tuple[tuple[int, ...], Point]:
     """Fit causes, and again without those that chance explains; return the places of the others.
 
-    places (k,): those of the causes in the catalogue. Raises LoopFailure if the model is unstable.
+    places (k,): those of the causes in the catalogue. reach: cost above which the first fit is of
+    no use. Raises LoopFailure if the model is unstable, and the OutOfReachError of `fit`.
     """
     own = [causes[place] for place in places]
-    point = fit(problem, parameters, own, sizes, expected, held, linear)
+    point = fit(problem, parameters, own, sizes, expected, held, linear, reach)
     kept = shown_sizes(point)
     left = tuple(np.array(places)[kept].tolist())
     if kept.all() or not kept.any():

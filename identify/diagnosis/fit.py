@@ -25,8 +25,14 @@ STANDS = 2e-4  # fall of the cost by another search, as a share, below which siz
 # Mean square of the move of residuals, in units of the noise, up to which the columns of the last
 # linearisation stay. A run without derivatives takes a sixth of the time of one that has them.
 SETTLED = 2e-2
+# Largest ratio of the fall of the cost by a search to the fall that its linearisation predicts.
+BEYOND_LINEAR = 4.0
 # Criteria of a search of the parameters alone.
 FOLLOW = replace(STOP, cost_tolerance=1e-2, max_iterations=6)
+
+
+class OutOfReachError(Exception):
+    """A fit will probably not fall to a cost that would be of use."""
 
 
 @dataclass(frozen=True)
@@ -199,6 +205,16 @@ class WithCauses:
         )
         return float(found.residual @ found.residual), rows[:count, :count], rows[:count, count]
 
+    def may_reach(self, coordinates: Array, cost: float) -> bool:
+        """Tell whether a search from coordinates (p + k,) may fall to a cost.
+
+        The linearisation is the one with which the search begins.
+        """
+        if cost == np.inf:
+            return True
+        here, _, falls = self.linearise(coordinates)
+        return bool(here - BEYOND_LINEAR * (falls @ falls) <= cost)
+
 
 def with_last_columns(
     problem: OutputErrorProblem,
@@ -225,12 +241,16 @@ def fit(
     expected: Array,
     held: NDArray[np.bool_],
     linear: Linearisation | None,
+    reach: float = np.inf,
 ) -> Point:
     """Fit parameters and causes from parameters (p,) and sizes (k,).
 
     expected (k,): sizes to which the search probably goes. held (k,): causes whose sizes stay until
-    the parameters have followed. linear: linearisation at the start, if it is known. Raises
-    LoopFailure if the model is unstable at the start.
+    the parameters have followed. linear: linearisation at the start, if it is known. reach: cost
+    above which the fit is of no use.
+
+    Raises LoopFailure if the model is unstable at the start, and OutOfReachError if a search will
+    hardly fall to this cost.
     """
     whole = WithCauses(problem, tuple(causes), np.zeros_like(held))
     there = with_causes(problem, causes, sizes)
@@ -248,6 +268,8 @@ def fit(
         coordinates = minimise(replace(whole, held=held), coordinates, *limits, FOLLOW).parameters
     renewing = RENEWALS if any(one.renewed for one in causes) else 0
     for _ in range(ROUNDS):
+        if not whole.may_reach(coordinates, reach):
+            raise OutOfReachError
         # each begins with a wide trust region again, which kinks make narrow
         found = minimise(whole, coordinates, *limits, STOP)
         coordinates = found.parameters

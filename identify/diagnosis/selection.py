@@ -18,6 +18,7 @@ from dynamics import DynamicsError
 from identify.diagnosis.asking import Asked, ask
 from identify.diagnosis.candidate_fits import (
     INEXACT,
+    MOST_OF_IT,
     RIVALS,
     Selected,
     State,
@@ -47,11 +48,6 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 CHANCE = 0.01  # probability that a right model is accused of any cause in the catalogue
 MOST = 3  # largest number of causes or groups that are selected
 SEVERAL = 2  # number of causes above which a selection begins anew with another first one
-
-# Share of the misfit that the causes must explain for it to count as explained. A cause that is
-# there leaves noise once it is fitted. Groups of many numbers can take up most of the effect of a
-# cause outside the catalogue.
-MOST_OF_IT = 0.9
 
 
 @dataclass(frozen=True)
