@@ -14,6 +14,7 @@ from dynamics.closed_loop import simulate_commands
 from dynamics.pseudo_inertia import body_fault
 from identify.diagnosis.diagnose import diagnose
 from identify.diagnosis.diagnosis import CandidateRow, Diagnosis, Finding
+from identify.diagnosis.fit import WithCauses
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.explanation import Misfit
 from identify.record.recording import poses, recorded_reference
@@ -373,3 +374,26 @@ def test_two_causes_are_not_taken_for_one_that_is_there_or_not():
     ):
         assert abs(sizes[group].value - true) < 4 * sizes[group].std
     assert not found.left.significant
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("wrong", ["two", "outside"])
+def test_fits_that_are_left_as_hopeless_change_no_finding(wrong, monkeypatch):
+    """Fits that are all brought to their ends are the oracle."""
+    made = drawn(lab(), np.random.SeedSequence(5).spawn(2)[0], wrong).made
+    found = diagnose(made.record)
+    left = []
+
+    def always(fit, coordinates, cost):
+        left.append(not may_reach(fit, coordinates, cost))
+        return True
+
+    may_reach = WithCauses.may_reach
+    monkeypatch.setattr(WithCauses, "may_reach", always)
+    whole = diagnose(made.record)
+    assert [one.name for one in found.findings] == [one.name for one in whole.findings]
+    assert found.none_of_these == whole.none_of_these
+    for ours, theirs in zip(found.findings, whole.findings, strict=True):
+        for size, other in zip(ours.sizes, theirs.sizes, strict=True):
+            assert size.value == pytest.approx(other.value, abs=0.2 * other.std)
+    assert any(left) or wrong == "outside"
