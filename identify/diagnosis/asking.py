@@ -1,4 +1,4 @@
-"""Causes as they are asked at an optimum: their columns, and sizes at which some are tried."""
+"""Causes as they are asked at an optimum: their columns, and the trial sizes of some of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 class Asked:
     """Causes as they are asked at an optimum, and their columns (m, k) there.
 
-    A cause that is tried at some sizes has the difference to the largest gain there as its column,
-    by its size. It is returned with that size alone.
+    Of the trial sizes of a cause, the one with the largest gain is kept alone. Its column is the
+    change of the residuals at that size, divided by the size. If none gains, all are kept.
     """
 
     causes: tuple[Cause, ...]
@@ -29,7 +29,7 @@ class Asked:
 def ask(
     problem: OutputErrorProblem, point: Point, causes: Sequence[Cause], places: tuple[int, ...]
 ) -> Asked:
-    """Return the causes at an optimum with those at some places fitted."""
+    """Return the causes as asked at an optimum. places: indices of those that are fitted there."""
     sizes = np.zeros(len(causes))
     sizes[list(places)] = point.sizes
     asked = to_ask(causes, places)
@@ -46,10 +46,10 @@ def ask_first(
     at_bound: NDArray[np.bool_],
     causes: Sequence[Cause],
 ) -> tuple[Point, Asked]:
-    """Return the optimum (p,) of a problem without any cause, and the causes there.
+    """Return the optimum (p,) of a problem without any cause, and the causes as asked there.
 
-    at_bound (p,): coordinates of the parameters that are held at their bounds. One run of the model
-    is differentiated for both.
+    at_bound (p,): coordinates of the parameters that are held at their bounds. Both results share
+    one linearisation.
     """
     sizes = np.zeros(len(causes))
     asked = to_ask(causes, ())
@@ -62,9 +62,9 @@ def ask_first(
 
 
 def to_ask(causes: Sequence[Cause], places: tuple[int, ...]) -> list[int]:
-    """Return the places of causes that can be asked beside those at other places.
+    """Return the indices of the causes that can be asked beside the fitted ones at `places`.
 
-    A companion has no effect before its cause is there.
+    Companions are left out, as they have no effect before their causes are fitted.
     """
     beside = [one.companion for one in causes if one.companion is not None]
     return [
@@ -82,23 +82,28 @@ def _tried(
     asked: Sequence[int],
     columns: Array,
 ) -> Asked:
-    """Return causes with columns (m, k), after those that are tried at some sizes.
+    """Try the trial sizes of causes, and return the causes with their columns, see `Asked`.
 
-    sizes (k,): those at the optimum. asked: places of the causes that are asked.
+    sizes (k,): sizes at the optimum. asked: indices of the causes that are asked. columns (m, k):
+    changed in place.
     """
     chosen = list(causes)
-    left = point.beside_all.part(point.residual)
-    there = with_causes(problem, causes, sizes)
-    tried = [(place, size) for place in asked for size in causes[place].tried]
-    ends = [causes[place].change(there, size) for place, size in tried]
+    residual_beside = point.beside_all.part(point.residual)
+    fitted = with_causes(problem, causes, sizes)
+    trials = [(place, size) for place in asked for size in causes[place].tried]
+    problems = [causes[place].change(fitted, size) for place, size in trials]
     gains = np.zeros(len(causes))
-    for (place, size), end in zip(tried, each_residuals(ends, point.parameters), strict=True):
-        if end is None:
+    for (place, size), residual in zip(
+        trials, each_residuals(problems, point.parameters), strict=True
+    ):
+        if residual is None:
             continue
-        column = ((end - point.residual) / size)[:, None]
-        judged = score(point.beside_all.part(column), left, np.linalg.norm(column, axis=0))
-        if judged.sizes[0] > 0 and judged.statistic > gains[place]:
-            gains[place] = judged.statistic
+        column = ((residual - point.residual) / size)[:, None]
+        found = score(
+            point.beside_all.part(column), residual_beside, np.linalg.norm(column, axis=0)
+        )
+        if found.sizes[0] > 0 and found.statistic > gains[place]:
+            gains[place] = found.statistic
             columns[:, place] = column[:, 0]
             chosen[place] = replace(causes[place], tried=(size,))
     return Asked(tuple(chosen), columns)

@@ -4,7 +4,7 @@ Each cause is a torque that the joints need in addition to the torques of the mo
 bodies are columns of the regressor of full bodies (ten inertial parameters each), along the motion
 of the model. Torques of passive joints are columns of `dynamics.rigid_body.passive_friction`. All
 act on the model as changes of its commands (`identify.model.joint_torques`). The drives already
-hold these torques before the motion begins, so that only their change since then acts.
+hold these torques before the motion begins, so that only the change from their first value acts.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,17 +34,18 @@ from identify.model.loop_model import LoopModel
 from identify.record.stored_common_errors import FRICTION_OFFSET
 
 PASSIVE_GROUP = "friction of passive joints"  # group of the friction of passive joints
-MOVING = 0.01  # velocity above which a joint moves, as a share of its RMS velocity
-# Least standard deviation, N m or N, of an offset of friction that a remedy states.
+MOVING = 0.01  # fraction of its RMS velocity above which a joint counts as moving
+# Smallest standard deviation, N m or N, of an offset of friction that a remedy states.
 LEAST_OFFSET = 0.01
 
 
 @dataclass(frozen=True)
 class Needed:
-    """Additional torques that the joints need if a cause has the size one.
+    """Additional torques that the joints need for a cause of size one.
 
     torques: one array (N, n) for each run, N m or N. along: function that returns these torques for
-    other motions of the runs. None if they depend little on the motion.
+    other motions of the runs. None: a fit keeps those along the first motion. The rest is as in
+    `Cause`.
     """
 
     name: str
@@ -102,7 +103,7 @@ def _remedy(
 
 
 def _added(one: Needed) -> Change:
-    """Return the change of a problem by needed torques."""
+    """Return the change of a problem whose joints need further torques."""
 
     def added(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
         runs = [
@@ -115,26 +116,26 @@ def _added(one: Needed) -> Change:
 
 
 def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]) -> list[Needed]:
-    """Return centres of mass and products of inertia of the platform and of the bodies of legs.
+    """Return torques for offset centres of mass and products of inertia of platform and leg bodies.
 
     All bodies of one kind have the same offset or product, each in its own axes. Full bodies are
     left out, as the model has these parameters.
     """
     layout = robot.layout
     masses = layout.bodies_of(parameters[layout.rigid])[:, 0]
-    found = []
+    needed = []
     together = []
     weights = []
     for kind in dict.fromkeys(one.name for one in layout.kinds):
-        own = [
-            place
-            for place, one in enumerate(layout.kinds)
-            if one.name == kind and not layout.full[place]
+        bodies = [
+            index
+            for index, one in enumerate(layout.kinds)
+            if one.name == kind and not layout.full[index]
         ]
-        if not own:
+        if not bodies:
             continue
         words = "the platform" if kind == "platform" else f"the {kind}s"
-        # one key, so that bodies which the model names stay
+        # this key leaves the settings of other kinds of bodies as they are
         remedy = f"--set model.inertia.{kind}=full"
         if kind == "platform":
             remedy += ", or state a load that is on it"
@@ -143,48 +144,48 @@ def _uneven_bodies(robot: Robot, parameters: Array, motions: Sequence[RunMotion]
             (PRODUCTS, "kg m2", f"products of inertia of {words}"),
         ):
             for name in names:
-                together.append(tuple(f"{layout.bodies[place]}.{name}" for place in own))
-                weights.append(masses[own] if unit == "m" else np.ones(len(own)))
+                together.append(tuple(f"{layout.bodies[index]}.{name}" for index in bodies))
+                weights.append(masses[bodies] if unit == "m" else np.ones(len(bodies)))
                 axis = name[-1] if unit == "m" else name
-                found.append(Needed(f"{group}, {axis}", unit, group, (), remedy))
+                needed.append(Needed(f"{group}, {axis}", unit, group, (), remedy))
     wrenches = [body_wrenches(robot.geometry, one, tuple(together), weights) for one in motions]
     return [
-        replace(one, torques=_at_the_joints(motions, wrenches, place))
-        for place, one in enumerate(found)
+        replace(one, torques=_at_the_joints(motions, wrenches, index))
+        for index, one in enumerate(needed)
     ]
 
 
 def _passive_friction(robot: Robot, motions: Sequence[RunMotion]) -> list[Needed]:
-    """Return viscous and dry friction of the passive joints, by their place in the legs.
+    """Return torques for viscous and dry friction of the passive joints, the same in all legs.
 
     Parameters that the model has are left out.
     """
     geometry = robot.geometry
     names = passive_parameters(geometry.legs)
-    stated = {of_all_legs(one) for one in robot.layout.passive_names}
+    modelled = {of_all_legs(one) for one in robot.layout.passive_names}
     columns = [passive_columns(geometry, one) for one in motions]
-    found = []
-    for place, name in enumerate(names):
-        if name in stated:
+    needed = []
+    for index, name in enumerate(names):
+        if name in modelled:
             continue
-        found.append(
+        needed.append(
             Needed(
                 name=passive_words(name),
                 unit=robot.layout.unit(name),
                 group=PASSIVE_GROUP,
-                torques=_at_the_joints(motions, columns, place),
+                torques=_at_the_joints(motions, columns, index),
                 remedy=InList("model.passive_friction", robot.layout.passive_names, name),
                 least=0.0,
-                along=partial(_passive_torques, geometry, place),
+                along=partial(_passive_torques, geometry, index),
             )
         )
-    return found
+    return needed
 
 
 def _passive_torques(
     geometry: RobotGeometry, place: int, motions: Sequence[RunMotion]
 ) -> tuple[Array, ...]:
-    """Return the torques of a parameter of passive friction along motions, by its place."""
+    """Return torques along motions for the parameter of passive friction with the index `place`."""
     return _at_the_joints(motions, [passive_columns(geometry, one) for one in motions], place)
 
 
@@ -204,9 +205,9 @@ def passive_words(name: str) -> str:
 
 
 def _uneven_friction(run: LoopModel, motions: Sequence[RunMotion]) -> list[Needed]:
-    """Return the half differences of the dry friction of each joint between its two directions.
+    """Return torques for half the difference of each joint's dry friction between both directions.
 
-    They are left out where the model estimates them.
+    The result is empty where the model estimates such offsets.
     """
     layout = run.robot.layout
     if any(name.startswith(FRICTION_OFFSET) for name in run.common.loop_std):

@@ -1,7 +1,8 @@
 """Fits of candidates beside the causes that were selected before, and which of them is the best.
 
-Columns tell what a candidate explains to first order. Where they cannot tell candidates apart, or
-where the best one leaves some of the misfit, several are fitted.
+Columns tell what a candidate explains to first order. Where the best candidate, once fitted, leaves
+some of the misfit, those that columns cannot tell from it are fitted, too. A cause with trial sizes
+is fitted whenever its statistic is close to the best, because its column is the least exact.
 """
 
 from collections.abc import Sequence
@@ -19,18 +20,17 @@ from identify.diagnosis.linearisation import Linearisation
 from identify.diagnosis.ranking import NEAR, Ranked, Rows, indistinguishable, misfit_of
 from identify.estimation.output_error_problem import OutputErrorProblem
 
-# Share of the best statistic from which on a cause that is tried at a size is fitted, too.
+# Fraction of the best statistic above which a cause with trial sizes is fitted, too.
 CLOSE = 0.8
-LOOSE = 0.3  # the same share, where the best candidate leaves some of the misfit when it is fitted
-# Share of a misfit which, if the best candidate leaves more, lets others be fitted from afar.
+LOOSE = 0.3  # the same fraction, where the best candidate as fitted leaves some of the misfit
+# Fraction of the misfit: if all fits leave more, causes are fitted from their trial sizes.
 MOST_LEFT = 0.2
-# Share of the misfit that the causes must explain for it to count as explained. A cause that is
-# there leaves noise once it is fitted. Groups of many numbers can take up most of the effect of a
-# cause outside the catalogue.
+# Smallest fraction of the misfit that the right causes explain. They leave only noise when fitted.
+# Groups of many numbers can take up most of the effect of a cause outside the catalogue.
 MOST_OF_IT = 0.9
-# Largest number of candidates beside the best that are fitted, as columns cannot tell them apart.
+# Largest number of candidates beside the best that are fitted or returned.
 RIVALS = 3
-# Share of a fitted cost by which two fits can differ, as each follows the motion only so far.
+# Fraction of the cost by which equally good fits can differ, as a fit never converges fully.
 INEXACT = 1e-3
 
 
@@ -39,8 +39,8 @@ class Selected:
     """Selected candidate.
 
     ranked  The candidate as it was ranked.
-    places  Places of those of its causes whose sizes chance does not explain.
-    gain    Fall of the cost as it was fitted.
+    places  Indices in the catalogue of those of its causes whose sizes chance does not explain.
+    gain    Fall of the cost by its fit, and that of earlier candidates that it makes needless.
     alike   Names of the candidates that cannot be told apart from it.
     """
 
@@ -54,9 +54,9 @@ class Selected:
 class State:
     """Selected candidates so far, their optimum, and what is asked there.
 
-    places: those of the fitted causes in the catalogue. causes: the catalogue with the causes as
-    they were fitted. fresh: whether columns are those at this optimum. ranking: of the candidates
-    that are left.
+    places: indices of the fitted causes in the catalogue. causes: the catalogue with the causes as
+    they were fitted. fresh: whether the columns are those at this optimum. ranking: candidates that
+    remain.
     """
 
     chosen: tuple[Selected, ...]
@@ -70,10 +70,10 @@ class State:
 
 @dataclass(frozen=True)
 class FittedCandidate:
-    """Candidate that was fitted beside those before it.
+    """Candidate that was fitted beside those selected before it.
 
-    added: places of its causes. places: those of all causes that are left, in the order of the
-    point's sizes.
+    added: indices of its causes and their companions. places: indices of all causes that the fit
+    has kept, in the order of the point's sizes.
     """
 
     added: tuple[int, ...]
@@ -91,51 +91,53 @@ class Way:
 
 
 def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tuple[Way, ...]:
-    """Fit the best candidate of a state's ranking beside the causes that it has.
+    """Fit the best candidate of a state's ranking beside the causes that the state has.
 
-    Where that leaves some of the misfit, others that columns cannot tell from it are fitted, too,
-    and where all leave most of it, those that are tried at sizes. Returns the fits that help, the
-    best first, and the others by their costs.
+    Others are fitted, too, see `CLOSE`, `LOOSE`, `RIVALS` and `MOST_LEFT`. Returns the fits that
+    help by increasing cost, but that of the best candidate first if it is as good but for chance.
     """
     point, asked, places = now.point, now.asked, now.places
     alike = indistinguishable(now.ranking, rows, point.beside_all.part(point.residual))
     first = _trial(problem, point, asked, places, alike[0])
-    leaves = first is not None and misfit_of(rows, first.point.residual).significant
-    rival = _rival(asked.causes, alike[0], now.ranking, LOOSE if leaves else CLOSE)
+    leaves_misfit = first is not None and misfit_of(rows, first.point.residual).significant
+    rival = _rival(asked.causes, alike[0], now.ranking, LOOSE if leaves_misfit else CLOSE)
     others = () if rival is None else (rival,)
-    if leaves:
+    if leaves_misfit:
         others = (*others, *alike[1 : 1 + RIVALS])
     fits = [(alike[0], first)]
     reach = _of_use(now, first, rows)
     fits += [(one, _trial(problem, point, asked, places, one, reach)) for one in others]
     helping = [(one, fit) for one, fit in fits if fit is not None]
     least = min((fit.point.cost for _, fit in helping), default=point.cost)
-    left = beyond_noise(rows, point.cost)
-    # a selection that explains little of the misfit is not worth more of these fits
-    known = left <= MOST_LEFT * (left + sum(one.gain for one in now.chosen)) or not now.chosen
-    if known and beyond_noise(rows, least) > MOST_LEFT * left:
+    misfit = beyond_noise(rows, point.cost)
+    # fits from trial sizes take too long beside a selection that explains little of the misfit
+    worthwhile = (
+        misfit <= MOST_LEFT * (misfit + sum(one.gain for one in now.chosen)) or not now.chosen
+    )
+    if worthwhile and beyond_noise(rows, least) > MOST_LEFT * misfit:
         helping += _from_afar(problem, now, rows, least, [one for one, _ in fits])
     if not helping:
         return ()
     helping.sort(key=lambda pair: pair[1].point.cost)
     least = helping[0][1].point.cost
-    near = least + max(NEAR, INEXACT * least)
-    if first is not None and first.point.cost <= near:
+    as_good = least + max(NEAR, INEXACT * least)
+    if first is not None and first.point.cost <= as_good:
         helping = [(alike[0], first), *(pair for pair in helping if pair[0] is not alike[0])]
     lead = helping[0][0]
-    # fitted, the others can be told apart
-    apart = [id(one) for one, fit in fits if fit is None or fit.point.cost > near]
+    # candidates whose fit fails or costs more can be told apart from the best
+    apart = [id(one) for one, fit in fits if fit is None or fit.point.cost > as_good]
     if all(one is not lead for one in alike):
         alike = ()
-    like = tuple(one for one in alike if one is not lead and id(one) not in apart)
-    best = Way(*helping[0], like)
+    still_alike = tuple(one for one in alike if one is not lead and id(one) not in apart)
+    best = Way(*helping[0], still_alike)
     return (best, *(Way(*pair, ()) for pair in helping[1 : 1 + RIVALS]))
 
 
 def _of_use(now: State, first: FittedCandidate | None, rows: Rows) -> float:
     """Return the cost above which the fit of another candidate than the first is of no use.
 
-    It must be as good as the first, or be a cause with which a selection can begin anew.
+    A useful fit is as good as the first. If nothing is selected yet, one that explains nearly all
+    is useful, too, as a selection can begin anew with it.
     """
     if first is None:
         return np.inf
@@ -157,12 +159,12 @@ def _from_afar(
     least: float,
     done: Sequence[Ranked],
 ) -> list[tuple[Ranked, FittedCandidate]]:
-    """Fit causes from the sizes at which they are tried, whatever they explain to first order.
+    """Fit causes from their trial sizes, whatever they explain to first order.
 
-    Where no candidate explains most, the parameters can have taken up so much of such a cause that
-    it shows only once they follow. least: cost of the best fit so far. done: candidates that were
-    fitted from the size at which they explain most. Of the sizes of a cause, the largest comes
-    first, and those after one that explains most are left out.
+    The parameters can have taken up so much of such a cause that it shows only once they are fitted
+    with it. least: cost of the best fit before. done: candidates that were fitted already, from the
+    size at which they explain most. The largest size of a cause comes first. Returns the fits of
+    lower cost than `least`, and ends after one that leaves less than `MOST_LEFT` of its misfit.
     """
     found = []
     for one in now.ranking:
@@ -193,21 +195,21 @@ def _trial(
     best: Ranked,
     reach: float = np.inf,
 ) -> FittedCandidate | None:
-    """Fit a candidate beside the causes at some places, or return None where that does not help.
+    """Fit a candidate beside the causes at `places`, or return None if the fit does not help.
 
-    now: optimum with those at places. asked: causes there. reach: cost above which the fit is of no
-    use.
+    A fit helps if the cost falls by more than ln n and one of the new causes is kept. now: optimum
+    with the causes at `places`. asked: causes there. reach: cost above which a fit is of no use.
     """
     causes = asked.causes
-    # a group may be asked after one of its members
+    # some members of a group may have been fitted before
     new = [k for k, place in enumerate(best.candidate.places) if place not in places]
     own = tuple(best.candidate.places[k] for k in new)
-    beside = companions(causes, own)
-    added = (*own, *beside)
-    none = np.zeros(len(beside))
+    accompanying = companions(causes, own)
+    added = (*own, *accompanying)
+    zeros = np.zeros(len(accompanying))
     tried = [causes[place].tried[0] if causes[place].tried else 0.0 for place in own]
-    sizes = np.concatenate([now.sizes, tried, none])
-    expected = np.concatenate([now.sizes, best.score.sizes[new], none])
+    sizes = np.concatenate([now.sizes, tried, zeros])
+    expected = np.concatenate([now.sizes, best.score.sizes[new], zeros])
     linear = None
     if not any(tried):
         linear = replace(now.linear, by_causes=np.hstack([now.columns, asked.columns[:, added]]))
@@ -228,7 +230,7 @@ def _rival(
 ) -> Ranked | None:
     """Return a cause that may do better than the best candidate once it is fitted, or None.
 
-    The statistic of one that is tried at a size is the roughest, and at least a share of the best.
+    It has trial sizes and another group than the best, and more than `share` of its statistic.
     """
     for one in ranking:
         cause = causes[one.candidate.places[0]]
@@ -239,7 +241,7 @@ def _rival(
 
 
 def companions(causes: Sequence[Cause], places: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the places of the companions that causes at some places have."""
+    """Return the indices of the companions of the causes at `places`."""
     wanted = [causes[place].companion for place in places]
     return tuple(
         place for place, one in enumerate(causes) if any(one is companion for companion in wanted)
@@ -247,7 +249,7 @@ def companions(causes: Sequence[Cause], places: tuple[int, ...]) -> tuple[int, .
 
 
 def excluded(causes: Sequence[Cause], asked: tuple[int, ...], places: tuple[int, ...]) -> bool:
-    """Tell whether causes at asked places cannot be there beside those at other places."""
+    """Tell whether an asked cause shares an exclusive group with one of those at `places`."""
     taken = {causes[place].group for place in places if causes[place].exclusive}
     return any(causes[place].group in taken for place in asked)
 
@@ -263,53 +265,54 @@ def fitted(
     linear: Linearisation | None,
     reach: float = np.inf,
 ) -> tuple[tuple[int, ...], Point]:
-    """Fit causes, and again without those that chance explains; return the places of the others.
+    """Fit causes, and again without those that chance explains.
 
-    places (k,): those of the causes in the catalogue. reach: cost above which the first fit is of
-    no use. Raises LoopFailure if the model is unstable, and the OutOfReachError of `fit`.
+    places (k,): indices of the causes in the catalogue. The other arguments are as for `fit`, with
+    `reach` for the first fit only. Returns the indices of the causes that are kept, and their
+    optimum. If none is kept, that is the optimum with all. Raises the errors of `fit`.
     """
     own = [causes[place] for place in places]
     point = fit(problem, parameters, own, sizes, expected, held, linear, reach)
     kept = shown_sizes(point)
-    left = tuple(np.array(places)[kept].tolist())
+    remaining = tuple(np.array(places)[kept].tolist())
     if kept.all() or not kept.any():
-        return left, point
-    # those that are left may be explained by others of them
+        return remaining, point
+    # of the causes that are kept, chance may explain more without the others
     sizes = point.sizes[kept]
-    free = np.zeros(len(left), dtype=bool)
-    known = with_fitted(causes, places, point.causes)
-    last = replace(point.linear, by_causes=point.columns[:, kept])
-    there = [known[place] for place in left]
-    linear = with_last_columns(problem, point.parameters, there, sizes, last)
-    return fitted(problem, point.parameters, known, left, sizes, sizes, free, linear)
+    none_held = np.zeros(len(remaining), dtype=bool)
+    catalogue = with_fitted(causes, places, point.causes)
+    kept_linear = replace(point.linear, by_causes=point.columns[:, kept])
+    there = [catalogue[place] for place in remaining]
+    linear = with_last_columns(problem, point.parameters, there, sizes, kept_linear)
+    return fitted(problem, point.parameters, catalogue, remaining, sizes, sizes, none_held, linear)
 
 
 def shown_sizes(point: Point) -> NDArray[np.bool_]:
     """Tell which sizes (k,) of an optimum are worth a number of their own.
 
-    Backward elimination: the least significant one is left out while it lowers the cost by less
-    than ln n.
+    Backward elimination: the least significant size is left out while that raises the cost by less
+    than ln n. Sizes without a variance stay.
     """
-    there = point.score()
+    found = point.score()
     limit = np.log(len(point.residual))
     kept = np.ones(len(point.sizes), dtype=bool)
-    # One that is there or not has no size that could be left out. One that is tried at a size has
-    # no derivative that tells what is left without it.
-    lasting = np.array([bool(one.tried) for one in point.causes], dtype=bool)
-    covariance = there.covariance()
+    # Causes with trial sizes stay: no derivative tells what remains without them. So do those that
+    # are there or not, which have a trial size, too.
+    stays = np.array([bool(one.tried) for one in point.causes], dtype=bool)
+    covariance = found.covariance()
     sizes = point.sizes.copy()
     while kept.any():
         inside = np.flatnonzero(kept)
         variances = np.diag(covariance)[inside]
-        falls = np.where(
-            (variances > 0) & ~lasting[inside],
+        rises = np.where(
+            (variances > 0) & ~stays[inside],
             sizes[inside] ** 2 / np.maximum(variances, 1e-300),
             np.inf,
         )
-        least = inside[int(np.argmin(falls))]
-        if falls.min() >= limit:
+        least = inside[int(np.argmin(rises))]
+        if rises.min() >= limit:
             break
-        # the others move to where they are best without it
+        # the other sizes move to their optimum without it
         gain = covariance[:, least] / covariance[least, least]
         sizes = sizes - gain * sizes[least]
         covariance = covariance - np.outer(gain, covariance[least])
@@ -320,6 +323,6 @@ def shown_sizes(point: Point) -> NDArray[np.bool_]:
 def with_fitted(
     causes: Sequence[Cause], places: tuple[int, ...], fitted: Sequence[Cause]
 ) -> tuple[Cause, ...]:
-    """Return causes, those at some places as they were fitted."""
+    """Return the causes, with those at `places` as they were fitted."""
     known = dict(zip(places, fitted, strict=True))
     return tuple(known.get(place, one) for place, one in enumerate(causes))

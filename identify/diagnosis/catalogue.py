@@ -1,8 +1,8 @@
 """Catalogue of causes for which a model can miss its record: the built-in ones, and a user's own.
 
-A user's own cause, ``module:function``, is a function (run, size) that returns the `LoopModel` of a
-run with the cause, of the one without. The function may carry a `unit` and, in that unit, a `step`
-for differences.
+A user's own cause, ``module:function``, is a function (run, size) that takes the `LoopModel` of a
+run without the cause, and returns the one with it. The function may carry a `unit` and, in that
+unit, a `step` for differences.
 """
 
 import math
@@ -22,13 +22,13 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 from identify.own_parts import PluginFunction, own_function
 
-STEP = 1e-4  # step of a cause that carries none
+STEP = 1e-4  # step of a user's own cause that carries none
 
 
 def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
     """Return all causes that are possible for a problem with the optimum `parameters` (p,).
 
-    Companions of other causes come after all others.
+    Companions come after all other causes.
     """
     runs = [run.simulate(parameters) for run in problem.runs]
     causes = (
@@ -42,7 +42,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
 
 
 def own_cause(name: str) -> Cause:
-    """Return a user's own cause. Raises EstimationError if it cannot be had."""
+    """Return a user's own cause. Raises EstimationError if it, or its step, is unusable."""
     function = own_function(name, "cause", EstimationError)
     step = getattr(function, "step", STEP)
     if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < math.inf:
@@ -60,7 +60,7 @@ def own_cause(name: str) -> Cause:
 
 
 def _check_run(part: str, found: object, run: LoopModel, size: float) -> None:
-    """Raise EstimationError unless a user's own cause has returned a run with the same frames."""
+    """Raise EstimationError unless a user's own cause returned a run with the same shapes."""
     if not isinstance(found, LoopModel):
         raise EstimationError(f"{part} must return a LoopModel, returned {type(found).__name__}")
     for name in ("measured", "ok", "logged"):
@@ -73,7 +73,7 @@ def _check_run(part: str, found: object, run: LoopModel, size: float) -> None:
 
 
 def check_columns(causes: tuple[Cause, ...], columns: Array) -> None:
-    """Raise EstimationError for a user's own cause that has no column.
+    """Raise EstimationError for a user's own cause whose column is not finite, or zero.
 
     columns (m, k): derivatives of the residuals with respect to the sizes of the causes.
     """

@@ -1,9 +1,10 @@
 """Causes for which a model may miss its record, as changes of the problem that was solved.
 
-A cause has a size, zero where the model is right. At a size it makes another output-error problem
-of the one that was solved: of other commands, another clock or another robot. The difference of
-their residuals is the column of the cause. Most columns also follow from one run of the model that
-is differentiated along many directions at once, for which a cause names its effect.
+A cause has a size, zero where the model is right. At another size, it turns the output-error
+problem that was solved into one with other commands, another clock or another robot. The derivative
+of the residuals with respect to the size is the column of the cause. A column is a difference of
+runs, or follows, for a cause that names its effect, from one run of the model that is
+differentiated along many directions at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ from identify.model.loop_model import LoopModel
 
 # Function that returns the problem with a cause of a given size. It changes nothing else.
 Change = Callable[[OutputErrorProblem, float], OutputErrorProblem]
-# Function (run, its place) that returns what a cause of size one changes at each frame.
+# Function (run, its index) that returns what a cause of size one changes at each frame.
 RunColumn = Callable[[LoopModel, int], Array]
 
 
@@ -39,7 +40,7 @@ class OnTorques:
 
 @dataclass(frozen=True)
 class OnGain:
-    """Effect of a cause that changes one gain of one joint. Both are counted from 0."""
+    """Effect of a cause that changes one gain of one joint. kind: index in JOINT_PID."""
 
     joint: int
     kind: int
@@ -64,9 +65,9 @@ Effect = OnCommands | OnTorques | OnGain | OnGeometry | OnPoses
 
 @dataclass(frozen=True)
 class InList:
-    """Remedy that is an entry of a list of settings, beside those that the model has and others.
+    """Remedy that adds an entry to a list in the settings.
 
-    key: of the list. known: its entries so far. entry: the further one.
+    key: that of the list. known: entries that the model has. entry: the one to add.
     """
 
     key: str
@@ -85,36 +86,36 @@ class Cause:
     unit : str
         Unit of the size.
     group : str
-        Name of the causes that this one is of a kind with. They are also judged together.
+        Name of its group of similar causes. A group is also judged as a whole, if not exclusive.
     change : callable
         Function (problem, size) that returns the problem with this cause.
     step : float
-        Size by which the cause is moved for a difference, so small that residuals follow in
-        proportion, and so large that rounding does not count. Zero: the cause is there or not.
+        Change of the size for differences, so small that residuals change in proportion, and so
+        large that rounding does not matter. Zero: the cause has no size, and is there or not.
     remedy : callable or InList
-        Function (size) that returns a line to type, or one sentence of what to do. Or the entry
+        Function (size) that returns an option to type, or a sentence on what to do. InList: entry
         that a list of settings needs.
     least : float
-        Least size that there can be.
+        Least possible size.
     effect : Effect, optional
-        Effect of a size of one. None: the column is a difference of runs.
+        Effect of size one. None: the column is a difference of runs.
     alone : bool
-        True if the cause is asked alone, too. False: only together with its group.
+        True if the cause is also asked alone. False: it is asked only together with its group.
     exclusive : bool
         True if at most one cause of the group can be there.
     companion : Cause, optional
-        Cause that has a size only where this one is there, and is then fitted with it.
+        Cause that has an effect only beside this one, and is fitted together with it.
     renewed : callable, optional
         Function (problem with the causes, parameters) that returns this cause with its effect along
-        the motion there, if its effect depends on it.
+        the motion of that problem. None: a fit keeps the first effect.
     anew : callable, optional
         Function (problem with other causes, parameters) that returns this cause as it is asked at
-        their optimum, if its sizes are relative to the motion.
+        the optimum with those. None: its sizes are not relative to the motion.
     exact : bool
-        True if the model with this cause is the true one. False: it follows to first order, or
-        joints that stick keep a fit from its optimum.
+        True if the fit of a true cause leaves only noise. False: its effect is of first order, or
+        joints that stick keep a fit from the optimum.
     tried : tuple of float
-        Sizes at which the cause is looked for, where a small one shows nothing. Empty: about zero.
+        Trial sizes, for a cause of which a small size shows nothing. Empty: it is asked at zero.
     """
 
     name: str
@@ -135,7 +136,7 @@ class Cause:
 
     @property
     def differentiable(self) -> bool:
-        """True if differences of runs tell more than that the cause is there."""
+        """True if the column is a difference of runs, and the cause is not just there or not."""
         return self.effect is None and self.step > 0
 
 
@@ -149,9 +150,9 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
 
 
 def prior_std(size: float, least: float) -> float:
-    """Return the standard deviation, a power of ten, with which a model allows for a size.
+    """Return the smallest power of ten that is at least a size, as a prior standard deviation.
 
-    It is at least that of an ordinary workshop, so that several causes of a kind have the same.
+    It is also at least `least`, the value of an ordinary workshop. Causes of a kind thus share it.
     """
     return float(10.0 ** np.ceil(np.log10(max(abs(size), least))))
 
@@ -159,14 +160,14 @@ def prior_std(size: float, least: float) -> float:
 def with_causes(
     problem: OutputErrorProblem, causes: Sequence[Cause], sizes: Array
 ) -> OutputErrorProblem:
-    """Return the problem with several causes, each of its size (k,)."""
-    # one of size zero changes nothing
+    """Return the problem with causes of sizes (k,)."""
+    # a cause of size zero changes nothing
     present = [(one, float(size)) for one, size in zip(causes, sizes, strict=True) if size]
     geometric = [
         size * one.effect.deviations for one, size in present if isinstance(one.effect, OnGeometry)
     ]
     if geometric:
-        # a robot is moved once for all numbers, which takes longer than a run of it
+        # to move a robot takes longer than to run it, so it is moved once for all numbers
         problem = with_geometry(problem, np.sum(geometric, axis=0))
     others = [pair for pair in present if not isinstance(pair[0].effect, OnGeometry)]
     return reduce(lambda changed, pair: pair[0].change(changed, pair[1]), others, problem)
@@ -180,5 +181,5 @@ def with_geometry(problem: OutputErrorProblem, deviations: Array) -> OutputError
 
 @lru_cache(maxsize=8)
 def _moved(robot: Robot, deviations: bytes) -> Robot:
-    """Return a moved robot, which a fit asks for several times. Bytes, as arrays are no keys."""
+    """Return a moved robot, as a fit asks for it repeatedly. The cache needs bytes, not arrays."""
     return robot.moved(np.frombuffer(deviations))

@@ -1,6 +1,7 @@
 """Causes between the log of the commands and the drives: their scale, and clocks.
 
-A record on the grid states when each command acts by a latency, and one at any times by a time.
+A record with commands at its frames states a latency for each of them. A record with commands at
+any times states when each of them acts.
 """
 
 from dataclasses import replace
@@ -15,7 +16,7 @@ from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
 
 CLOCK_STEP_S = 1e-4  # change of a latency for differences
-SHORTEST_S = 1e-4  # shortest time for which a command acts, s
+SHORTEST_S = 1e-4  # lower limit of the time between two commands in `delayed`
 SCALE_STD = 1e-3  # standard deviation of the scale of commands in an ordinary workshop
 SCALE_STEP = 1e-4  # change of the scale of commands for differences
 
@@ -26,7 +27,7 @@ def command_causes(problem: OutputErrorProblem) -> tuple[Cause, ...]:
 
 
 def scales() -> tuple[Cause, ...]:
-    """Return the scale of the commands about the zeros of the joints."""
+    """Return the error of the commands' scale about the zeros of the joints."""
 
     def scaled(run: LoopModel, size: float) -> LoopModel:
         return replace(run, logged=(1.0 + size) * run.logged)
@@ -49,7 +50,7 @@ def scales() -> tuple[Cause, ...]:
 
 
 def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
-    """Return the offset and the drift of the clock of the commands against that of the frames."""
+    """Return offset and drift of the commands' clock, positive if commands act later."""
     timing = problem.runs[0].settings.timing
 
     def drifting(run: LoopModel, size: float) -> LoopModel:
@@ -68,7 +69,7 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
         )
 
     timed = any(isinstance(run, TimedModel) for run in problem.runs)
-    # a clock may have any offset
+    # the offset of a clock has no limit, but a latency cannot be negative
     earliest = np.inf if timed else min(float(run.stated_latencies.min()) for run in problem.runs)
     longest = max(float(seconds_of(run)[-1]) for run in problem.runs)
     return (
@@ -101,33 +102,33 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
 
 
 def seconds_of(run: LoopModel) -> Array:
-    """Return the times (N,) of the commands of a run since its first frame, s."""
+    """Return the times (N,), s, of a run's commands after its first frame."""
     if isinstance(run, TimedModel):
         return np.asarray(run.acting - run.times[0])
     return np.arange(len(run.logged)) / run.settings.timing.frame_rate_hz
 
 
 def acting_later(run: LoopModel, seconds: Array | float) -> LoopModel:
-    """Return a model whose commands act later by some seconds (N,)."""
+    """Return a model whose commands act later by some seconds (N,), with `possible` latencies."""
     if isinstance(run, TimedModel):
         return replace(run, acting=run.acting + seconds)
     return replace(run, acted=possible(run, run.stated_latencies + seconds))
 
 
 def delayed(run: LoopModel) -> Array:
-    """Return the change (N, n) of the commands by which they act a second later, to first order.
+    """Return the derivative (N, n) of the commands with respect to a delay, s.
 
-    A held command that acts later by s lets the one before it act for so long, at the beginning of
-    its time. Half of this change is in the time of either one, so that its middle is there.
+    If a held command acts later by s, the one before it acts longer by s. This change is at the
+    boundary of their two intervals, and each interval gets half of it.
     """
     changes = np.diff(run.logged, axis=0, prepend=run.logged[:1], append=run.logged[-1:])
     rates = np.full((len(run.logged), 1), run.settings.timing.frame_rate_hz)
     if isinstance(run, TimedModel) and len(rates) > 1:
-        # two commands that act together are as one
+        # commands that act at the same time would divide by zero
         rates[:-1, 0] = 1.0 / np.maximum(np.diff(run.acting), SHORTEST_S)
     return -rates * (changes[:-1] + changes[1:]) / 2
 
 
 def possible(run: LoopModel, latencies: Array) -> Array:
-    """Return latencies (N,) that a loop can have, cut at nothing and at the longest."""
+    """Return latencies (N,) clipped to those that a loop can have, 0 to MAX_DELAY_FRAMES frames."""
     return np.clip(latencies, 0.0, MAX_DELAY_FRAMES / run.settings.timing.frame_rate_hz)

@@ -33,7 +33,7 @@ from identify.progress import SilentProgress
 from identify.runtime import one_thread
 from identify.scenario import Scenario
 
-MOST_STEPS = 30  # largest number of steps of the search for the optimum under the logged commands
+MOST_STEPS = 30  # iterations after which the search under the logged commands ends
 
 
 def diagnose(
@@ -61,13 +61,13 @@ def diagnose(
     Returns
     -------
     Diagnosis
-        Causes by their share of the misfit. A right model is accused of nothing.
+        Causes in the order of their selection. There are none if chance explains the misfit.
 
     Raises
     ------
     RecordError, EstimationError, ScenarioError, dynamics.DynamicsError
         As `identify.identify`. An EstimationError also tells that a cause of one's own changes no
-        pose, or that the drives took torques.
+        pose or gives a model that does not run, or that the drives took torques.
 
     Examples
     --------
@@ -89,8 +89,8 @@ def diagnosed(
     problem = output_error_problem(asked.records, side, asked.settings)
     errors = result.common_errors.learned
     costs = dict(zip(result.searches, result.costs, strict=True))["command_driven"]
-    # Common errors are those of the last search. The optimum of the model under commands then has
-    # others, and must be searched.
+    # The final search has estimated the common errors. At the optimum under the commands they
+    # differ, so that a search follows, as it does if the first one reached its limit.
     settled = not errors and len(costs) <= asked.settings.max_iterations
     found = diagnosis_from(problem, result.driven_estimate, causes, errors, settled)
     return replace(found, seconds=time.perf_counter() - began)
@@ -108,11 +108,11 @@ def diagnosis_from(
 
     The joints are driven by the logged commands, since the residuals of a right model are white
     only then. own: causes in addition to those of the catalogue. errors: estimates of the first
-    record's common errors, by name. The search for common errors starts from them. settled: whether
-    the parameters are the optimum under the logged commands already.
+    record's common errors, by name, from which their search starts. settled: whether the parameters
+    are already the optimum under the logged commands.
 
-    Raises EstimationError for a cause of one's own that has no effect, and for drives that took
-    torques. Raises LoopFailure if the model is unstable.
+    Raises EstimationError for a cause of one's own that has no effect or does not run, and for
+    drives that took torques. Raises LoopFailure if the model is unstable.
     """
     began = time.perf_counter()
     if any(run.settings.drives.torques for run in problem.runs):
@@ -141,9 +141,10 @@ def diagnosis_from(
 
 
 def _with_errors(problem: OutputErrorProblem, errors: Mapping[str, float]) -> OutputErrorProblem:
-    """Return a problem whose first run has these common errors, if it can have exactly these.
+    """Return a problem whose first run has these common errors.
 
-    Of other records nothing is known, and they begin without errors.
+    Other runs begin without errors, as theirs are not known. The problem is unchanged if there are
+    no errors, or the first run has errors of other names.
     """
     first, *others = problem.runs
     if not errors or tuple(errors) != first.common.all_names:

@@ -18,7 +18,7 @@ from identify.estimation.explanation import MISFIT_STDS, Misfit, by_frames, whit
 if TYPE_CHECKING:
     import pandas as pd
 
-NAMED = 3  # number of causes that one line names of those that cannot be told apart from another
+NAMED = 3  # largest number of causes that a line names as indistinguishable from another
 
 
 @dataclass(frozen=True)
@@ -44,19 +44,19 @@ class Finding:
     name : str
         Name in plain words.
     group : str
-        Name of the causes that this one is of a kind with.
+        Name of the group of similar causes.
     sizes : tuple of Size
-        Size of each cause, fitted beside the parameters and all other findings.
+        Sizes of the causes that have one, fitted beside the parameters and all other findings.
     share : float
-        Share of the misfit that it explains after the findings before it.
+        Fraction of the misfit that it explains after the findings before it.
     statistic, freedoms : float, int
         Score statistic and its degrees of freedom.
     chance : float
-        Probability that a right model is accused of any cause so strongly.
+        Probability that a right model has such a statistic for any cause.
     alike : tuple of str
-        Causes that the record cannot tell from this one.
+        Names of the causes that the record cannot tell from this one.
     remedies : tuple of str
-        Line to type, or sentence of what to measure or mend, for each cause.
+        Options to type, or sentences on what to measure or mend, without repetition.
     """
 
     name: str
@@ -85,9 +85,9 @@ class Finding:
 class CandidateRow:
     """Candidate as it was ranked before any cause was fitted.
 
-    group: name of the causes that it is of a kind with. share: of the misfit that it alone
-    explains. value and std: size of a single cause, to first order, with its standard deviation by
-    noise, or None for a group, and where nothing shows it.
+    group: name of the group of similar causes. share: fraction of the misfit that it alone
+    explains. value and std: size of a single cause, to first order, with its standard deviation due
+    to noise. None for a group, a cause without a size, and one that the residuals cannot show.
     """
 
     name: str
@@ -103,12 +103,12 @@ class CandidateRow:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Causes for which a model misses its record, the one that explains most first.
+    """Causes for which a model misses its record, in the order of their selection.
 
     Attributes
     ----------
     findings : tuple of Finding
-        Causes that chance does not explain. Empty if the model is accused of nothing.
+        Causes with effects that chance does not explain. Empty if no cause is accused.
     candidates : tuple of CandidateRow
         All causes and groups that were asked, as they were ranked at first.
     misfit, left : Misfit
@@ -116,7 +116,7 @@ class Diagnosis:
     seconds : float
         Time that the diagnosis took, s.
     not_needed : str
-        Why no cause is needed, as for residuals that are noise. Empty if one is.
+        Reason why no cause is needed, such as residuals that are noise. Empty if one is needed.
     """
 
     findings: tuple[Finding, ...]
@@ -128,12 +128,12 @@ class Diagnosis:
 
     @property
     def explained(self) -> float:
-        """Share of the misfit that all findings explain together."""
+        """Fraction of the misfit that all findings explain together."""
         return sum(one.share for one in self.findings)
 
     @property
     def none_of_these(self) -> bool:
-        """True if the model misses the record, and the findings leave more than a tenth of that."""
+        """True if there is a misfit, and the findings leave more than a tenth of it."""
         return self.misfit.significant and self.explained < MOST_OF_IT
 
     def __str__(self) -> str:
@@ -150,7 +150,7 @@ class Diagnosis:
 
     @property
     def _unfitted(self) -> str:
-        """Words on a cause that explains most of the misfit to first order, and not as fitted."""
+        """Words on the first candidate, if it explains the misfit only to first order."""
         first = self.candidates[0]
         if first.share < MOST_OF_IT:
             return ""
@@ -163,7 +163,7 @@ class Diagnosis:
         return f"<Diagnosis: {self}>"
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning that names the first cause, if there is any and one is needed."""
+        """Return at most one warning: the first finding, or that no cause explains the misfit."""
         if self.not_needed or not (self.findings or self.none_of_these):
             return ()
         if self.none_of_these:
@@ -187,7 +187,7 @@ class Diagnosis:
         }
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Table of all candidates as they were ranked, with the share that each alone explains."""
+        """Return a table of all candidates as they were ranked at first, indexed by name."""
         import pandas as pd
 
         return pd.DataFrame([asdict(one) for one in self.candidates]).set_index("name")
@@ -204,14 +204,14 @@ class Diagnosis:
 def diagnosis_of(
     selection: Selection, causes: Sequence[Cause], rows: Rows, seconds: float
 ) -> Diagnosis:
-    """Return what a selection among causes says. rows: places of the problem's residuals."""
+    """Return what a selection among causes says. rows: layout of the problem's residuals."""
     count = len(rows.of_poses(selection.point.residual))
     excess = count * (selection.before.found - selection.before.expected)
     gains = sum(one.gain for one in selection.selected)
-    # a misfit that chance can make has no shares; then it is what the causes explain
+    # the causes can explain more than the excess over noise, which would make fractions above one
     whole = max(excess, gains)
     sizes = dict(zip(selection.places, _sizes(selection, causes, rows), strict=True))
-    # what is typed last stands, and so has the entries of the findings before
+    # a list that is set again replaces the earlier one, so it repeats the earlier entries
     lists: dict[str, list[str]] = {}
     findings = tuple(_finding(one, causes, sizes, whole, lists) for one in selection.selected)
     noise = noise_finding(selection, rows, whole)
@@ -223,8 +223,8 @@ def diagnosis_of(
 def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | None:
     """Return the finding that the sensor states another noise than it has, or None.
 
-    It has no column, but what is left by all other causes then is white, and of another size than
-    stated. whole: misfit without any cause.
+    Wrongly stated noise has no column. It shows in residuals that are white beside all causes, and
+    have another variance than stated. whole: misfit without any cause.
     """
     left = selection.after
     off = (left.found - left.expected) / left.std
@@ -237,7 +237,7 @@ def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | N
     ]
     names = ("noise of the positions", "noise of the orientations")
     excess = 6 * count * (left.found - left.expected)
-    # a record that is nearer to the model than its noise allows has no misfit to share
+    # residuals smaller than the stated noise have no misfit, which this would be a fraction of
     share = excess / whole if excess > 0 else 1.0
     return Finding(
         name="noise of the sensor",
@@ -259,15 +259,15 @@ def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | N
 
 
 def _sizes(selection: Selection, causes: Sequence[Cause], rows: Rows) -> list[Size]:
-    """Return the fitted sizes, with the spread that noise and what is left of the misfit make."""
+    """Return the fitted sizes, with standard deviations due to noise and the remaining misfit."""
     point = selection.point
     if not len(point.sizes):
         return []
-    there = point.score()
-    # what is left of the misfit lasts from frame to frame, and spreads the sizes further
+    found = point.score()
+    # the remaining misfit is correlated between frames, and adds to the covariance
     colour = rows.colour(point.residual)
-    model = selection.after.share_of_model * rows.spread(colour, there.directions)
-    std = np.sqrt(np.diag(there.covariance(model)))
+    by_misfit = selection.after.share_of_model * rows.spread(colour, found.directions)
+    std = np.sqrt(np.diag(found.covariance(by_misfit)))
     return [
         Size(causes[place].name, causes[place].unit, float(value), float(err))
         for place, value, err in zip(selection.places, point.sizes, std, strict=True)
@@ -287,7 +287,7 @@ def _finding(
     return Finding(
         name=name,
         group=causes[one.places[0]].group,
-        # one that is there or not has no size to tell
+        # a cause that is there or not has no size
         sizes=tuple(
             size for place, size in zip(one.places, own, strict=True) if causes[place].step
         ),
@@ -303,7 +303,7 @@ def _finding(
 def remedies_of(
     causes: Sequence[Cause], sizes: Sequence[Size], lists: dict[str, list[str]]
 ) -> tuple[str, ...]:
-    """Return the remedies of a finding with some causes, and add to lists of settings by key."""
+    """Return the remedies of a finding. lists: entries of settings by key, extended in place."""
     found = []
     keys = []
     for one, size in zip(causes, sizes, strict=True):

@@ -1,4 +1,4 @@
-"""Fit of causes beside the parameters, with the model linearised anew until their sizes stand."""
+"""Fit of causes beside the parameters, by searches that are repeated until the sizes converge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,16 +18,16 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 STOP = StopCriteria(cost_tolerance=1e-4, parameter_tolerance=1e-3, max_iterations=5)
 ROUNDS = 6  # largest number of searches
 FINER = 0.3  # factor of the steps of differences from one search to the next
-SLOW = 0.25  # fall of the cost by a search, as a share, below which differences become finer
-# Number of searches after which effects that depend on the motion are those of the new one.
+SLOW = 0.25  # relative fall of the cost in a search, up to which differences become finer
+# Number of first searches after which effects that depend on the motion are computed anew.
 RENEWALS = 2
-STANDS = 2e-4  # fall of the cost by another search, as a share, below which sizes stand
-# Mean square of the move of residuals, in units of the noise, up to which the columns of the last
+STANDS = 2e-4  # relative fall of the cost in a search, up to which sizes have converged
+# Mean square change of the residuals, in units of the noise, up to which the columns of the latest
 # linearisation stay. A run without derivatives takes a sixth of the time of one that has them.
 SETTLED = 2e-2
-# Largest ratio of the fall of the cost by a search to the fall that its linearisation predicts.
+# Largest assumed ratio of the fall of the cost in a search to that which linearisation predicts.
 BEYOND_LINEAR = 4.0
-# Criteria of a search of the parameters alone.
+# Criteria of a search for the parameters while trial sizes are held.
 FOLLOW = replace(STOP, cost_tolerance=1e-2, max_iterations=6)
 
 
@@ -50,7 +50,7 @@ class Point:
     linear : Linearisation
         Residuals, and their columns by parameters and by these causes.
     beside : OrthogonalComplement
-        Space beside the columns of the parameters that no bound holds.
+        Orthogonal complement of the columns of the parameters that are not at their bounds.
     """
 
     causes: tuple[Cause, ...]
@@ -103,7 +103,7 @@ class Point:
 
     @cached_property
     def beside_all(self) -> OrthogonalComplement:
-        """Space beside the columns of the parameters and of the causes."""
+        """Orthogonal complement of the columns of the free parameters and of the causes."""
         return self.beside.without(self.columns)
 
 
@@ -111,8 +111,8 @@ class Point:
 class WithCauses:
     """Problem in the coordinates of parameters and causes, see `bounded_least_squares.Problem`.
 
-    The sizes stand behind the coordinates of the parameters, in steps of the causes. held (k,):
-    causes whose sizes do not move. step: that of differences, in the causes' own steps. known:
+    The sizes, in units of the causes' steps, follow the coordinates of the parameters. held (k,):
+    causes whose sizes do not move. step: step of differences, in the same units. known:
     linearisations by the bytes of their coordinates.
     """
 
@@ -140,7 +140,7 @@ class WithCauses:
         return coordinates[len(coordinates) - len(self.causes) :] * self.steps
 
     def renewed(self, coordinates: Array) -> "WithCauses":
-        """Return the problem with causes of effects along the motion at coordinates (p + k,)."""
+        """Return the problem with effects of causes along the motion at coordinates (p + k,)."""
         parameters = self.parameters(coordinates)
         there = with_causes(self.problem, self.causes, self.sizes(coordinates))
         causes = tuple(
@@ -155,9 +155,9 @@ class WithCauses:
 
     def at(self, coordinates: Array) -> Linearisation:
         """Return the linearisation at coordinates (p + k,). Raises LoopFailure."""
-        place = coordinates.tobytes()
-        if place not in self.known:
-            self.known[place] = self._settled(coordinates) or linearisation(
+        key = coordinates.tobytes()
+        if key not in self.known:
+            self.known[key] = self._settled(coordinates) or linearisation(
                 self.problem,
                 self.parameters(coordinates),
                 self.causes,
@@ -165,41 +165,41 @@ class WithCauses:
                 range(len(self.causes)),
                 self.step,
             )
-        return self.known[place]
+        return self.known[key]
 
     def _settled(self, coordinates: Array) -> Linearisation | None:
-        """Return the last linearisation with the residuals at coordinates, if these hardly move."""
+        """Return `with_last_columns` of the latest linearisation, None if residuals change much."""
         if not self.known:
             return None
-        place, last = next(reversed(self.known.items()))
-        before = np.frombuffer(place)
+        key, latest = next(reversed(self.known.items()))
+        before = np.frombuffer(key)
         parameters = self.parameters(coordinates)
         sizes = self.sizes(coordinates)
-        moved = last.by_parameters @ (parameters - self.parameters(before))
-        moved += last.by_causes @ (sizes - self.sizes(before))
-        if not moved @ moved <= SETTLED * len(moved):
+        change = latest.by_parameters @ (parameters - self.parameters(before))
+        change += latest.by_causes @ (sizes - self.sizes(before))
+        if not change @ change <= SETTLED * len(change):
             return None
-        found = with_last_columns(self.problem, parameters, self.causes, sizes, last)
+        found = with_last_columns(self.problem, parameters, self.causes, sizes, latest)
         if found is None:
             return None
-        moved = found.residual - last.residual
-        return found if moved @ moved <= SETTLED * len(moved) else None
+        change = found.residual - latest.residual
+        return found if change @ change <= SETTLED * len(change) else None
 
     def best_known(self, coordinates: Array, cost: float) -> Array:
-        """Return the best linearised coordinates, or these (p + k,) of a cost if far better."""
-        costs = {place: float(one.residual @ one.residual) for place, one in self.known.items()}
-        place = min(costs, key=lambda one: costs[one], default=b"")
-        near = place and costs[place] <= cost * (1 + STOP.cost_tolerance)
-        return np.frombuffer(place) if near else coordinates
+        """Return the best linearised coordinates, or these (p + k,) if clearly of less cost."""
+        costs = {key: float(one.residual @ one.residual) for key, one in self.known.items()}
+        key = min(costs, key=lambda one: costs[one], default=b"")
+        good_enough = key and costs[key] <= cost * (1 + STOP.cost_tolerance)
+        return np.frombuffer(key) if good_enough else coordinates
 
     def linearise(self, coordinates: Array) -> tuple[float, Array, Array]:
-        """Return cost and linearisation at coordinates (p + k,)."""
+        """Return cost, triangular factor and right-hand side (p + k,) at coordinates (p + k,)."""
         found = self.at(coordinates)
         count = len(coordinates)
         bounds = self.problem.bounds
         rows = triangular_factor(
             found.by_parameters @ bounds.slope(coordinates[: count - len(self.causes)]),
-            # one whose model does not run on either side stays, too
+            # the size of a cause stays, too, if its model runs on neither side (NaN)
             np.nan_to_num(found.by_causes) * self.steps * ~self.held,
             found.residual,
         )
@@ -208,7 +208,7 @@ class WithCauses:
     def may_reach(self, coordinates: Array, cost: float) -> bool:
         """Tell whether a search from coordinates (p + k,) may fall to a cost.
 
-        The linearisation is the one with which the search begins.
+        The fall is taken as at most `BEYOND_LINEAR` times what the first linearisation predicts.
         """
         if cost == np.inf:
             return True
@@ -223,9 +223,9 @@ def with_last_columns(
     sizes: Array,
     last: Linearisation,
 ) -> Linearisation | None:
-    """Return a linearisation of the last columns and the residuals at parameters (p,), sizes (k,).
+    """Return the linearisation `last` with the residuals at parameters (p,) and sizes (k,).
 
-    Returns None where a column is a difference of runs, as kinks of friction change it at once.
+    Returns None if a column is a difference of runs, as kinks of friction change it abruptly.
     last: linearisation nearby. Raises LoopFailure if the model is unstable.
     """
     if any(one.differentiable for one in causes):
@@ -245,12 +245,12 @@ def fit(
 ) -> Point:
     """Fit parameters and causes from parameters (p,) and sizes (k,).
 
-    expected (k,): sizes to which the search probably goes. held (k,): causes whose sizes stay until
-    the parameters have followed. linear: linearisation at the start, if it is known. reach: cost
-    above which the fit is of no use.
+    expected (k,): sizes that the search will probably reach. held (k,): causes whose sizes stay
+    until a first search has adapted the parameters. linear: linearisation at the start, if it is
+    known. reach: cost above which the fit is of no use.
 
     Raises LoopFailure if the model is unstable at the start, and OutOfReachError if a search will
-    hardly fall to this cost.
+    probably not fall to `reach`.
     """
     whole = WithCauses(problem, tuple(causes), np.zeros_like(held))
     there = with_causes(problem, causes, sizes)
@@ -264,13 +264,13 @@ def fit(
     spread = there.bounds.spread(coordinates[:count], problem.guess.std)
     limits = np.concatenate([there.bounds.lower, least]), np.concatenate([spread, far])
     if held.any():
-        # the parameters follow before the sizes move, as joints that stick make many minima
+        # the parameters adapt before the sizes move, as joints that stick make many minima
         coordinates = minimise(replace(whole, held=held), coordinates, *limits, FOLLOW).parameters
     renewing = RENEWALS if any(one.renewed for one in causes) else 0
     for _ in range(ROUNDS):
         if not whole.may_reach(coordinates, reach):
             raise OutOfReachError
-        # each begins with a wide trust region again, which kinks make narrow
+        # each search widens the trust region again, which kinks of friction have narrowed
         found = minimise(whole, coordinates, *limits, STOP)
         coordinates = found.parameters
         fall = (found.costs[0] - found.costs[-1]) / found.costs[-1]
@@ -281,7 +281,7 @@ def fit(
             whole = whole.renewed(coordinates)
             renewing -= 1
         if fall <= SLOW:
-            # Joints that stick make kinks. Far off, coarse differences see past them.
+            # Joints that stick make kinks. Far from the optimum, coarse differences pass over them.
             whole = replace(whole, step=FINER * whole.step, known={})
     coordinates = whole.best_known(found.parameters, found.costs[-1])
     return Point.of(

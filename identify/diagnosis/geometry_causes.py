@@ -1,4 +1,4 @@
-"""Causes in the geometry: zeros of the joints, and places, axes and lengths of the legs."""
+"""Causes in the geometry: zeros and positions of joints, and axes and lengths of the legs."""
 
 from dataclasses import replace
 
@@ -19,10 +19,10 @@ from identify.model.loop_model import LoopModel
 STEPS = {"m": 1e-5, "rad": 1e-4}  # change of a number for differences, by its unit
 # Standard deviation of the zero of a joint in an ordinary workshop, by its unit.
 ZERO_STDS = {"m": 1e-4, "rad": 1e-3}
-# Numbers that are zeros of joints, which a shift of the commands stands for.
+# Geometric numbers that are zeros of joints. A shift of the commands represents them.
 ZEROS = ("crank_zero", "zero_length")
 
-# Names of the groups of numbers, by their kinds.
+# Name of the group of each kind of geometric number.
 GROUPS = {
     "base_joint": "places of the base joints",
     "platform_joint": "places of the platform joints",
@@ -43,18 +43,18 @@ def geometry_causes(problem: OutputErrorProblem) -> tuple[Cause, ...]:
     return (
         *(_zero(joint, unit) for joint in range(joints)),
         *(
-            _number(name, unit, np.eye(len(geometry.number_names))[place])
-            for place, (name, unit) in enumerate(numbers)
+            _number(name, unit, np.eye(len(geometry.number_names))[index])
+            for index, (name, unit) in enumerate(numbers)
             if name.partition(".")[2] not in ZEROS
         ),
     )
 
 
 def _zero(joint: int, unit: str) -> Cause:
-    """Return the zero of a joint, which reads less than it should where the size is positive."""
+    """Return the error of a joint's zero. The joint reads too little if the size is positive."""
 
     def shifted(run: LoopModel, size: float) -> LoopModel:
-        # drives that read less by a value go further by it
+        # drives whose reading is too small by a value move the joint too far by it
         return replace(run, logged=run.logged + size * np.eye(run.logged.shape[1])[joint])
 
     def shifts(run: LoopModel, place: int) -> Array:
@@ -78,13 +78,13 @@ def _zero(joint: int, unit: str) -> Cause:
 def _number(name: str, unit: str, direction: Array) -> Cause:
     leg, _, number = name.partition(".")
     kind = number.partition(".")[0]
-    words = f"{number.replace('_', ' ').replace('.', ' ')} of {leg.replace('leg', 'leg ')}"
+    cause_name = f"{number.replace('_', ' ').replace('.', ' ')} of {leg.replace('leg', 'leg ')}"
 
     def moved(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
         return with_geometry(problem, size * direction)
 
     return Cause(
-        name=words,
+        name=cause_name,
         unit=unit,
         group=GROUPS.get(kind, kind.replace("_", " ")),
         change=moved,

@@ -4,15 +4,15 @@ One run of the model is differentiated with respect to the parameters and the ga
 and along all directions of the commands that causes have. A torque that joints need beside those of
 the model is a direction, too (`identify.model.joint_torques`). So are the zeros of the joints.
 
-A robot with other geometric numbers moves under the same commands. Its column follows without a run
-of it. At the same joint coordinates the pose is off by what closes the loops, J_g. A run begins at
-the pose of rest, where the joints then are at other coordinates by d, and the drives take them from
-there to where the commands want them. That response is known from the zeros of the joints, whose
-columns Z have the same one: a joint whose zero is off by s begins at its command less s. So
+The column of a geometric number follows without a run of a robot with that number. Let J_g and X be
+the derivatives of the pose with respect to the number and to the joint coordinates, both with
+closed loops. A run begins at the same pose of rest, so that its joint coordinates differ by d. The
+drives then move the joints by -d, to where the commands want them. The columns Z of the zeros of
+the joints contain the same response: a joint whose zero is off by s begins at its command less s.
 
-    column = J_g + (J_theta - Z) d,    d = -J_theta^-1 J_g at the first pose.
+    column = J_g + (X - Z) d,    d = -X^-1 J_g at the first pose
 
-What the changed lever arms do to the torques is left out.
+The effect of changed lever arms on the torques is left out.
 
 All other columns are differences of runs.
 """
@@ -48,7 +48,7 @@ class Linearisation:
     """Residuals (m,) of a problem, with their columns by parameters (m, p) and causes (m, k).
 
     Rows of what is known beside the poses come first, then those of each run. The column of a cause
-    is NaN where the model with it is unstable, and zero where it has no derivative.
+    is NaN if the model is unstable on both sides of the size, and zero if it has no derivative.
     """
 
     residual: Array
@@ -66,8 +66,8 @@ def linearisation(
 ) -> Linearisation:
     """Return the linearisation of a problem with causes at parameters (p,) and sizes (k,).
 
-    asked: places of the causes whose columns are wanted. step: that of differences, in the causes'
-    own steps. Raises LoopFailure if the model is unstable.
+    asked: indices of the causes whose columns are wanted. step: step of differences, in units of
+    the causes' steps. Raises LoopFailure if the model is unstable.
     """
     there = with_causes(problem, causes, sizes)
     known, known_rows = there.known(parameters)
@@ -80,26 +80,26 @@ def linearisation(
         residual.append(missed.ravel())
         by_parameters.append(slopes)
         by_causes.append(columns)
-    found = Linearisation(np.concatenate(residual), np.vstack(by_parameters), np.vstack(by_causes))
-    slow = [
+    linear = Linearisation(np.concatenate(residual), np.vstack(by_parameters), np.vstack(by_causes))
+    by_differences = [
         k
         for k, place in enumerate(asked)
-        # one that is only tried has no derivative at nothing
+        # a cause with trial sizes has no derivative at size zero
         if causes[place].differentiable and (sizes[place] or not causes[place].tried)
     ]
-    places = [asked[k] for k in slow]
-    differences = _differences(problem, parameters, causes, sizes, places, step, found.residual)
-    for k, column in zip(slow, differences, strict=True):
-        found.by_causes[:, k] = column
-    return found
+    places = [asked[k] for k in by_differences]
+    differences = _differences(problem, parameters, causes, sizes, places, step, linear.residual)
+    for k, column in zip(by_differences, differences, strict=True):
+        linear.by_causes[:, k] = column
+    return linear
 
 
 def _of_run(
     run: LoopModel, place: int, parameters: Array, effects: Sequence[Effect | None]
 ) -> tuple[Array, Array, Array]:
-    """Return residuals (n, 6) of a run, and their columns (6 n, p) and (6 n, k).
+    """Return residuals (n, 6) of a run's good frames, and their columns (6 n, p) and (6 n, k).
 
-    place: that of the run. effects: those of the k causes.
+    place: index of the run. effects: those of the k causes.
     """
     joints = run.robot.layout.joints
     geometric = [k for k, one in enumerate(effects) if isinstance(one, OnGeometry)]
@@ -138,7 +138,7 @@ def _of_run(
 def _directions(
     run: LoopModel, place: int, parameters: Array, effects: Sequence[Effect | None]
 ) -> tuple[list[int], Array]:
-    """Return the places of effects on commands and torques, and their directions (N, n, k)."""
+    """Return the indices of effects on commands and torques, and their directions (N, n, k)."""
     commands = {k: one for k, one in enumerate(effects) if isinstance(one, OnCommands)}
     torques = {k: one for k, one in enumerate(effects) if isinstance(one, OnTorques)}
     parts = [np.zeros((*run.logged.shape, 0))]
@@ -179,10 +179,10 @@ def _differences(
     step: float,
     residual: Array,
 ) -> list[Array | float]:
-    """Return central differences (m,) for the causes at some places, one-sided at least sizes.
+    """Return the central difference (m,) for each cause at `places`.
 
-    They are one-sided, too, where the model is unstable on one side, and NaN where on both.
-    residual (m,): that at the sizes.
+    It is one-sided at the least size, and where the model is unstable on one side. It is NaN where
+    the model is unstable on both. residual (m,): residuals at the sizes.
     """
     by = [step * causes[k].step for k in places]
     spans = [
@@ -208,7 +208,7 @@ def _differences(
 def _slope(
     residual: Array, less: Array | None, more: Array | None, low: float, high: float
 ) -> Array | float:
-    """Return the difference of residuals (m,) at two moves, or of the one that is there to none."""
+    """Return the slope between residuals (m,) at two changes of size. None: no change instead."""
     if less is None:
         less, low = residual, 0.0
     if more is None:
@@ -226,7 +226,7 @@ def residuals(problem: OutputErrorProblem, parameters: Array) -> Array:
 
 
 def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) -> list[Array | None]:
-    """Return the `residuals` (m,) of each problem, None where its model is unstable."""
+    """Return the `residuals` (m,) of each problem at `allowed` parameters, None if unstable."""
 
     def of(problem: OutputErrorProblem) -> Array | None:
         try:
@@ -238,7 +238,7 @@ def each_residuals(problems: Sequence[OutputErrorProblem], parameters: Array) ->
 
 
 def allowed(problem: OutputErrorProblem, parameters: Array) -> Array:
-    """Return parameters (p,) that a problem's law of the drives allows, raised where it must be."""
+    """Return parameters (p,), raised to their lower bounds where they must be above zero."""
     bounds = problem.bounds
     above = np.isin(bounds.layout.names, problem.guess.above_zero)
     return np.where(above, np.maximum(parameters, bounds.lower), parameters)

@@ -1,11 +1,11 @@
 """Causes in the loop around the robot: friction, gains, springs, limits and laws of drives, steps.
 
-Many of them show nothing at a small size, or are there or not. They are looked for at some sizes
-of their own. Sizes are taken from the run of the model itself: velocities from those of its joints,
-limits from its torques.
+Many of them show nothing at a small size, or are there or not. They are asked at trial sizes. These
+are taken from the run of the model itself: velocities from those of its joints, limits from its
+torques.
 
-A joint whose motor drives the body through a spring is behind its motor by the torque over the
-stiffness. To first order that is a shift of its command.
+A joint that is driven through a spring lags behind its motor by the torque over the stiffness. To
+first order that is a shift of its command.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ from identify.model.loop_model import LoopModel
 from identify.model.timed_model import TimedModel
 from identify.model.unequal_gains import with_unequal_gains
 
-# Velocities over which static friction fades, as shares of the joints' RMS velocity.
+# Velocities over which static friction fades, as fractions of the joints' RMS velocity.
 SLOW = {"slow": 0.1, "middling": 0.3, "fast": 0.9}
 FRICTION = "law of friction"  # group of the laws of friction, of which a joint has one
-FINER = 4  # factor of the steps a frame with which a finer model is tried
-# Deflection at the largest torque for differences, by the unit of joint coordinates.
+FINER = 4  # ratio of the steps per frame of the finer model to those of the model
+# Deflection at the largest torque that is the step of differences, by unit of the joints.
 DEFLECTION = {"rad": 1e-4, "m": 1e-5}
-GAIN_STEP = 1e-3  # change of a gain for differences, as a share of the gain
-LEAST_GAIN = -0.9  # least difference of a gain, as a share of it. A law needs gains above zero.
+GAIN_STEP = 1e-3  # relative change of a gain for differences
+LEAST_GAIN = -0.9  # least relative difference of a gain, as a law needs gains above zero
 
 
 def loop_causes(
@@ -58,7 +58,7 @@ def in_settings(change: Callable[[LoopSettings, float], LoopSettings]) -> Change
 
 
 def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
-    """Return other laws of friction, where the model's is that of Coulomb.
+    """Return other laws of friction, if the model has Coulomb and viscous friction.
 
     typical: RMS velocity of the joints.
     """
@@ -88,7 +88,7 @@ def friction_causes(run: LoopModel, typical: float) -> tuple[Cause, ...]:
 
 
 def _static(name: str, velocity: float, unit: str, key: str) -> Cause:
-    """Return static friction beyond that of Coulomb, which fades over a velocity."""
+    """Return static friction in excess of Coulomb friction, which fades over a velocity."""
 
     def stribeck(settings: LoopSettings, size: float) -> LoopSettings:
         law = FrictionLaw("stribeck", static_ratio=1.0 + size, stribeck_velocity=velocity)
@@ -174,7 +174,7 @@ def elasticity(
 
 
 def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Array) -> Array:
-    """Return the torques (N, n) behind motors and their friction while each command acts."""
+    """Return joint torques (N, n) less friction, in the middle of the time each command acts."""
     _, coulomb, viscous, _ = run.robot.layout.split(parameters + run.payload)
     friction = run.settings.friction
     carried = found.torque - coulomb * friction.level(rates) - viscous * rates
@@ -190,8 +190,8 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
 def torque_limit(run: LoopModel, peak: float) -> Cause:
     """Return a limit of the torques below that of the model. peak: its largest torque.
 
-    Sizes are shares of this torque, which is another one at an optimum with other causes. Where a
-    robot carries its weight, motion adds only a few per cent to the torque.
+    A size is the fraction of this torque that the limit cuts off. With other causes, the largest
+    torque differs. Trial sizes are small, since motion can add only a few per cent to the weight.
     """
     layout = run.robot.layout
     unit = layout.unit("joint1.coulomb")
@@ -222,7 +222,7 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
 
 
 def laws(settings: LoopSettings) -> tuple[Cause, ...]:
-    """Return the other law of the drives that reads the same gains: cascade, or PID."""
+    """Return the other of the cascade and PID laws, if the model has one. Both read the same gains."""
     others: dict[str, DriveName] = {"pid": "cascade", "cascade": "pid"}
     other = others.get(settings.drives.law)
     if other is None:
@@ -233,7 +233,7 @@ def laws(settings: LoopSettings) -> tuple[Cause, ...]:
 
     def under_it(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
         changed = in_settings(law)(problem, size)
-        # the law has gains that must be above zero
+        # the guess tells which gains this law needs above zero
         return replace(changed, guess=replace(problem.guess, drive=other))
 
     return (
@@ -250,7 +250,7 @@ def laws(settings: LoopSettings) -> tuple[Cause, ...]:
 
 
 def finer_steps(settings: LoopSettings) -> Cause:
-    """Return steps of the model that are too coarse."""
+    """Return the cause that the steps of the model are too coarse."""
     steps = FINER * settings.steps_per_frame
 
     def finer(settings: LoopSettings, size: float) -> LoopSettings:
@@ -270,13 +270,13 @@ def finer_steps(settings: LoopSettings) -> Cause:
 def gain_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ...]:
     """Return the gains that can differ from those of the first joint, at an optimum (p,).
 
-    The gains of the first joint are those of the model.
+    The model has the gains of the first joint. The result is empty if each joint has its own.
     """
     run = problem.runs[0]
     layout = run.robot.layout
     if layout.own_gains:
         return ()
-    # a gain at its bound has the size of the initial guess
+    # the initial guess replaces a gain at its bound, as steps are relative to the gain
     gains = np.where(parameters > 0, parameters, problem.guess.values)[layout.joint_pid]
     return tuple(
         _gain_difference(joint, kind, float(gains[kind]), layout.unit(layout.joint_pid_names[kind]))
@@ -287,7 +287,7 @@ def gain_causes(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, 
 
 
 def _gain_difference(joint: int, kind: int, gain: float, unit: str) -> Cause:
-    """Return a gain of a joint beyond that of the first joint."""
+    """Return the difference of a joint's gain from that of the first joint."""
 
     def changed(run: LoopModel, size: float) -> LoopModel:
         differences = np.zeros((run.robot.layout.joints, len(JOINT_PID)))

@@ -1,17 +1,17 @@
 """Causes in what was measured: gross errors of single frames, errors that all frames share, and the
 scale anchor.
 
-A frame counts as suspicious if its residual is far from the median of its four neighbours, which
-shows what lasts. Its six components are then causes like all others (mean-shift model of outliers).
-The spread of such differences comes from their median, which outliers do not move.
+A frame is suspicious if its residual is far from the median of its four neighbours, which shows
+slow errors. The six components of its pose are then causes (mean-shift model of outliers). The
+scale of such differences comes from their median, which outliers hardly move.
 
-Errors of cameras and teaching are asked if the record states them. The residuals are whitened for
-them already, so that a cause is one that is larger than its stated standard deviation.
+Errors of cameras and teaching are asked if the record states them. The whitening of residuals
+allows for them already, so that only errors beyond their stated standard deviations show.
 
 No pose shows the common scale of the parameters, whatever gravity is, because all torques of a
 model are proportional to them. A known load is not proportional to them. Records with different
-loads therefore show the scale, and a measured anchor can contradict it. It has a row of its own
-among the residuals, and no other.
+loads therefore show the scale, and a measured anchor can contradict it. The anchor affects only one
+row of the residuals, its own.
 
 References
 ----------
@@ -41,7 +41,7 @@ BY_CHANCE = 1e-3
 """Probability that noise alone makes any frame of a record suspicious."""
 
 MOST_FRAMES = 8
-"""Largest number of frames that are asked, those that are furthest off."""
+"""Largest number of frames that are asked: first those of the first record, the furthest first."""
 
 ANCHOR_STEP = 1e-3
 """Relative change of the scale anchor for differences."""
@@ -63,7 +63,7 @@ def measurement_causes(
 def scale_anchor(problem: OutputErrorProblem) -> tuple[Cause, ...]:
     """Return the relative error of a measured scale anchor beside loads that show the scale, too.
 
-    It is left out where the loads of all records are the same, as they show no scale then.
+    There is no such cause without a measured anchor, or if all records have the same load.
     """
     anchor = problem.anchor
     if anchor.value is None or len({run.payload.tobytes() for run in problem.runs}) == 1:
@@ -100,7 +100,7 @@ def scale_anchor(problem: OutputErrorProblem) -> tuple[Cause, ...]:
 
 
 def shared_errors(problem: OutputErrorProblem) -> tuple[Cause, ...]:
-    """Return the errors that all poses have in common, as the first record states them."""
+    """Return the errors that all poses share, if all records state the same ones."""
     common = problem.runs[0].common
     stds = np.sqrt(np.diag(common.covariance))
     return tuple(
@@ -131,7 +131,7 @@ def _shared(name: str, place: int, std: float) -> Cause:
 
 
 def gross_errors(problem: OutputErrorProblem, runs: Sequence[ClosedLoopRun]) -> tuple[Cause, ...]:
-    """Return the components of the poses of suspicious frames. runs: those of the model."""
+    """Return the pose components of suspicious frames. runs: those of the model."""
     places = [
         (number, int(frame))
         for number, (run, found) in enumerate(zip(problem.runs, runs, strict=True))
@@ -170,15 +170,15 @@ def _gross(number: int, frame: int, component: int) -> Cause:
 
 
 def suspicious_frames(residuals: Array, ok: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """Return the frames whose residuals (n, 6) are far from their neighbours', the furthest first.
+    """Return the indices of frames with residuals (n, 6) off their neighbours', furthest first.
 
-    ok (N,): good frames, to which the residuals belong.
+    ok (N,): whether frames are good. The residuals are those of the n good ones.
     """
     count = len(residuals)
-    around = [(np.arange(count) + by) % count for by in (-2, -1, 1, 2)]
-    apart = residuals - np.median(residuals[np.array(around)], axis=0)
-    far = np.sum(apart**2, axis=1)
-    # the median of chi-square with six degrees of freedom, as it would be without outliers
-    far = far * chdtri(6, 0.5) / np.median(far)
-    found = np.flatnonzero(far > chdtri(6, BY_CHANCE / count))
-    return np.flatnonzero(ok)[found[np.argsort(-far[found])]]
+    neighbours = [(np.arange(count) + by) % count for by in (-2, -1, 1, 2)]
+    differences = residuals - np.median(residuals[np.array(neighbours)], axis=0)
+    distances = np.sum(differences**2, axis=1)
+    # scaled to the median of chi-square with six degrees of freedom
+    distances = distances * chdtri(6, 0.5) / np.median(distances)
+    found = np.flatnonzero(distances > chdtri(6, BY_CHANCE / count))
+    return np.flatnonzero(ok)[found[np.argsort(-distances[found])]]

@@ -2,15 +2,16 @@
 
 Candidates are all causes alone, and all causes of a group together. They are ranked by their score
 statistic S less d ln n, with d the degrees of freedom and n the number of residuals (Schwarz's
-criterion). A group may explain what two causes of other kinds make together. So it is compared
-with a few causes alone, each the best beside those before it (orthogonal matching pursuit). Each of
-these costs 2 ln k more, as it is chosen among k (Chen and Chen, Biometrika 95(3), 2008).
+criterion). A group may explain what two causes of other groups cause together. It is therefore
+compared with a few single causes, each the best beside those before it (orthogonal matching
+pursuit). Each of these costs 2 ln k more, as it is chosen among k (Chen and Chen, Biometrika 95(3),
+2008).
 
-A candidate counts if chance does not make its statistic. What of the misfit it leaves is no noise:
-it lasts from frame to frame, and goes together with any slow column. So the spread of U^T r is that
-of noise and, by the share of the model's error, that of residuals as correlated as those left
-(`identify.estimation.explanation`). The probability is multiplied by the number of candidates
-(Bonferroni).
+A candidate counts if chance does not explain its statistic. The misfit that it leaves is not white:
+it is correlated between frames, and with any slow column. The covariance of U^T r is therefore that
+of noise plus, weighted with the model's fraction of the error, that of residuals as correlated as
+those left (`identify.estimation.explanation`). The probability is multiplied by the number of
+candidates (Bonferroni).
 """
 
 from collections.abc import Sequence
@@ -32,18 +33,18 @@ from identify.estimation.explanation import (
 )
 from identify.estimation.output_error_problem import OutputErrorProblem
 
-# Size of the cosine between two projected columns from which on they cannot be told apart.
+# Absolute cosine between two projected columns from which on they cannot be told apart.
 ALIKE = 0.99
-# Size of that cosine up to which columns are as exact as to tell which cause is the better one.
+# Absolute cosine up to which columns are exact enough to tell which cause is the better one.
 EXACT = 0.999
 NEAR = 9.0  # difference of two statistics that chance may make, in units of the noise
-ROUNDING = 1e-13  # share of the largest eigenvalue of the products of columns that is rounding
-FEW = 3  # largest number of causes alone that are compared with a group
+ROUNDING = 1e-13  # fraction of the largest eigenvalue up to which eigenvalues are rounding errors
+FEW = 3  # largest number of single causes that are compared with a group
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One cause, or all causes of a group. places: theirs in the catalogue."""
+    """One cause, or all causes of a group. places: their indices in the catalogue."""
 
     name: str
     places: tuple[int, ...]
@@ -54,7 +55,7 @@ class Candidate:
 
 
 def candidates(causes: Sequence[Cause]) -> tuple[Candidate, ...]:
-    """Return all causes that are asked alone, then all groups that have several members."""
+    """Return all causes that are asked alone, then all groups of several, unless exclusive."""
     groups: dict[str, list[int]] = {}
     for place, one in enumerate(causes):
         groups.setdefault(one.group, []).append(place)
@@ -71,8 +72,8 @@ def candidates(causes: Sequence[Cause]) -> tuple[Candidate, ...]:
 class Ranked:
     """Candidate with its score.
 
-    chance: probability that a right model has such a statistic for any candidate. worth: the
-    statistic less what as many free numbers gain by chance.
+    chance: probability that a right model has such a statistic for any candidate. worth: S less
+    d ln n, or -inf if the candidate does not show.
     """
 
     candidate: Candidate
@@ -83,7 +84,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Rows:
-    """Places of a problem's residuals in their vector (m,).
+    """Layout of a problem's vector of residuals (m,).
 
     known: number of rows for what is known beside the poses. frames: which frames (N,) of each run
     are good.
@@ -94,7 +95,7 @@ class Rows:
 
     @classmethod
     def of(cls, problem: OutputErrorProblem, residual: Array) -> "Rows":
-        """Return the places of residuals (m,) of a problem."""
+        """Return the layout of residuals (m,) of a problem."""
         frames = tuple(run.ok for run in problem.runs)
         return cls(len(residual) - 6 * sum(int(one.sum()) for one in frames), frames)
 
@@ -104,11 +105,11 @@ class Rows:
         return 6 * sum(int(one.sum()) for one in self.frames)
 
     def of_poses(self, rows: Array) -> Array:
-        """Return the part of residuals (m, ...) that is of poses."""
+        """Return the rows of poses among residuals (m, ...)."""
         return rows[self.known :]
 
     def of_runs(self, rows: Array) -> list[Array]:
-        """Return the part (n, 6, ...) of residuals (m, ...) that is of each run's good frames."""
+        """Return the rows (n, 6, ...) of each run's good frames among residuals (m, ...)."""
         ends = np.cumsum([6 * int(ok.sum()) for ok in self.frames])
         parts = np.split(self.of_poses(rows), ends[:-1])
         return [one.reshape(len(one) // 6, 6, *one.shape[1:]) for one in parts]
@@ -119,7 +120,7 @@ class Rows:
         return tuple(spectral_density(own, ok) for own, ok in pairs)
 
     def spread(self, colour: Sequence[Array], directions: Array) -> Array:
-        """Return the covariance (d, d) of U^T r for residuals of a colour.
+        """Return the covariance (d, d) of U^T r for residuals r of a `colour`.
 
         directions (m, d): the columns of U.
         """
@@ -142,9 +143,10 @@ def rank(
     beside: OrthogonalComplement,
     rows: Rows,
 ) -> tuple[Ranked, ...]:
-    """Rank all candidates, the one of most worth first.
+    """Rank all candidates by their worth. columns (m, k) and residual (m,) are not projected yet.
 
-    columns (m, k) of the causes and the residual (m,) are not projected yet.
+    If a group is first, but a few single causes are worth more together, the first of these leads.
+    Only the chance of the first candidate allows for what the candidate explains of the residuals.
     """
     left = beside.part(residual)
     usable = np.isfinite(columns).all(axis=0)
@@ -153,17 +155,19 @@ def rank(
     lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
     every = candidates(causes)
     price = np.log(len(rows.of_poses(residual)))
-    share = misfit_of(rows, left).share_of_model
-    # what one of them leaves is hardly less than what all of them have to explain
-    beyond = share * rows.spread(rows.colour(left), projected) if share else None
+    model_fraction = misfit_of(rows, left).share_of_model
+    # a candidate is taken to leave as much as there is without it
+    by_misfit = (
+        model_fraction * rows.spread(rows.colour(left), projected) if model_fraction else None
+    )
     inner, rest = in_few_rows(projected, left)
     ranked = []
     for one in every:
         places = list(one.places)
         found = _possible_score(inner, rest, lengths, places, causes)
         spread = None
-        if beyond is not None:
-            spread = found.by_directions.T @ beyond[np.ix_(places, places)] @ found.by_directions
+        if by_misfit is not None:
+            spread = found.by_directions.T @ by_misfit[np.ix_(places, places)] @ found.by_directions
         chance = min(1.0, len(every) * _chance(found, rest, spread))
         found = replace(found, directions=projected[:, places] @ found.by_directions)
         worth = found.statistic - found.freedoms * price if found.freedoms else -np.inf
@@ -172,11 +176,11 @@ def rank(
     ranked[0] = _exactly(ranked[0], len(every), left, rows)
     if len(ranked[0].candidate.places) == 1:
         return tuple(ranked)
-    # causes that would need a size that nothing can have are left out
+    # causes that would need an impossible size are left out
     possible = {one.candidate.places for one in ranked if one.score.freedoms}
     alone = [place for place, one in enumerate(causes) if one.alone and (place,) in possible]
-    few, found = forward_selection(inner[:, alone], rest, lengths[alone], price)
-    chain = tuple(alone[place] for place in few)
+    chosen, found = forward_selection(inner[:, alone], rest, lengths[alone], price)
+    chain = tuple(alone[place] for place in chosen)
     found = replace(found, directions=projected[:, list(chain)] @ found.by_directions)
     worth = found.statistic - len(chain) * (price + 2 * np.log(len(alone)))
     if worth <= ranked[0].worth:
@@ -200,7 +204,7 @@ def explained_by_all(point: Point, columns: Array) -> float:
 
 
 def in_few_rows(columns: Array, residual: Array) -> tuple[Array, Array]:
-    """Return columns (k, k) and residuals (k,) with the same products as columns (m, k) have.
+    """Return columns (q, k) and residuals (q,), q <= k, with the same products as columns (m, k).
 
     They follow from the eigenvectors of the products of the columns in units of their lengths.
     Directions that are nothing but rounding are left out.
@@ -215,17 +219,17 @@ def in_few_rows(columns: Array, residual: Array) -> tuple[Array, Array]:
 
 
 def _exactly(one: Ranked, count: int, left: Array, rows: Rows) -> Ranked:
-    """Return a candidate of a number of them with its chance by what it leaves of residuals."""
+    """Return one of `count` candidates with its chance by what it leaves of residuals (m,)."""
     return replace(one, chance=min(1.0, count * p_value_of(one.score, left, rows)))
 
 
 def _possible_score(
     projected: Array, left: Array, lengths: Array, places: list[int], causes: Sequence[Cause]
 ) -> Score:
-    """Return the score of causes at some places, without those whose sizes nothing can have.
+    """Return the score of the causes at `places`, without those that would need impossible sizes.
 
     projected (m, k): columns of all causes, projected. left (m,): projected residuals. lengths
-    (k,): lengths of the columns before.
+    (k,): lengths of the columns before projection. The sizes of causes left out are zero.
     """
     inside = list(places)
     while True:
@@ -233,11 +237,11 @@ def _possible_score(
         if len(places) == len(inside) == 1 and found.sizes[0] >= causes[places[0]].least:
             return found
         least = np.array([causes[place].least for place in inside])
-        beyond = np.maximum(least - found.sizes, 0.0) * lengths[inside]
-        if not inside or not beyond.any():
+        shortfall = np.maximum(least - found.sizes, 0.0) * lengths[inside]
+        if not inside or not shortfall.any():
             break
-        # the one that is farthest beyond its least size, in units of the residuals
-        inside.pop(int(np.argmax(beyond)))
+        # the cause that is farthest below its least size, in units of the residuals
+        inside.pop(int(np.argmax(shortfall)))
     sizes = np.zeros(len(places))
     by_directions = np.zeros((len(places), found.freedoms))
     for k, place in enumerate(inside):
@@ -249,10 +253,9 @@ def _possible_score(
 def forward_selection(
     columns: Array, residual: Array, lengths: Array, price: float
 ) -> tuple[tuple[int, ...], Score]:
-    """Return the places of a few causes alone, each the best beside those before, and their score.
+    """Return indices of a few columns, each the best beside those before it, and their score.
 
-    The arguments are as for `score`. price: statistic that a cause is worth by chance, beside its
-    choice among all.
+    The other arguments are as for `score`. price: least gain of a cause, to which 2 ln k is added.
     """
     chain: tuple[int, ...] = ()
     found = score(columns[:, :0], residual, lengths[:0])
@@ -260,11 +263,11 @@ def forward_selection(
     for _ in range(FEW):
         beside = OrthogonalComplement.of(columns[:, list(chain)])
         free = beside.part(columns)
-        long = np.linalg.norm(free, axis=0)
-        shown = long > 0.1 * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        falls = np.where(shown, (free.T @ residual) / np.where(shown, long, 1.0), 0.0) ** 2
-        chain = (*chain, int(np.argmax(falls)))
-        if falls.max() < price:
+        norms = np.linalg.norm(free, axis=0)
+        shown = norms > 0.1 * np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        gains = np.where(shown, (free.T @ residual) / np.where(shown, norms, 1.0), 0.0) ** 2
+        chain = (*chain, int(np.argmax(gains)))
+        if gains.max() < price:
             return chain[:-1], found
         found = score(columns[:, list(chain)], residual, lengths[list(chain)])
     return chain, found
@@ -273,7 +276,7 @@ def forward_selection(
 def p_value_of(found: Score, residual: Array, rows: Rows) -> float:
     """Return the probability that a model without the causes has such a statistic.
 
-    residual (m,): the one that was projected.
+    residual (m,): projected residuals.
     """
     left = residual - found.directions @ (found.directions.T @ residual)
     share = misfit_of(rows, left).share_of_model
@@ -284,7 +287,7 @@ def p_value_of(found: Score, residual: Array, rows: Rows) -> float:
 def _chance(found: Score, residual: Array, spread: Array | None) -> float:
     """Return the probability of a statistic.
 
-    spread (d, d): covariance of U^T r by the model's error, beside that by noise, if there is any.
+    spread (d, d): covariance of U^T r due to the model's error. None: there is only noise.
     """
     if not found.freedoms:
         return 1.0
@@ -296,10 +299,10 @@ def _chance(found: Score, residual: Array, spread: Array | None) -> float:
 def indistinguishable(ranking: Sequence[Ranked], rows: Rows, residual: Array) -> tuple[Ranked, ...]:
     """Return the first of a ranking and all that cannot be told apart from it, the lead first.
 
-    They have no cause in common with the first, and explain as much but for chance, or for a
-    cosine of `ALIKE`. One that stands alone is compared with such ones only. Of those that explain
-    as much as columns can be exact, the lead has the fewest numbers and stands first in the
-    catalogue, where causes that are easier to look for come first.
+    They have no cause in common with the first, and explain as much up to chance, or up to a cosine
+    of `ALIKE`. Single causes are compared with single causes, groups with groups. Of those that
+    explain as much up to the exactness of columns, the lead has the fewest degrees of freedom, and
+    then stands first in the catalogue, where causes that are easier to check come first.
     """
     first = ranking[0]
     most = first.score.statistic

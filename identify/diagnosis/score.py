@@ -23,38 +23,38 @@ import numpy as np
 
 from identify.arrays import Array
 
-# Share of a column's length below which nothing is left of it beside the parameters. Differences of
-# runs that stick and slip are not more exact.
+# Fraction of a column's length up to which the rest beside the parameters counts as zero.
+# Differences of runs that stick and slip are not more exact.
 HIDDEN = 1e-5
-# Smallest share of the largest singular value for which directions of a group count as several.
+# Fraction of the largest singular value up to which directions of a group are left out.
 DEPENDENT = 1e-3
 
 
 @dataclass(frozen=True)
 class OrthogonalComplement:
-    """Space beside the columns of a problem's parameters.
+    """Orthogonal complement of the span of some columns.
 
-    basis (m, q): orthonormal basis of these columns.
+    basis (m, q): orthonormal basis of this span.
     """
 
     basis: Array
 
     @classmethod
     def of(cls, columns: Array) -> "OrthogonalComplement":
-        """Return the space beside columns (m, q) that are independent of each other."""
+        """Return the complement of columns (m, q), independent except for columns of zeros."""
         scale = np.linalg.norm(columns, axis=0)
         return cls(np.linalg.qr(columns[:, scale > 0] / scale[scale > 0])[0])
 
     def without(self, columns: Array) -> "OrthogonalComplement":
-        """Return the part of this space that lies beside further columns (m, k), too."""
+        """Return the complement of these and further columns (m, k)."""
         return OrthogonalComplement(
             np.hstack([self.basis, OrthogonalComplement.of(self.part(columns)).basis])
         )
 
     def part(self, rows: Array) -> Array:
-        """Return the part of residuals (m,) or columns (m, k) that lies in this space."""
+        """Return the projection of residuals (m,) or columns (m, k) onto the complement."""
         beside = rows - self.basis @ (self.basis.T @ rows)
-        # once more, as rounding leaves what is small beside the columns themselves
+        # a second time, as rounding errors of the first matter in a small projection
         return np.asarray(beside - self.basis @ (self.basis.T @ beside))
 
 
@@ -64,9 +64,9 @@ class Score:
 
     statistic                    Fall of the cost that is expected if the causes are fitted.
     freedoms                     Number of directions in which their sizes show.
-    sizes (k,)                   Sizes that are expected.
+    sizes (k,)                   Sizes that are expected, zero for causes that do not show.
     directions (m, freedoms)     Orthonormal directions U of the residuals in which the causes show.
-    by_directions (k, freedoms)  Change of the sizes by U^T r.
+    by_directions (k, freedoms)  Matrix B with sizes = -B U^T r.
     """
 
     statistic: float
@@ -78,7 +78,7 @@ class Score:
     def covariance(self, spread: Array | None = None) -> Array:
         """Return the covariance (k, k) of the sizes.
 
-        spread (freedoms, freedoms): that of U^T r beyond the noise's. None: there is only noise.
+        spread (freedoms, freedoms): covariance of U^T r beyond that of noise. None: only noise.
         """
         whole = np.eye(self.freedoms) if spread is None else np.eye(self.freedoms) + spread
         return np.asarray(self.by_directions @ whole @ self.by_directions.T)
@@ -89,20 +89,20 @@ def score(columns: Array, residual: Array, lengths: Array) -> Score:
 
     lengths (k,): those of the columns before they were projected.
     """
-    left = np.linalg.norm(columns, axis=0)
-    shown = left > HIDDEN * lengths
-    count = len(left)
+    norms = np.linalg.norm(columns, axis=0)
+    shown = norms > HIDDEN * lengths
+    count = len(norms)
     if not shown.any():
         return Score(0.0, 0, np.zeros(count), columns[:, :0], np.zeros((count, 0)))
     if count == 1:
-        alone = columns / left
-        fall = alone.T @ residual
-        return Score(float(fall @ fall), 1, -fall / left, alone, 1 / left[:, None])
-    unit = columns[:, shown] / left[shown]
-    directions, lasting, turned = np.linalg.svd(unit, full_matrices=False)
-    kept = lasting > DEPENDENT * lasting[0]
+        direction = columns / norms
+        fall = direction.T @ residual
+        return Score(float(fall @ fall), 1, -fall / norms, direction, 1 / norms[:, None])
+    unit = columns[:, shown] / norms[shown]
+    directions, singular_values, turned = np.linalg.svd(unit, full_matrices=False)
+    kept = singular_values > DEPENDENT * singular_values[0]
     directions = directions[:, kept]
     along = directions.T @ residual
     inverse = np.zeros((count, int(kept.sum())))
-    inverse[shown] = (turned[kept].T / lasting[kept]) / left[shown][:, None]
+    inverse[shown] = (turned[kept].T / singular_values[kept]) / norms[shown][:, None]
     return Score(float(along @ along), int(kept.sum()), -inverse @ along, directions, inverse)

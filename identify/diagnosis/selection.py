@@ -3,10 +3,10 @@
 Causes that were selected before stay free beside the parameters. Of all that are fitted, those
 whose sizes chance explains are left out again (backward elimination).
 
-The first cause is chosen while those beside it are not known. Of candidates that explain nearly
-all alike, a wrong one can take up some of what the others do. So where the selection needs many
-causes, or leaves some of the misfit, it begins anew with the other candidates that explained nearly
-all, and the one with the least cost + k ln n for its k sizes counts (Schwarz's criterion).
+The first cause is chosen before those beside it are known. If several candidates each explain
+nearly all, a wrong one can take up the effect of others. Where a selection needs many causes, or
+leaves some of the misfit, it therefore begins anew with each of the others. The selection with the
+least cost + k ln n for its k sizes counts (Schwarz's criterion).
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ from identify.diagnosis.score import score
 from identify.estimation.explanation import Misfit
 from identify.estimation.output_error_problem import OutputErrorProblem
 
-CHANCE = 0.01  # probability that a right model is accused of any cause in the catalogue
+CHANCE = 0.01  # largest probability of chance with which a candidate counts
 MOST = 3  # largest number of causes or groups that are selected
 SEVERAL = 2  # number of causes above which a selection begins anew with another first one
 
@@ -54,7 +54,7 @@ SEVERAL = 2  # number of causes above which a selection begins anew with another
 class Selection:
     """Selected candidates, and the optimum with all of them.
 
-    places: those of the fitted causes in the catalogue, in the order of the point's sizes.
+    places: indices of the fitted causes in the catalogue, in the order of the point's sizes.
     ranking: all candidates as ranked at first. before, after: misfit without and with the causes.
     """
 
@@ -71,25 +71,25 @@ def select(
 ) -> Selection:
     """Select the causes that explain the misfit of a problem at its optimum.
 
-    point: optimum without any cause. asked: causes there.
+    point: optimum without any cause. asked: causes as asked there.
     """
     rows = Rows.of(problem, point.residual)
     first = rank(asked.causes, asked.columns, point.residual, point.beside, rows)
     start = State((), (), point, tuple(causes), asked, first)
     ways = _next_fits(problem, start, rows)
     ended = start
-    for place, one in enumerate(ways):
-        if place and not (_explains_most(rows, point, one.fit.point) and _doubtful(rows, ended)):
+    for attempt, one in enumerate(ways):
+        if attempt and not (_explains_most(rows, point, one.fit.point) and _doubtful(rows, ended)):
             break
         found = _followed(problem, _with_fit(problem, start, one, rows), point.cost, rows)
-        ended = found if not place or _criterion(found) < _criterion(ended) else ended
+        ended = found if not attempt or _criterion(found) < _criterion(ended) else ended
     ended = _simplified(problem, ended, rows)
     before, after = (misfit_of(rows, one.residual) for one in (point, ended.point))
     return Selection(ended.chosen, ended.places, ended.point, first, before, after)
 
 
 def _followed(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State:
-    """Return the state in which no further candidate counts. cost: that without any cause."""
+    """Select up to `MOST` candidates while one counts. cost: that without any cause."""
     while len(now.chosen) < MOST:
         ways = _next_fits(problem, now, rows)
         if not ways:
@@ -134,9 +134,9 @@ def _with_fit(problem: OutputErrorProblem, now: State, one: Way, rows: Rows) -> 
 
 
 def _not_followed(chosen: Sequence[Selected], causes: Sequence[Cause], fresh: bool) -> float:
-    """Return how much of the misfit the model may leave that its causes explain in truth.
+    """Return the misfit that a fit may leave although its causes are the true ones.
 
-    Columns that are not those of the optimum follow less, and causes that are exact leave nothing.
+    Columns of another optimum are less exact. At their own optimum, exact causes leave nothing.
     """
     share = 1 - (EXACT if fresh else ALIKE) ** 2
     return share * sum(
@@ -155,10 +155,10 @@ def _state(
     rows: Rows,
     left_out: tuple[int, ...] = (),
 ) -> State:
-    """Return the state at an optimum with the causes at some places.
+    """Return the state at an optimum with the causes at `places`.
 
-    All are asked anew while noise does not explain what is left. left_out: places of causes that
-    are not asked.
+    All causes are asked anew if noise does not explain what is left. left_out: indices of causes
+    that are not ranked.
     """
     causes = with_fitted(before.causes, places, point.causes)
     fresh = misfit_of(rows, point.residual).significant
@@ -218,8 +218,8 @@ def _simplified(problem: OutputErrorProblem, now: State, rows: Rows) -> State:
     """Return a state with simpler candidates in place of groups, where they explain as much.
 
     A group of many numbers can be selected because it takes up what causes after it do. So, of
-    several that were selected, each group is taken off again to first order, and candidates of
-    fewer sizes are asked in its place.
+    several that were selected, each group is removed again to first order, and candidates of fewer
+    sizes are asked in its place.
     """
     if len(now.chosen) == 1:
         return now
@@ -230,12 +230,12 @@ def _simplified(problem: OutputErrorProblem, now: State, rows: Rows) -> State:
 
 
 def _in_place_of(problem: OutputErrorProblem, now: State, one: Selected, rows: Rows) -> State:
-    """Return a state with a simpler candidate in place of one, or the same state."""
+    """Return a state of smaller criterion with a simpler candidate in place of one, or the same."""
     point = now.point
     own = np.isin(now.places, one.places)
     residual = point.residual - point.columns[:, own] @ point.sizes[own]
     beside = point.beside.without(point.columns[:, ~own])
-    stay = tuple(place for place, out in zip(now.places, own, strict=True) if not out)
+    others = tuple(place for place, out in zip(now.places, own, strict=True) if not out)
     columns = now.asked.columns.copy()
     columns[:, list(now.places)] = point.columns
     found = score(
@@ -249,35 +249,35 @@ def _in_place_of(problem: OutputErrorProblem, now: State, one: Selected, rows: R
         for other in rank(now.causes, columns, residual, beside, rows)
         if other.score.freedoms < len(one.places)
         and other.score.statistic >= enough
-        and not set(other.candidate.places) & set(stay)
-        and not excluded(now.causes, other.candidate.places, stay)
+        and not set(other.candidate.places) & set(others)
+        and not excluded(now.causes, other.candidate.places, others)
         and not any(now.causes[place].tried for place in other.candidate.places)
     ]
     for other in simpler[:RIVALS]:
-        places = (*stay, *other.candidate.places)
+        places = (*others, *other.candidate.places)
         sizes = np.concatenate([point.sizes[~own], other.score.sizes])
-        free = np.zeros(len(places), dtype=bool)
+        none_held = np.zeros(len(places), dtype=bool)
         try:
-            left, there = fitted(
-                problem, point.parameters, now.causes, places, sizes, sizes, free, None
+            kept, there = fitted(
+                problem, point.parameters, now.causes, places, sizes, sizes, none_held, None
             )
         except DynamicsError:
             continue
-        inside = tuple(place for place in other.candidate.places if place in left)
-        changed = replace(now, places=left, point=there)
+        inside = tuple(place for place in other.candidate.places if place in kept)
+        changed = replace(now, places=kept, point=there)
         if not inside or _criterion(changed) >= _criterion(now):
             continue
-        taken = Selected(other, inside, one.gain + point.cost - there.cost, ())
-        chosen = tuple(taken if each is one else each for each in now.chosen)
-        causes = with_fitted(now.causes, left, there.causes)
-        return replace(changed, chosen=_of_places(chosen, left), causes=causes)
+        replaced = Selected(other, inside, one.gain + point.cost - there.cost, ())
+        chosen = tuple(replaced if each is one else each for each in now.chosen)
+        causes = with_fitted(now.causes, kept, there.causes)
+        return replace(changed, chosen=_of_places(chosen, kept), causes=causes)
     return now
 
 
 def _of_places(chosen: tuple[Selected, ...], places: tuple[int, ...]) -> tuple[Selected, ...]:
-    """Return selected candidates with those of their causes alone that have these places.
+    """Return selected candidates with only those of their causes that are at `places`.
 
-    One that has none left has been explained by the last one, which takes over its gain.
+    A candidate without causes is dropped, and the final candidate takes over its gain.
     """
     inside = [
         replace(one, places=tuple(place for place in one.places if place in places))
