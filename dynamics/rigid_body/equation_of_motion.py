@@ -1,6 +1,6 @@
 """Equation of motion in the platform's coordinates, and its derivatives, in CasADi.
 
-The integrator of the closed loop evaluates them. The coordinates q are the entries of the pose that
+The integrator of the closed loop evaluates both. The coordinates q are the entries of the pose that
 the chart leaves free. The balance of wrenches is multiplied by T^T (twist = T q_dot, eq. 29):
 
     M(q) q_ddot + b(q, q_dot) = J_theta^T (torque - friction)

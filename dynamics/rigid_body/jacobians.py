@@ -35,7 +35,7 @@ def joint_coordinates(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
 
 
 def reach_margin(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
-    """Reach margins (n,), without unit. They are negative out of reach."""
+    """Reach margins (n,), without unit. They are negative for legs that cannot reach the pose."""
     arms = platform_arms(geometry, pose)
     return ca.vertcat(
         *[leg.reach(pose[0:3] + arm) for leg, arm in zip(geometry.legs, arms, strict=True)]
@@ -65,13 +65,13 @@ def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
         position = pose[0:3] + arm
         velocity = twist[0:3] + ca.cross(twist[3:6], arm)
-        places_and_spins = zip(
+        placed = zip(
             leg.placements(position), leg.angular_velocities(position, velocity), strict=True
         )
         # `vec` lists a matrix by columns, and the columns of the transpose are the rows
         rows += [
-            ca.vertcat(place.centre, ca.vec(place.axes.T), spin).T
-            for place, spin in places_and_spins
+            ca.vertcat(placement.centre, ca.vec(placement.axes.T), spin).T
+            for placement, spin in placed
         ]
     return ca.vertcat(*rows)
 
@@ -80,7 +80,7 @@ def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.
     """Leverage (n,) of each actuator on its leg, in 0..1, and J_a2 (n, m) without unit.
 
     Row i of J_a2 is [d, a x d] for the unit vector d of the force of leg i. Each column is for one
-    twist that the platform can have, with rotations divided by the characteristic length.
+    twist that the platform can have. Entries of rotations are divided by the characteristic length.
     """
     leverages = []
     rows = []

@@ -2,7 +2,7 @@
 
 Let w (3,) be the angular velocity of the outer body of a joint relative to the inner one, and W
 (3, 6) its derivatives with respect to the twist of the platform. Viscous friction with the moment
-c w dissipates the power c |w|^2, and is thus the wrench c W^T w at the platform. Dry friction has
+c w dissipates the power c |w|^2. The wrench c W^T w at the platform overcomes it. Dry friction has
 the moment c w / |w|. It fades below the angular velocity `SLOW`, so that the equation of motion
 stays smooth:
 
@@ -22,7 +22,7 @@ SLOW = 0.02  # relative angular velocity, rad/s, below which dry friction of a p
 
 
 def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
-    """Wrench (6, k) at the platform for a unit of each parameter of passive friction.
+    """Wrenches (6, k) at the platform that overcome passive friction, for a unit of each parameter.
 
     The parameters are those of the layout, in its order.
     """
@@ -51,7 +51,7 @@ def _relative_spins(
 ) -> list[tuple[tuple[str, str], ca.SX, int]]:
     """Names, relative angular velocity (3,) and number of parallel joints of each passive joint.
 
-    The names are that of the joints of all legs, and that of the joint of this leg.
+    The first name is that of the joint in all legs, and the second that of the joint in this leg.
     """
     nominal = geometry if isinstance(geometry, RobotGeometry) else geometry.nominal
     joints = []

@@ -1,7 +1,7 @@
 """Regressor of the rigid bodies (eq. 25): wrenches for a unit of each parameter, in CasADi.
 
 Wrenches act at the platform origin, in the axes of the base. The regressor of a robot also has
-columns of friction, see `virtual_work.dynamic_functions`.
+columns for friction of the actuated joints, see `virtual_work.dynamic_functions`.
 """
 
 import casadi as ca
@@ -17,7 +17,7 @@ from dynamics.spatial_inertia import FULL_INERTIAL, spatial_inertia
 def rigid_body_regressor(
     geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX
 ) -> ca.SX:
-    """Columns of Gamma (6, p) for the parameters of the equation of motion (eq. 25)."""
+    """Columns of Gamma (6, p) for bodies, and for friction of passive joints (eq. 25)."""
     gravity = ca.DM(geometry.gravity)
     layout = geometry.layout
     columns = ca.SX.zeros(6, layout.rigid.stop)
@@ -43,7 +43,7 @@ def rigid_body_regressor(
 def platform_columns(
     pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM, full: bool
 ) -> ca.SX:
-    """Wrench (6, 4) or (6, 10) of the platform alone for a unit of each inertial parameter."""
+    """Wrenches of the platform, (6, 4) or (6, 10) if full, for a unit of each parameter."""
     frame = rotation_matrix(pose[3:6])
     omega = twist[3:6]
     omega_dot = twist_dot[3:6]

@@ -97,7 +97,7 @@ def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.
 
 
 def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
-    """Mass matrix (6, 6) of the platform alone for its inertial parameters (4,) or (10,)."""
+    """Mass matrix (6, 6) of the platform alone for inertial parameters (4,), or (10,) if full."""
     inertia = spatial_inertia(platform, rotation_matrix(pose[3:6]))
     linear = inertia.mass * ca.SX.eye(3)
     if inertia.first_moment is None:
@@ -107,7 +107,7 @@ def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
 
 
 def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """Functions of the pose and its rates: joints, reach, Jacobians, conversions of twists."""
+    """Functions of pose and rates: joints, reach, closure, Jacobians, twists and placements."""
     pose = ca.SX.sym("pose", 6)
     rate = ca.SX.sym("pose_rate", 6)
     acceleration = ca.SX.sym("pose_acceleration", 6)

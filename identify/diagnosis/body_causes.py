@@ -41,11 +41,10 @@ LEAST_OFFSET = 0.01
 
 @dataclass(frozen=True)
 class Needed:
-    """Additional torques that the joints need for a cause of size one.
+    """Additional torques that the joints need for a cause of size one, with attributes of `Cause`.
 
     torques: one array (N, n) for each run, N m or N. along: function that returns these torques for
-    other motions of the runs. None: a fit keeps those along the first motion. The rest is as in
-    `Cause`.
+    other motions of the runs. None: a fit keeps those along the first motion.
     """
 
     name: str

@@ -277,7 +277,7 @@ def fitted(
     remaining = tuple(np.array(places)[kept].tolist())
     if kept.all() or not kept.any():
         return remaining, point
-    # of the causes that are kept, chance may explain more without the others
+    # chance may explain more of the causes that are kept, once the others are gone
     sizes = point.sizes[kept]
     none_held = np.zeros(len(remaining), dtype=bool)
     catalogue = with_fitted(causes, places, point.causes)

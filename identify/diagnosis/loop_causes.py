@@ -222,7 +222,7 @@ def torque_limit(run: LoopModel, peak: float) -> Cause:
 
 
 def laws(settings: LoopSettings) -> tuple[Cause, ...]:
-    """Return the other of the cascade and PID laws, if the model has one. Both read the same gains."""
+    """Return the other of the cascade and PID laws, which read the same gains, or no cause."""
     others: dict[str, DriveName] = {"pid": "cascade", "cascade": "pid"}
     other = others.get(settings.drives.law)
     if other is None:

@@ -17,13 +17,14 @@ from identify.studies.rows.gauntlet.verdict import GROUPS
 from identify.studies.study_file import Study
 
 STEM = "gauntlet"  # name of the files, before their suffix
-DOUBLED = 2.0  # smallest misfit with which a case counts in the fractions of one and two causes
+# Smallest misfit, over that of noise, with which a case of one or two causes counts in fractions.
+DOUBLED = 2.0
 LEVEL = 0.95  # confidence of the intervals of fractions
 
 
 @dataclass(frozen=True)
 class Share:
-    """Fraction ``share`` of right answers, from their number ``right`` and that of the cases.
+    """Fraction ``share`` of right answers, with their number ``right`` and the number of cases.
 
     low, high: Clopper and Pearson's interval of the fraction (binomial). goal: goal as text.
     """
@@ -40,7 +41,7 @@ class Share:
 def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each case in the table of a study of kind `gauntlet`.
 
-    Kinds of trouble and groups of causes have their names, while the table has numbers for them.
+    Names of troubles and groups of causes replace their numbers. No number, or -1, has no name.
     The verdict is "failed" if the diagnosis is wrong or the row could not be computed.
     """
     own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
@@ -103,7 +104,7 @@ def _name(names: tuple[str, ...], numbers: pd.Series) -> list[str]:
 def shares(cases: pd.DataFrame) -> list[Share]:
     """Return the fraction of right answers for each sort of case, and for the fitted sizes.
 
-    Sorts without cases are left out.
+    Sorts without cases are left out. Rows that could not be computed belong to no sort.
     """
     shown = cases["misfit"] >= DOUBLED
     # A case that stopped with an error has no misfit, but counts as well.
@@ -144,13 +145,13 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
     depend on each other. Cases without identified quantities after the remedy, and thus without
     intervals, are counted separately. The result is empty if no case has intervals.
     """
-    named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
-    percent = named["covered_percent"].dropna()
+    rightly_named = cases[(cases["right_cause"] == 1) & (cases["outside"] == 0)]
+    percent = rightly_named["covered_percent"].dropna()
     if not len(percent):
         return {}
     statistics = {
         "cases": len(percent),
-        "cases_without_intervals": len(named) - len(percent),
+        "cases_without_intervals": len(rightly_named) - len(percent),
         "covered_percent": float(percent.mean()),
     }
     if len(percent) == 1:
@@ -159,10 +160,10 @@ def coverage(cases: pd.DataFrame) -> dict[str, float]:
 
 
 def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
-    """Yield each kind of trouble with figures of the cases that have this one trouble only.
+    """Yield each kind of trouble with statistics of the cases that have this one trouble only.
 
-    The figures are the numbers of cases and of right answers, the median misfit, and the mean
-    percentage of intervals that contain the truth.
+    These are the numbers of cases and of right answers, the median misfit, and the mean percentage
+    of intervals that contain the truth.
     """
     single = cases[cases["wrong"].isin(["one", "outside"])]
     for name in TROUBLES:
@@ -227,7 +228,7 @@ def _miss(row: pd.Series) -> dict[str, Any]:
 def _tables(
     entry: dict[str, Any], cases: pd.DataFrame
 ) -> Iterator[tuple[str, list[str], list[list[str]]]]:
-    """Yield the tables of a gauntlet, each with its title, header and rows of text."""
+    """Yield the tables of a gauntlet, each as its title, header and rows of text."""
     rows = [
         [
             one["what"],

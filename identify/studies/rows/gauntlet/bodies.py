@@ -23,13 +23,16 @@ def centre_of_mass(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def products_of_inertia(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw principal axes of the platform that are turned in its frame."""
+    """Draw principal axes of the platform that are turned in its frame.
+
+    The size bounds the products of inertia, as a fraction of the mean principal moment.
+    """
     mass, principal = _known(lab, "platform")
     size = log_uniform(rng, 0.25, 0.6)
-    share = size * rng.uniform(-1.0, 1.0, 3)
+    fractions = size * rng.uniform(-1.0, 1.0, 3)
     mean = float(np.trace(principal)) / 3
     products = np.zeros((3, 3))
-    products[[0, 0, 1], [1, 2, 2]] = mean * share
+    products[[0, 0, 1], [1, 2, 2]] = mean * fractions
     inertia = 1.2 * principal + products + products.T
     return Trouble(
         kind="products of inertia",
@@ -65,13 +68,15 @@ def centre_of_leg_bodies(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 def load(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw an unstated load on the platform, away from the origin of the platform's frame."""
     size = log_uniform(rng, 0.3, 2.0)
-    place = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
+    position = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
     mass, principal = _known(lab, "platform")
-    whole = mass + size
-    centre = size * place / whole
-    apart = mass * size / whole
-    inertia = principal + apart * (place @ place * np.eye(3) - np.outer(place, place))
-    values = _values("platform", whole, centre, inertia) | {"platform.mass": whole}
+    total_mass = mass + size
+    centre = size * position / total_mass
+    reduced_mass = mass * size / total_mass
+    inertia = principal + reduced_mass * (
+        position @ position * np.eye(3) - np.outer(position, position)
+    )
+    values = _values("platform", total_mass, centre, inertia) | {"platform.mass": total_mass}
     return Trouble(
         kind="load that is not stated",
         size=size,
@@ -96,11 +101,11 @@ def possible_moments(moments: list[float]) -> Array:
 
     If needed, the smaller two are scaled until their sum exceeds the largest one by a tenth.
     """
-    found = np.array(moments)
-    order = np.argsort(found)
+    possible = np.array(moments)
+    order = np.argsort(possible)
     smaller = order[:2]
-    found[smaller] *= max(1.0, 1.1 * found[order[2]] / found[smaller].sum())
-    return found
+    possible[smaller] *= max(1.0, 1.1 * possible[order[2]] / possible[smaller].sum())
+    return possible
 
 
 def _rigid(inertia: Array) -> Array:

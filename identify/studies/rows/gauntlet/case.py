@@ -25,9 +25,10 @@ from identify.studies.rows.identified import designed_trajectories, row_setup
 from identify.studies.rows.kind import robot_named
 from identify.studies.rows.row_sensor import DrawnSensor
 
+# Random streams of a case: its trouble, its record, and the record after something was mended.
 TROUBLE = 0
 RECORD = 1
-AGAIN = 2  # streams of a case: its trouble, its record, and the record after something was mended
+AGAIN = 2
 DRAWS = 10  # largest number of draws of a case until the robot can run
 
 
@@ -45,14 +46,15 @@ class Case:
 
     troubles       What was wrong.
     diagnosis      What the diagnosis of the plain model said.
-    named          For each trouble, the place of the finding that names it, from 1 on, or 0 if none
-                   does.
+    named          For each trouble, the number of the finding that names it, from 1 on, or 0 if
+                   none does.
     together       For each trouble, True if that finding only names it as indistinguishable from
                    its cause.
     size_errors    Error of each trouble's size in standard deviations, NaN where it was not fitted.
     before, after  Whether each interval contains the truth, with the plain model and after the
-                   remedy.
-    explained      True if noise explains the residuals of the remedied model.
+                   remedy. Both are the same if no finding names a trouble. `after` is empty if an
+                   error stops the remedy.
+    explained      True if noise explains the residuals of the model to which `after` belongs.
     alone          For each of two troubles, the misfit of the plain model with this trouble only,
                    divided by the misfit due to noise. NaN if the model cannot be identified.
     seconds        Time of the first identification and of the diagnosis, s.
@@ -74,7 +76,7 @@ class Case:
 class Drawn:
     """Troubles of a case, and its record.
 
-    number, again: seeds of the record, and of the record after something was mended.
+    number, again: seeds of this record, and of the record after something was mended.
     """
 
     lab: Laboratory
@@ -90,7 +92,7 @@ def drawn(lab: Laboratory, seed: np.random.SeedSequence, wrong: Wrong) -> Drawn:
     Troubles with which the robot cannot follow its trajectory are drawn again, because a laboratory
     would have no record of them. wrong: sort of case.
 
-    Raises the exceptions of the experiment if no draw gives a record.
+    Raises a DynamicsError if none of `DRAWS` draws gives a record.
     """
     rng = np.random.default_rng(child(seed, TROUBLE))
     record, again = (integer_seed(child(seed, stream)) for stream in (RECORD, AGAIN))
@@ -109,8 +111,8 @@ def drawn(lab: Laboratory, seed: np.random.SeedSequence, wrong: Wrong) -> Drawn:
 def run_case(case: Drawn) -> Case:
     """Identify from the record of a case, diagnose, remedy what was found, and identify again.
 
-    Raises EstimationError, and the exceptions of the model. An error after the remedy is caught,
-    and the case then has no intervals.
+    The remedy is left out if no finding names a trouble. Raises EstimationError, and the exceptions
+    of the model. An error after the remedy is caught, and the case then has no intervals.
     """
     scenario = case.lab.scenario
     made = case.made
@@ -118,31 +120,31 @@ def run_case(case: Drawn) -> Case:
     began = time.perf_counter()
     result = identify(made.record, plain, scenario)
     identified = time.perf_counter()
-    found = diagnose(made.record, result, plain, scenario)
+    diagnosis = diagnose(made.record, result, plain, scenario)
     seconds = (identified - began, time.perf_counter() - identified)
-    places = tuple(place_of(one, found) for one in case.troubles)
+    named_by = tuple(place_of(one, diagnosis) for one in case.troubles)
     remedies = [
-        trouble.remedy(found.findings[place - 1]) if place else Remedied()
-        for trouble, (place, _) in zip(case.troubles, places, strict=True)
+        trouble.remedy(diagnosis.findings[number - 1]) if number else Remedied()
+        for trouble, (number, _) in zip(case.troubles, named_by, strict=True)
     ]
-    named = {place for place, _ in places}
-    # a laboratory cannot know which findings are right, so it also applies those of the others
+    named = {number for number, _ in named_by}
+    # a laboratory cannot know which findings are right, so it also applies those of other findings
     remedies += [
         Remedied(typed(one).settings)
-        for place, one in enumerate(found.findings, start=1)
-        if place not in named
+        for number, one in enumerate(diagnosis.findings, start=1)
+        if number not in named
     ]
     before = intervals_hold(result, made.plant)
     after = before
     explained = result.explained
-    if any(place for place, _ in places):
+    if any(number for number, _ in named_by):
         after, explained = after_remedies(case, remedies)
     return Case(
         troubles=case.troubles,
-        diagnosis=found,
-        named=tuple(place for place, _ in places),
-        together=tuple(alike for _, alike in places),
-        size_errors=tuple(size_error(one, found) for one in case.troubles),
+        diagnosis=diagnosis,
+        named=tuple(number for number, _ in named_by),
+        together=tuple(alike for _, alike in named_by),
+        size_errors=tuple(size_error(one, diagnosis) for one in case.troubles),
         before=before,
         after=after,
         explained=explained,
@@ -155,8 +157,8 @@ def run_case(case: Drawn) -> Case:
 def laboratory(scenario_toml: str, trajectory: int) -> Laboratory:
     """Return the laboratory of a scenario without trouble. It is made once per process.
 
-    Its robot runs the exciting trajectory once, which gives the largest torque. trajectory: seed of
-    the trajectory.
+    Its robot runs the exciting trajectory once, which gives the largest torques of motion and of
+    rest. trajectory: seed of the trajectory.
 
     Raises ScenarioError if the scale needs a second record.
     """
@@ -201,28 +203,28 @@ def after_remedies(case: Drawn, remedies: Sequence[Remedied]) -> tuple[tuple[boo
     """Return `Case.after` and `Case.explained` for remedies.
 
     remedies: first those of the case's troubles, in the order of the troubles, then those of other
-    findings.
+    findings. A new record is made if a trouble is mended.
     """
     pairs = zip(case.troubles, remedies, strict=False)
-    left = [one for one, by in pairs if not by.mended]
+    left = [one for one, remedy in pairs if not remedy.mended]
     settings = {key: value for one in remedies for key, value in one.settings.items()}
     made = case.made
     try:
         if len(left) < len(case.troubles):
             made = recorded(case.lab, left, case.again)
-        known = case.lab.scenario.with_overrides(settings)
-        record = made.record.assign_attrs(scenario=known.to_toml())
+        scenario = case.lab.scenario.with_overrides(settings)
+        record = made.record.assign_attrs(scenario=scenario.to_toml())
         for one in remedies:
             record = one.record(record)
-        robot = Setup(known, loaded=robot_named(known.robot)).robot
-        result = identify(record, robot, known)
+        robot = Setup(scenario, loaded=robot_named(scenario.robot)).robot
+        result = identify(record, robot, scenario)
     except (IdentifyError, DynamicsError):
         return (), False
     return intervals_hold(result, made.plant), result.explained
 
 
 def misfits_alone(case: Drawn) -> tuple[float, ...]:
-    """Return the misfit with each of two troubles alone, see `Case.alone`."""
+    """Return the misfit with each of two troubles alone, see `Case.alone`, or nothing."""
     if len(case.troubles) < 2:
         return ()
     known = case.lab.scenario.with_overrides({"identification.method": "command_driven"})
@@ -240,16 +242,16 @@ def misfits_alone(case: Drawn) -> tuple[float, ...]:
 
 
 def place_of(trouble: Trouble, found: Diagnosis) -> tuple[int, bool]:
-    """Return the place of the finding that names a trouble, from 1 on, or 0 if none does.
+    """Return the number of the finding that names a trouble, from 1 on, or 0 if none does.
 
     The second result is True if the finding only names it as indistinguishable from its own cause.
     """
     groups = {one.name: one.group for one in found.candidates}
-    for place, finding in enumerate(found.findings, start=1):
+    for number, finding in enumerate(found.findings, start=1):
         if finding.group in trouble.groups:
-            return place, False
+            return number, False
         if any(groups.get(name) in trouble.groups for name in finding.alike):
-            return place, True
+            return number, True
     return 0, False
 
 

@@ -37,14 +37,14 @@ OUTSIDE: dict[str, Draw] = {
     "steps of commands": mechanical.quantised,
 }
 
-# Names of all kinds of trouble. Rows name a kind by its place here.
+# Names of all kinds of trouble. Rows name a kind by its index here.
 TROUBLES: tuple[str, ...] = (*INSIDE, *OUTSIDE)
 
 Wrong = Literal["drawn", "none", "one", "two", "outside"]
 
 # Probability of each sort of case, if the sort is drawn.
 SHARES: dict[Wrong, float] = {"one": 0.55, "two": 0.2, "none": 0.125, "outside": 0.125}
-# Kinds that are never drawn with another. Their size shows only if nothing else is wrong.
+# Kinds that are never drawn with another, as their size shows only if nothing else is wrong.
 ALONE = ("stated noise",)
 
 
@@ -53,7 +53,7 @@ def drawn_troubles(
 ) -> tuple[Trouble, ...]:
     """Draw what is wrong in a case: nothing, one trouble, or two of different groups.
 
-    wrong: sort of case, or "drawn".
+    wrong: sort of case, or "drawn" for a sort with the probabilities `SHARES`.
     """
     sort = str(rng.choice(list(SHARES), p=list(SHARES.values()))) if wrong == "drawn" else wrong
     if sort == "none":
@@ -66,7 +66,7 @@ def drawn_troubles(
     while True:
         first, second = (str(name) for name in rng.choice(kinds, size=2, replace=False))
         pair = INSIDE[first](lab, rng), INSIDE[second](lab, rng)
-        # a robot has one law of friction, and its platform one inertia
+        # a diagnosis must be able to name both, and one setting cannot have two values
         if not (set(pair[0].groups) & set(pair[1].groups) or _clash(*pair)):
             return pair
 

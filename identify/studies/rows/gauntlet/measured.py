@@ -23,7 +23,7 @@ from identify.studies.rows.gauntlet.troubled_plants import late_plant
 # Standard deviation with which a laboratory states a latency that a diagnosis has found. It is so
 # large that the record itself determines the latency.
 LATENCY_STD_S = 1e-3
-SCALE_STD = 1e-4  # standard deviation of the scale of the cameras that a record states
+SCALE_STD = 1e-4  # standard deviation that a record states for the scale of its cameras
 MOST_FRAMES = 4  # largest number of frames with gross errors
 # Pattern of a remedy that marks a frame as lost. It captures the number of the frame.
 FRAME = re.compile(r"mark frame (\d+)")
@@ -126,10 +126,10 @@ def stated_noise(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def gross_errors(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw some frames whose position is far off."""
+    """Draw some frames with a position error of one size in any direction."""
     frames = lab.scenario.timing.frames(lab.scenario.excitation.duration_s)
     count = int(rng.integers(1, MOST_FRAMES + 1))
-    places = rng.choice(np.arange(5, frames - 5), size=count, replace=False)
+    spoilt_frames = rng.choice(np.arange(5, frames - 5), size=count, replace=False)
     size = log_uniform(rng, 2e-4, 2e-3)
     directions = rng.standard_normal((count, 3))
     errors = size * directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -137,7 +137,7 @@ def gross_errors(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     def spoilt(record: xr.Dataset) -> xr.Dataset:
         position = record["measured_position"]
         values = position.values.copy()
-        values[places] += errors
+        values[spoilt_frames] += errors
         return record.assign(measured_position=(position.dims, values))
 
     def remedy(finding: Finding) -> Remedied:

@@ -24,7 +24,7 @@ from identify.studies.rows.gauntlet.troubled_plants import PlantWithPlay
 ZERO = {"rad": (2e-4, 1.5e-3), "m": (5e-5, 5e-4)}
 # Smallest and largest error of another number of the geometry, by unit.
 NUMBER = {"rad": (1e-3, 8e-3), "m": (1e-4, 8e-4)}
-# Smallest and largest step of commands, by the unit of the joints.
+# Smallest and largest step to which commands are rounded, by the unit of the joints.
 STEP = {"rad": (3e-4, 2e-3), "m": (3e-5, 2e-4)}
 # Smallest and largest friction of passive joints, N m s/rad or N m, by its law.
 PASSIVE = {"viscous": (0.01, 0.05), "coulomb": (3e-3, 2e-2)}
@@ -62,41 +62,44 @@ def zero(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 def geometric_number(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw an error of one number of the geometry that is not a zero of a joint."""
     geometry = lab.robot.geometry
-    places = [
-        place
-        for place, name in enumerate(geometry.number_names)
+    indices = [
+        index
+        for index, name in enumerate(geometry.number_names)
         if name.partition(".")[2] not in ZEROS
     ]
-    place = int(rng.choice(places))
-    unit = geometry.number_units[place]
-    leg, _, name = geometry.number_names[place].partition(".")
+    index = int(rng.choice(indices))
+    unit = geometry.number_units[index]
+    leg, _, name = geometry.number_names[index].partition(".")
     kind = name.partition(".")[0]
     size = sign(rng) * log_uniform(rng, *NUMBER[unit])
-    deviations = size * np.eye(len(geometry.number_names))[place]
-    words = f"{name.replace('_', ' ').replace('.', ' ')} of {leg.replace('leg', 'leg ')}"
+    deviations = size * np.eye(len(geometry.number_names))[index]
+    cause_name = f"{name.replace('_', ' ').replace('.', ' ')} of {leg.replace('leg', 'leg ')}"
     return Trouble(
         kind="geometry",
         size=size,
         unit=unit,
         groups=(GROUPS.get(kind, kind.replace("_", " ")),),
-        cause=words,
+        cause=cause_name,
         plant=_moved_by(lambda own: own.moved(deviations)),
     )
 
 
 def geometric_numbers(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw errors of several numbers of the geometry, all of one kind and none a joint's zero."""
+    """Draw errors of 3 to 8 numbers of the geometry, all of one kind and none a joint's zero.
+
+    The size is their root mean square.
+    """
     geometry = lab.robot.geometry
     kinds: dict[str, list[int]] = {}
-    for place, name in enumerate(geometry.number_names):
+    for index, name in enumerate(geometry.number_names):
         number_of_leg = name.partition(".")[2]
         if number_of_leg not in ZEROS:
-            kinds.setdefault(number_of_leg.partition(".")[0], []).append(place)
+            kinds.setdefault(number_of_leg.partition(".")[0], []).append(index)
     kind = str(rng.choice(sorted(kinds)))
     count = int(rng.integers(3, min(8, len(kinds[kind])) + 1))
     deviations = np.zeros(len(geometry.number_names))
-    for place in rng.choice(kinds[kind], size=count, replace=False):
-        deviations[place] = sign(rng) * log_uniform(rng, *NUMBER[geometry.number_units[place]])
+    for index in rng.choice(kinds[kind], size=count, replace=False):
+        deviations[index] = sign(rng) * log_uniform(rng, *NUMBER[geometry.number_units[index]])
     return Trouble(
         kind="several numbers of the geometry",
         size=float(np.sqrt(np.mean(deviations[deviations != 0] ** 2))),
@@ -168,7 +171,7 @@ def _per_unit(lab: Laboratory) -> float:
 
 
 def passive_friction(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw friction of one law in the passive joints at the same place of every leg."""
+    """Draw friction of one law in the corresponding passive joint of every leg."""
     name = str(rng.choice(passive_parameters(lab.robot.geometry.legs)))
     size = log_uniform(rng, *PASSIVE[name.partition(".")[2]])
     return Trouble(
@@ -226,7 +229,7 @@ def backlash(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def quantised(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw drives that get their commands in steps. The diagnosis has no such cause."""
+    """Draw drives that round their commands to steps. The diagnosis has no such cause."""
     unit = lab.robot.layout.joint_unit
     size = log_uniform(rng, *STEP[unit])
 
@@ -238,7 +241,7 @@ def quantised(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 
 
 def unequal_gains(lab: Laboratory, rng: np.random.Generator) -> Trouble:
-    """Draw a joint whose proportional gain differs from that of all others."""
+    """Draw a joint, not the first, whose proportional gain differs from that of all others."""
     layout = lab.robot.layout
     joint = int(rng.integers(1, layout.joints))
     gain = float(lab.parameters[layout.names.index("joint_pid.lp")])

@@ -1,8 +1,8 @@
-"""Rows of kind `gauntlet`: something is wrong, and the diagnosis must find it.
+"""Rows of kind `gauntlet`: something is wrong in a laboratory, and the diagnosis must find it.
 
-The trouble of a row is drawn from its seed, see `drawn_troubles`. The
-sensor adds noise with the covariance that is stated at the home pose. Figures of a row are numbers:
-a kind of trouble is its place in `TROUBLES`, and a group of causes is its place in `GROUPS`.
+The trouble of a row is drawn from its seed, see `drawn_troubles`. The sensor adds noise with the
+covariance that is stated at the home pose. A row has only numbers: a kind of trouble is its index
+in `TROUBLES`, and a group of causes is its index in `GROUPS`, or -1 if it is not among them.
 """
 
 import math
@@ -77,7 +77,10 @@ class GauntletOptions(Section):
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: GauntletOptions) -> Row:
-    """Compute one row. A case that stops with a known error has failed."""
+    """Compute one row. A case has failed if identification or diagnosis stops with a known error.
+
+    Raises the exceptions of `laboratory` and `drawn`, such as those of the experiment.
+    """
     lab = laboratory(scenario.to_toml(), options.trajectory_seed)
     case = drawn(lab, seed, options.wrong)
     row = trouble_figures(case.troubles)
@@ -88,31 +91,31 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: GauntletO
 
 
 def trouble_figures(troubles: Sequence[Trouble]) -> Row:
-    """Return the figures of what is wrong."""
+    """Return the columns of what is wrong."""
     row: Row = {
         "troubles": len(troubles),
         "outside": float(any(not one.groups for one in troubles)),
     }
-    for place, trouble in enumerate(troubles, start=1):
+    for number, trouble in enumerate(troubles, start=1):
         row |= {
-            f"trouble_{place}": TROUBLES.index(trouble.kind),
-            f"size_{place}": trouble.size,
+            f"trouble_{number}": TROUBLES.index(trouble.kind),
+            f"size_{number}": trouble.size,
         }
     return row
 
 
 def figures(case: Case) -> Row:
-    """Return the figures of a finished case. Those that it does not have are missing."""
+    """Return the columns of a finished case. Those that are not finite are missing."""
     found = case.diagnosis
     row: dict[str, Any] = {"stopped": 0.0}
-    for place, alone in enumerate(case.alone, start=1):
-        row[f"alone_{place}"] = alone
+    for number, alone in enumerate(case.alone, start=1):
+        row[f"alone_{number}"] = alone
     each = zip(case.named, case.together, case.size_errors, strict=True)
-    for place, (named, together, error) in enumerate(each, start=1):
+    for number, (named, together, error) in enumerate(each, start=1):
         row |= {
-            f"named_{place}": named,
-            f"together_{place}": together,
-            f"size_error_{place}": error,
+            f"named_{number}": named,
+            f"together_{number}": together,
+            f"size_error_{number}": error,
         }
     verdict = judge(case)
     group = first_group(found.findings)

@@ -15,7 +15,7 @@ from identify.diagnosis.diagnosis import Finding
 from identify.experiment.plant import Plant
 from identify.scenario import Scenario
 
-# Pattern of a setting in a remedy, as it would be typed, with or without quotes.
+# Pattern of an option in a remedy, as it would be typed, with or without quotes.
 SETTING = re.compile(r"--set (?:'([^']+)'|(\S+))")
 
 
@@ -34,7 +34,7 @@ class Remedied:
     """Remedy of a laboratory for a finding.
 
     settings  Settings of the estimator by dotted path.
-    record    Correction of the record.
+    record    Function that corrects the record.
     mended    True if the trouble is removed, and the experiment repeated without it.
     """
 
@@ -44,7 +44,7 @@ class Remedied:
 
 
 def mend(finding: Finding) -> Remedied:
-    """Return the remedy that removes the trouble, and repeats the experiment."""
+    """Return the remedy of removing the trouble and repeating the experiment."""
     return Remedied(mended=True)
 
 
@@ -84,8 +84,8 @@ class Trouble:
     cause     Name of the cause of the diagnosis that has this size. Empty if it has no comparable
               size.
     settings  Settings of the scenario of the plant by dotted path. The estimator does not see them.
-    plant     Change of the plant.
-    record    Change of the record.
+    plant     Function that changes the plant.
+    record    Function that changes the record.
     remedy    Function (finding) that returns what a laboratory does about the trouble, once it is
               found.
     """

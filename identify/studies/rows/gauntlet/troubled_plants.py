@@ -1,9 +1,9 @@
 """Plants with troubles that no setting of a scenario can make: late commands, and play of joints.
 
 With play, a joint follows its command only after the command has crossed the play. This is the play
-operator with input u, output y and width w: y stays as near to its last value as |u - y| <= w / 2
-allows. The log holds the commands before the play. The servo (eq. 30) sees the effect of the play
-in the measured poses. The diagnosis has no cause for play.
+operator with input u, output y and width w: y stays as near to its previous value as
+|u - y| <= w / 2 allows. The log holds the commands before the play. The servo (eq. 30) sees the
+effect of the play in the measured poses. The diagnosis has no cause for play.
 """
 
 from dataclasses import dataclass, replace
@@ -63,7 +63,7 @@ class PlantWithPlay(Plant):
         load: Array | None = None,
         law: LawInLoop | None = None,
     ) -> ClosedLoopRun:
-        """Follow a reference under the servo, as `Plant.run` does.
+        """Follow a reference as `Plant.run` does, but under the servo even if a law is given.
 
         Raises the errors of `dynamics.closed_loop.simulate_controller`.
         """
@@ -100,7 +100,7 @@ class _ServoWithPlay:
     def follow(
         self, frame: int, time: float, measured: Array, desired: Array, desired_rate: Array
     ) -> Array:
-        """Return the servo's command at a frame as it is after the play."""
+        """Return the servo's command at a frame after the play, and log the one before it."""
         error = desired - measured
         self._integral = self._integral + self._period * error
         rate = (measured - self._last) / self._period

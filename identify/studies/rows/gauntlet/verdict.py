@@ -9,7 +9,7 @@ from identify.diagnosis.loop_causes import FRICTION
 from identify.diagnosis.measurement_causes import KINDS
 from identify.studies.rows.gauntlet.case import Case
 
-# Names of groups of causes. Rows name a group by its place here.
+# Names of groups of causes. Rows name a group by its index here.
 GROUPS: tuple[str, ...] = (
     "scale of the commands",
     "latency of the commands",
@@ -34,14 +34,14 @@ GROUPS: tuple[str, ...] = (
     "noise of the sensor",
 )
 
-# Smallest share of a case's intervals that must contain the truth for the verdict "right". The
+# Smallest fraction of a case's intervals that must contain the truth for "right intervals". The
 # intervals of a case depend on each other. In one of twenty right models, the common scale of all
 # parameters is off by two standard deviations, so that a third of the intervals miss the truth.
-# With a wrong model, nearly all miss it, or nothing is identified. The share over all cases is
+# With a wrong model, nearly all miss it, or nothing is identified. The fraction over all cases is
 # judged separately.
 HOLD = 0.5
 
-FIRST = 3  # number of findings among which both of two troubles must be
+FIRST = 3  # number of first findings among which both of two troubles must be
 
 Verdict = Literal["right intervals", "right cause", "failed"]
 
@@ -50,24 +50,25 @@ def rightly_named(case: Case) -> bool:
     """Return whether the diagnosis is right.
 
     One trouble must be named by the first finding, alone or together with causes that are
-    indistinguishable from it. Two troubles must be named by two different findings among the
-    first. If nothing is wrong, there must be no finding. For a trouble outside the catalogue, the
-    answer must be "none of these".
+    indistinguishable from it. Two troubles must be named by two different findings among the first
+    `FIRST`. Further findings do not matter. If nothing is wrong, there must be no finding. For a
+    trouble outside the catalogue, the answer must be "none of these".
     """
     found = case.diagnosis
     if any(not one.groups for one in case.troubles):
         return found.none_of_these
     if not case.troubles:
         return not found.findings and not found.none_of_these
-    last = 1 if len(case.troubles) == 1 else FIRST
-    apart = len(set(case.named)) == len(case.named)
-    return apart and all(0 < place <= last for place in case.named)
+    latest = 1 if len(case.troubles) == 1 else FIRST
+    different = len(set(case.named)) == len(case.named)
+    return different and all(0 < place <= latest for place in case.named)
 
 
 def judge(case: Case) -> Verdict:
     """Return the verdict on a case.
 
-    No remedy is known for a trouble outside the catalogue, so its intervals are not judged.
+    No remedy is known for a trouble outside the catalogue. Its intervals are not judged, and the
+    best verdict is "right cause".
     """
     if not rightly_named(case):
         return "failed"
