@@ -19,7 +19,7 @@ class Asked:
     """Causes as they are asked at an optimum, and their columns (m, k) there.
 
     Of the trial sizes of a cause, the one with the largest gain is kept alone. Its column is the
-    change of the residuals at that size, divided by the size. If none gains, all are kept.
+    change of the residuals at that size, divided by the size. All sizes are kept if none gains.
     """
 
     causes: tuple[Cause, ...]
@@ -88,20 +88,18 @@ def _tried(
     changed in place.
     """
     chosen = list(causes)
-    residual_beside = point.beside_all.part(point.residual)
+    rest = point.beside_all.part(point.residual)
     fitted = with_causes(problem, causes, sizes)
     trials = [(place, size) for place in asked for size in causes[place].tried]
     problems = [causes[place].change(fitted, size) for place, size in trials]
     gains = np.zeros(len(causes))
-    for (place, size), residual in zip(
+    for (place, size), moved in zip(
         trials, each_residuals(problems, point.parameters), strict=True
     ):
-        if residual is None:
+        if moved is None:
             continue
-        column = ((residual - point.residual) / size)[:, None]
-        found = score(
-            point.beside_all.part(column), residual_beside, np.linalg.norm(column, axis=0)
-        )
+        column = ((moved - point.residual) / size)[:, None]
+        found = score(point.beside_all.part(column), rest, np.linalg.norm(column, axis=0))
         if found.sizes[0] > 0 and found.statistic > gains[place]:
             gains[place] = found.statistic
             columns[:, place] = column[:, 0]

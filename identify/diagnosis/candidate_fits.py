@@ -111,10 +111,8 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
     least = min((fit.point.cost for _, fit in helping), default=point.cost)
     misfit = beyond_noise(rows, point.cost)
     # fits from trial sizes take too long beside a selection that explains little of the misfit
-    worthwhile = (
-        misfit <= MOST_LEFT * (misfit + sum(one.gain for one in now.chosen)) or not now.chosen
-    )
-    if worthwhile and beyond_noise(rows, least) > MOST_LEFT * misfit:
+    useful = misfit <= MOST_LEFT * (misfit + sum(one.gain for one in now.chosen)) or not now.chosen
+    if useful and beyond_noise(rows, least) > MOST_LEFT * misfit:
         helping += _from_afar(problem, now, rows, least, [one for one, _ in fits])
     if not helping:
         return ()

@@ -40,7 +40,7 @@ class OnTorques:
 
 @dataclass(frozen=True)
 class OnGain:
-    """Effect of a cause that changes one gain of one joint. kind: index in JOINT_PID."""
+    """Effect of a cause that changes one gain. joint: index from 0. kind: index in JOINT_PID."""
 
     joint: int
     kind: int
@@ -150,9 +150,9 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
 
 
 def prior_std(size: float, least: float) -> float:
-    """Return the smallest power of ten that is at least a size, as a prior standard deviation.
+    """Return the smallest power of ten not below |size|, as a prior standard deviation.
 
-    It is also at least `least`, the value of an ordinary workshop. Causes of a kind thus share it.
+    Nor is it below `least`, which is usual in workshops. Most causes of a kind thus have the same.
     """
     return float(10.0 ** np.ceil(np.log10(max(abs(size), least))))
 

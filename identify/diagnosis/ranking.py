@@ -155,11 +155,9 @@ def rank(
     lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
     every = candidates(causes)
     price = np.log(len(rows.of_poses(residual)))
-    model_fraction = misfit_of(rows, left).share_of_model
+    fraction = misfit_of(rows, left).share_of_model
     # a candidate is taken to leave as much as there is without it
-    by_misfit = (
-        model_fraction * rows.spread(rows.colour(left), projected) if model_fraction else None
-    )
+    by_misfit = fraction * rows.spread(rows.colour(left), projected) if fraction else None
     inner, rest = in_few_rows(projected, left)
     ranked = []
     for one in every:

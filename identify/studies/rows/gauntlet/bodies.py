@@ -68,14 +68,12 @@ def centre_of_leg_bodies(lab: Laboratory, rng: np.random.Generator) -> Trouble:
 def load(lab: Laboratory, rng: np.random.Generator) -> Trouble:
     """Draw an unstated load on the platform, away from the origin of the platform's frame."""
     size = log_uniform(rng, 0.3, 2.0)
-    position = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
+    offset = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.02, 0.1)])
     mass, principal = _known(lab, "platform")
     total_mass = mass + size
-    centre = size * position / total_mass
-    reduced_mass = mass * size / total_mass
-    inertia = principal + reduced_mass * (
-        position @ position * np.eye(3) - np.outer(position, position)
-    )
+    centre = size * offset / total_mass
+    reduced = mass * size / total_mass
+    inertia = principal + reduced * (offset @ offset * np.eye(3) - np.outer(offset, offset))
     values = _values("platform", total_mass, centre, inertia) | {"platform.mass": total_mass}
     return Trouble(
         kind="load that is not stated",
