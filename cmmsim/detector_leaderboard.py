@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.allowed_plugins import DETECTORS
+from cmmsim.allowed_plugins import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detection.cramer_rao import cramer_rao_bound
 from cmmsim.detection.detector import (
     DetectedCentres,
@@ -65,11 +65,9 @@ class Condition:
     psf_px: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (
-            SMALLEST_RADIUS_PX <= self.radius_px < np.inf
-            and 0.0 < self.noise < 1.0
-            and 0.0 <= self.tilt <= np.radians(LARGEST_TILT_DEG)
-        ):
+        sized = SMALLEST_RADIUS_PX <= self.radius_px < np.inf
+        tilted = 0.0 <= self.tilt <= np.radians(LARGEST_TILT_DEG)
+        if not (sized and tilted and 0.0 < self.noise < 1.0):
             raise CmmError(
                 f"a disc of {self} cannot be drawn: radius must be at least {SMALLEST_RADIUS_PX:g} "
                 f"px, tilt 0 to {LARGEST_TILT_DEG:g} degrees, noise above 0 and below 100 % of the "
@@ -248,6 +246,11 @@ class Score:
     lost: float
 
 
+def contestants(own: str = DEFAULT_DETECTOR) -> list[Detector]:
+    """Return the built-in detectors, ``own`` if it is another one, and two methods of OpenCV."""
+    return [*map(find_detector, dict.fromkeys([*DETECTORS, own])), *PEERS]
+
+
 def compete(
     scene: Scene,
     conditions: Sequence[Condition],
@@ -258,15 +261,14 @@ def compete(
 ) -> list[Score]:
     """Return the scores of all detectors under all conditions, with ``draws`` discs each.
 
-    Without ``detectors``, the built-in detectors and two methods of OpenCV compete.
-    ``report(done, total)`` is called after each condition. Raises CmmError for fewer than two
-    draws, and for impossible conditions, before any disc is drawn.
+    Without ``detectors``, all ``contestants`` compete. ``report(done, total)`` is called after each
+    condition. Raises CmmError for fewer than two draws, and for impossible conditions.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
     scenes = [scene.with_noise(condition.noise) for condition in conditions]
     scores: list[Score] = []
-    chosen = detectors or [*map(find_detector, DETECTORS), *PEERS]
+    chosen = detectors or contestants()
     for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
         scores += _round(lit, condition, draws, rng, chosen)
         report(k + 1, len(conditions))

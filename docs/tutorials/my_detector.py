@@ -14,7 +14,7 @@ def find_centres(given):
     dark, bright = np.percentile(flat, 50, axis=1), flat.max(axis=1)
     cut = dark + THRESHOLD * (bright - dark)
     weights = np.clip(windows - cut[:, None, None], 0.0, None)
-    total = weights.sum(axis=(1, 2))
+    total = np.maximum(weights.sum(axis=(1, 2)), 1e-9)  # finite where a window shows no spot
     ticks = np.arange(windows.shape[1])
     x = (weights.sum(axis=1) @ ticks) / total
     y = (weights.sum(axis=2) @ ticks) / total

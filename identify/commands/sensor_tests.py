@@ -169,6 +169,9 @@ def detectors(
     """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector without
     bias can beat.
 
+    Detectors are the built-in ones, two methods of OpenCV, and the detector that the sensor file
+    names, if it is your own.
+
     The first row of the table is the sensor's view of the platform at home. The other rows are all
     combinations of the options.
 
@@ -185,6 +188,7 @@ def detectors(
     \b
     Examples:
       cmmsim detectors
+      cmmsim detectors my_sensor.toml --plugin my_detector
       cmmsim detectors --tags APRILTAG_36h11 --tags 5X5_100
       cmmsim detectors --radius 5 --tilt 0 --noise 1 --draws 1000
     """
@@ -192,7 +196,14 @@ def detectors(
     import pandas as pd
 
     from cmmsim.detection.tags import tag_dictionary
-    from cmmsim.detector_leaderboard import CONFIDENCE, Condition, compete, scene_of, working_point
+    from cmmsim.detector_leaderboard import (
+        CONFIDENCE,
+        Condition,
+        compete,
+        contestants,
+        scene_of,
+        working_point,
+    )
     from cmmsim.files.sensor_file import read_sensor_file
     from cmmsim.tag_comparison import compare_tags
     from identify.verification.sensor_figures import detectors_figure
@@ -211,7 +222,12 @@ def detectors(
     with terminal_progress(quiet).stage("detectors", 1 + len(swept)) as advance:
         rng = np.random.default_rng(seed)
         scores = compete(
-            scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance()
+            scene_of(file),
+            [at_work, *swept],
+            draws,
+            rng,
+            contestants(file.detection.detector),
+            report=lambda done, total: advance(),
         )
     marks: list[MarkScore] = []
     if tags:

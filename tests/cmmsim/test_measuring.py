@@ -107,7 +107,7 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     assert np.isnan(m.pose).all()
     assert len(m.points) == 0
     assert m.reason.startswith("plane B")
-    assert "at least 3 needed" in m.reason
+    assert "at least 3 are needed" in m.reason
     assert sensor.measure(sensor.home).ok
 
 

@@ -17,6 +17,7 @@ from cmmsim.allowed_plugins import (
     import_plugin,
 )
 from cmmsim.detection.detector import find_detector
+from cmmsim.detector_leaderboard import contestants
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import load_robot
 from identify.errors import EstimationError, ScenarioError
@@ -133,6 +134,11 @@ def test_a_detector_that_returns_what_is_none_is_named(name, said):
     sensor = cmmsim.load_sensor("ctrack780", changes=changes, renderer="analytic")
     assert said in refusal(cmmsim.CmmError, sensor.measure, sensor.home)
     assert "bias_px = 'much'" in refusal(cmmsim.CmmError, find_detector, f"{__name__}:biased")
+
+
+def test_an_own_detector_competes_with_those_that_are_built_in():
+    own = f"{__name__}:short"
+    assert {one.name for one in contestants(own)} - {one.name for one in contestants()} == {own}
 
 
 def dark(drawable, views, supersampling, background=0.0):
