@@ -116,10 +116,7 @@ class Tracker:
                 predicted = self._predicted()
                 return self._estimator.measure(images, predicted, *self._ends(predicted))
             found = self._estimator.measure(images, self._last)
-            ends = self._ends(found[1])
-            return (
-                found if ends == (None, None) else self._estimator.measure(images, found[1], *ends)
-            )
+            return self._estimator.measure(images, found[1], *self._ends(found[1]))
         except LostError:
             return None
 
@@ -133,14 +130,11 @@ class Tracker:
     def _ends(self, middle: Array) -> tuple[Ends, Ends]:
         """Return the ends of the exposure, and those of a frame period about its middle.
 
-        The first result is None if the exposure takes no time, and the second if all rows are
-        exposed at once. Without a previous pose, both are None.
+        The first result is None if the exposure takes no time. Without a previous pose, both are
+        None.
         """
-        settings = self._estimator.settings
-        whole = 1.0 if settings.row_share > 0.0 else 0.0
-        return self._part_of_frame(middle, settings.exposed_share), self._part_of_frame(
-            middle, whole
-        )
+        share = self._estimator.settings.exposed_share
+        return self._part_of_frame(middle, share), self._part_of_frame(middle, 1.0)
 
     def _part_of_frame(self, middle: Array, share: float) -> Ends:
         """Return camera_from_platform (4, 4) at both ends of a fraction of a frame period.

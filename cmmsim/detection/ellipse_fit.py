@@ -44,9 +44,11 @@ FEWEST_FOR_A_THREAD = 16  # windows
 class EllipseFits(DetectedCentres):
     """Result of the fits in n windows, with all optional arrays of ``DetectedCentres``.
 
-    ``contrast`` and ``ground`` (n,) are in grey values. ``lights`` (n, 5) tell how far the centres
+    ``contrast`` and ``ground`` (n,) are in grey values. ``lights`` (n, 7) tell how far the centres
     would move if light that rises across each sticker were fitted too: the shift x, y, px, and the
-    entries xx, xy, yy of its covariance, px². They are zero if it was fitted.
+    entries xx, xy, yy of its covariance, px². The last two are the right-hand side and the
+    information of half the variance, px², by which the image is blurred more than the model. They
+    all are zero if rising light was fitted.
     """
 
     shapes: Array = field()  # without a default, unlike in the base class
@@ -99,7 +101,7 @@ def fit_ellipses(
     n = len(windows)
     inner = np.empty((n, 2))
     parameters = np.empty((n, LIT_UNKNOWNS if lit else UNKNOWNS))
-    lights = np.empty((n, 5))
+    lights = np.empty((n, 7))
     misfits = np.empty(n)
     shapes = np.empty((n, 2, 2))
     covariances = np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))

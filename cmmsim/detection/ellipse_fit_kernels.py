@@ -281,7 +281,7 @@ def fit_window(
     if light that rises across the sticker is fitted too. The fit ends when the ellipse moves by
     less than ``converged`` px. The normal matrix and the misfit are those from before this last
     step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m
-    parameters. ``light`` (5,) is filled with what ``light_across`` finds, or zero for nine
+    parameters. ``light`` (7,) is filled with what ``light_across`` finds, or zero for nine
     parameters.
     """
     unknowns = len(parameters)
@@ -343,7 +343,7 @@ def fit_windows(
     """Fit the part of ``size`` px around the bright spot of each window (n, h, h) of floats.
 
     The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of these
-    parts within their windows, the misfits (n,) and the ``lights`` (n, 5). Also fills the
+    parts within their windows, the misfits (n,) and the ``lights`` (n, 7). Also fills the
     parameters (n, 7) or (n, 9), the shapes (n, 2, 2) and the covariances (n, m, m) of the first m
     parameters, relative to these corners.
     """

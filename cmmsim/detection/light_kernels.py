@@ -83,17 +83,22 @@ def light_across(
     window: Array, mask: Array, shares: Array, derivatives: Array, parameters: Array,
     settings: FitSettings, lower: Array, step: Array, light: Array,
 ) -> None:  # fmt: skip
-    """Fill the shift (2,) of the centre if rising light were fitted too, and its covariance.
+    """Fill the shift of the centre if rising light were fitted too, and what tells of more blur.
 
-    ``light`` (5,) are the shift x, y and the entries xx, xy, yy of its covariance, px and px². They
-    are exact to first order in the slope of the light. ``parameters`` (7,) are those of the last
-    normal matrix, whose factor is ``lower``, and ``step`` (7,) is the step that follows from it.
+    ``light`` (7,) are first the shift x, y and the entries xx, xy, yy of its covariance, px and
+    px². They are exact to first order in the slope of the light. The last two are the right-hand
+    side and the information of half the variance, px², by which the image is blurred more than the
+    model. ``parameters`` (7,) are those of the last normal matrix, whose factor is ``lower``, and
+    ``step`` (7,) is the step that follows from it.
     """
     variance = settings.psf_px * settings.psf_px + PIXEL_VARIANCE
     contrast = parameters[5]
     ground = parameters[6] - settings.black
-    mixed = np.zeros((2, EVEN_UNKNOWNS))
+    mixed = np.zeros((3, EVEN_UNKNOWNS))
     slope = np.empty(2)
+    own_blur = right_blur = 0.0
+    end = window.shape[0] - 1
+    wide = window.shape[1] - 1
     own_xx = own_xy = own_yy = 0.0
     right_x = right_y = 0.0
     dark = 1.0 / variance_at(parameters[6], settings)
@@ -119,7 +124,21 @@ def light_across(
                     weighted = weight * slope[k] * contrast
                     for a in range(5):
                         mixed[k, a] += weighted * change[a]
+            # The light that a blur brings to a pixel from its neighbours.
+            blur = contrast * (
+                shares[max(i - 1, 0), j] + shares[min(i + 1, end), j]
+                + shares[i, max(j - 1, 0)] + shares[i, min(j + 1, wide)] - 4.0 * share
+            )  # fmt: skip
             residual = weight * (window[i, j] - mean)
+            if blur != 0.0:
+                weighted = weight * blur
+                right_blur += blur * residual
+                own_blur += weighted * blur
+                mixed[2, 5] += weighted * share
+                mixed[2, 6] += weighted
+                if 0.0 < share < 1.0:
+                    for a in range(5):
+                        mixed[2, a] += weighted * contrast * derivatives[i, j, a]
             right_x += slope[0] * residual
             right_y += slope[1] * residual
             own_xx += weight * slope[0] * slope[0]
@@ -129,9 +148,11 @@ def light_across(
                 mixed[k, 5] += weight * slope[k] * share
                 mixed[k, 6] += weight * slope[k]
     taken = mixed.copy()
-    for k in range(2):
+    for k in range(3):
         solve_factored(lower, taken[k])
     for a in range(EVEN_UNKNOWNS):
+        right_blur -= mixed[2, a] * step[a]
+        own_blur -= mixed[2, a] * taken[2, a]
         right_x -= mixed[0, a] * step[a]
         right_y -= mixed[1, a] * step[a]
         own_xx -= mixed[0, a] * taken[0, a]
@@ -139,6 +160,8 @@ def light_across(
         own_yy -= mixed[1, a] * taken[1, a]
     determinant = own_xx * own_yy - own_xy * own_xy
     light[:] = 0.0
+    light[5] = right_blur
+    light[6] = own_blur
     if not (own_xx > 0.0 and determinant > 0.0):
         return
     spread_xx = own_yy / determinant

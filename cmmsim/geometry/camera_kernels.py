@@ -101,3 +101,37 @@ def transformed(move: Array, point: Array) -> tuple:
         move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3],
         move[2, 0] * point[0] + move[2, 1] * point[1] + move[2, 2] * point[2] + move[2, 3],
     )
+
+
+@compiled
+def pose_slopes(camera: Array, move: Array, point: Array, arm: Array, slopes: Array) -> tuple:
+    """Fill the derivatives (2, 6) of a point's pixel with respect to the small error of a pose.
+
+    ``arm`` (3,) is the point relative to the origin of the pose's body. Return the pixel.
+    """
+    x, y, z = transformed(move, point)
+    u, v, a, b, c, d = project(camera, x, y, z)
+    f_x = camera[0] / z
+    f_y = camera[1] / z
+    slopes[0, :3] = point_derivatives(move, a, b, f_x, f_y, x / z, y / z)
+    slopes[1, :3] = point_derivatives(move, c, d, f_x, f_y, x / z, y / z)
+    for i in range(2):
+        slopes[i, 3] = slopes[i, 2] * arm[1] - slopes[i, 1] * arm[2]
+        slopes[i, 4] = slopes[i, 0] * arm[2] - slopes[i, 2] * arm[0]
+        slopes[i, 5] = slopes[i, 1] * arm[0] - slopes[i, 0] * arm[1]
+    return u, v
+
+
+@compiled
+def weigh(slopes: Array, spread: Array, weight: Array, weighted: Array) -> None:
+    """Fill the ``weight`` (2, 2) of a pixel, and its product (6, 2) with the slopes (2, 6).
+
+    The weight is the inverse of the pixel's covariance ``spread`` (2, 2).
+    """
+    share = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
+    weight[0, 0] = spread[1, 1] / share
+    weight[0, 1] = weight[1, 0] = -spread[0, 1] / share
+    weight[1, 1] = spread[0, 0] / share
+    for i in range(6):
+        for j in range(2):
+            weighted[i, j] = slopes[0, i] * weight[0, j] + slopes[1, i] * weight[1, j]

@@ -20,7 +20,8 @@ or several stickers are slightly misplaced. Each place is then compared with the
 stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
 their noise (squared Birge ratio), up to a limit, and by a factor, because such errors are not
 independent. The covariances are also enlarged for a warp of the whole pattern (``warp_kernels``),
-and for a pose from less than half of the stickers that were searched.
+for errors that stickers share (``shared_error_kernels``), and for a pose from less than half of the
+stickers that were searched.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -45,6 +46,7 @@ from cmmsim.measuring.sticker_windows import StickerObservation
 
 if TYPE_CHECKING:
     from cmmsim.measuring.outline_kernels import Outlines
+    from cmmsim.measuring.shared_error_kernels import Images
     from cmmsim.measuring.solver_kernels import SolverLimits
 
 # Probability that a good sticker is rejected, for its place and for each of its two ellipses.
@@ -87,6 +89,7 @@ class SolvedFrames:
                       larger than noise
     used              (k,), False for rejected stickers
     starts            (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
+    shared            (f, 6, 6), part of the covariances due to errors that stickers share
     verdicts          (f, COLUMNS), reasons why frames are lost
     places            (n, 3), taught places on ``body``
     """
@@ -96,6 +99,7 @@ class SolvedFrames:
     stickers: StickerObservation
     used: NDArray[np.bool_]
     starts: NDArray[np.int_]
+    shared: Array
     verdicts: Array
     body: MarkedBody
     places: Array
@@ -164,13 +168,14 @@ def solve_frames(
     )
     camera_from_body = np.array(near, dtype=float)
     spreads = np.zeros((frames, 6, 6))
+    shared = np.zeros((frames, 6, 6))
     verdicts = np.zeros((frames, kernels.COLUMNS))
     outlines = _outlines(seen, observer, body.sticker_normals[sticker])
     limits = solver_limits(len(places), observer.settings)
     taught = np.ascontiguousarray(places[sticker])
     kernels.solve_frames(
         *(rows, taught, outlines, limits, starts, searched),
-        *(camera_from_body, spreads, verdicts),
+        *(_images(seen, observer, frames), camera_from_body, spreads, shared, verdicts),
     )
     return SolvedFrames(
         camera_from_body,
@@ -178,6 +183,7 @@ def solve_frames(
         replace(seen, covariances=covariances),
         used,
         starts,
+        shared,
         verdicts,
         body,
         places,
@@ -286,6 +292,23 @@ def no_outlines(rig: StereoRig) -> Outlines:
 
     shapes = np.zeros((0, 2, 3))
     return Outlines(shapes, np.zeros((0, 2, 6)), np.zeros((0, 3)), 0.0, rig.kernel_cameras)
+
+
+def _images(seen: StickerObservation, observer: Observer, frames: int) -> Images:
+    """Return the compiled solver's input with the centres of stickers in both images."""
+    # Imported late, because importing numba takes time.
+    from cmmsim.measuring.shared_error_kernels import Images
+
+    spreads = np.zeros((len(seen.index), 2, 2, 2)) if seen.spreads is None else seen.spreads
+    shifts = np.zeros((frames, 2)) if seen.shifts is None else seen.shifts
+    ends = np.zeros((frames, 2, 4, 4)) if seen.frame_ends is None else seen.frame_ends
+    return Images(
+        np.stack([seen.left_pixels, seen.right_pixels], axis=1),
+        np.ascontiguousarray(spreads),
+        shifts,
+        np.ascontiguousarray(ends),
+        observer.rig.kernel_cameras,
+    )
 
 
 def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:

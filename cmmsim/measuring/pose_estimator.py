@@ -20,7 +20,7 @@ from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, fram
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, poses_of, skew
 from cmmsim.geometry.registration import register
 from cmmsim.measuring.first_movement import frame_ends_of
-from cmmsim.measuring.frame_solver import SolvedFrames, consistent
+from cmmsim.measuring.frame_solver import SolvedFrames, solve_frames
 from cmmsim.measuring.layout_search import (
     ENOUGH,
     FEWEST_TAUGHT,
@@ -240,27 +240,29 @@ class PoseEstimator(Observer):
         ``near`` is a first guess of camera_from_platform. Raises LostError.
         """
         places = self.taught.platform_places
-        used, move, covariance = consistent(seen, near, self, self.platform, places)
-        return self._measured(used, move, covariance)
+        solved = solve_frames(seen, near[None], self, self.platform, places)
+        if solved.lost[0]:
+            raise solved.error(0)
+        return self._measured(solved, 0)
 
     def measurement_of(self, solved: SolvedFrames, frame: int) -> Measurement:
         """Return the measurement, or the lost measurement, of one of several solved frames."""
         if solved.lost[frame]:
             return lost_measurement(solved.reason(frame))
-        used = solved.of(frame)
         try:
-            return self._measured(used, solved.camera_from_body[frame], solved.covariances[frame])[
-                0
-            ]
+            return self._measured(solved, frame)[0]
         except LostError as error:
             return lost_measurement(str(error))
 
-    def _measured(
-        self, used: StickerObservation, move: Array, covariance: Array
-    ) -> tuple[Measurement, Array]:
+    def _measured(self, solved: SolvedFrames, frame: int) -> tuple[Measurement, Array]:
+        used = solved.of(frame)
+        move = solved.camera_from_body[frame]
+        covariance = solved.covariances[frame]
         if self.method == "planes":
             rough_normals = self.platform.normals @ move[:3, :3].T
             move, covariance, used = by_planes(used, self.platform, rough_normals)
+            # The stickers' covariances do not contain what the stickers share.
+            covariance = covariance + solved.shared[frame]
         pose, spread = self.in_base(move, covariance)
         return self.measurement(pose, spread, used), move
 

@@ -23,6 +23,7 @@ from cmmsim.geometry.rigid_kernels import (
 )
 from cmmsim.geometry.transform_kernels import make_rigid, move_by
 from cmmsim.measuring.outline_kernels import Outlines, outline_misfit
+from cmmsim.measuring.shared_error_kernels import Images, shared_errors
 from cmmsim.measuring.warp_kernels import SHAPES, warp
 
 MOST_STEPS = 8
@@ -81,7 +82,8 @@ class SolverLimits(NamedTuple):
     excess_share    factor on the mean square of residuals that are larger than noise
     tails           (d,), factor on the covariance of a pose from few stickers, by the number of
                     degrees of freedom
-    largest_warp    largest squared warp that noise explains
+    largest_warp    largest squared warp that noise explains; infinite if an error of the rig is
+                    known, which leaves residuals like those of delays
     warp_share      factor on the mean square of the warp's shapes, for the covariances
     fewest_rivals   smallest number of rejected stickers that contradict the others
     """
@@ -289,16 +291,18 @@ def few_excess(
 @compiled
 def solve(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    covariance: Array, searched: int, verdict: Array,
+    covariance: Array, searched: int, images: Images, frame: int, shared: Array, verdict: Array,
 ) -> None:  # fmt: skip
     """Solve one frame, in which ``searched`` is the number of stickers that were searched.
 
     ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
     ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
     are the taught places. Stickers that contradict the others are marked as not used. The
-    covariances of the used stickers are enlarged if residuals are larger than noise. Arms and gaps
-    must belong to ``place`` on entry.
+    covariances of the used stickers are enlarged if residuals are larger than noise. ``shared``
+    (6,6) is the part of the covariance that ``shared_errors`` finds in row ``frame`` of the
+    ``images``. Arms and gaps must belong to ``place`` on entry.
     """
+    shared[:] = 0.0
     rejected = seen.used.copy()
     verdict[RIVALS] = 0
     verdict[WARP] = 0.0
@@ -312,6 +316,8 @@ def solve(
         verdict[STATE] = CONTRADICTED
         return
     verdict[WARP] = warp(seen.used, seen.arms, seen.gaps, seen.informations, seen.rays, covariance)
+    exact = limits.largest_warp < np.inf
+    shared_errors(seen.used, places, seen.arms, images, frame, place, covariance, exact, shared)
     excess = verdict[EXCESS]
     # Only the excess over the limit counts, so that good frames that just exceed it lose little.
     beyond = verdict[WARP] - excess * limits.largest_warp
@@ -324,7 +330,7 @@ def solve(
     verdict[EXCESS] = excess
     for i in range(6):
         for j in range(6):
-            covariance[i, j] *= excess
+            covariance[i, j] = excess * covariance[i, j] + shared[i, j]
     for n in range(len(seen.used)):
         for i in range(3 if seen.used[n] else 0):
             for j in range(3):
@@ -334,14 +340,15 @@ def solve(
 @compiled
 def solve_frames(
     seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, starts: Array,
-    searched: Array, camera_from_body: Array, covariances: Array, verdicts: Array,
+    searched: Array, images: Images, camera_from_body: Array, covariances: Array, shared: Array,
+    verdicts: Array,
 ) -> None:  # fmt: skip
     """Call ``solve`` for several frames.
 
     Frame j has the stickers ``starts[j]`` to ``starts[j + 1]``, and ``searched`` (f,) is the number
     of stickers that were searched in each. ``camera_from_body`` (f,4,4) contains first guesses on
-    entry, and the results at the end. Their ``covariances`` (f,6,6) and ``verdicts`` (f, COLUMNS)
-    are filled.
+    entry, and the results at the end. Their ``covariances`` and ``shared`` (f,6,6) and ``verdicts``
+    (f, COLUMNS) are filled.
     """
     for f in range(len(camera_from_body)):
         first = starts[f]
@@ -363,11 +370,18 @@ def solve_frames(
             outlines.cameras,
         )
         taught = places[first:last]
+        parts = Images(
+            images.pixels[first:last],
+            images.spreads[first:last],
+            images.shifts,
+            images.ends,
+            images.cameras,
+        )
         # A tracker extrapolates poses from earlier results, so rounding errors accumulate.
         make_rigid(camera_from_body[f])
         for n in range(last - first):
             turn_arm(camera_from_body[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
         solve(
-            own, taught, shown, limits, camera_from_body[f], covariances[f], searched[f],
-            verdicts[f],
+            own, taught, shown, limits, camera_from_body[f], covariances[f], searched[f], parts, f,
+            shared[f], verdicts[f],
         )  # fmt: skip

@@ -32,6 +32,14 @@ if TYPE_CHECKING:
 LONGEST_SMEAR_PX = 8.0
 # Point spreads of stickers out of focus are rounded to multiples of this, which a fit can model.
 SPREAD_STEP_PX = 0.01
+# A lens is known to half this variance of its point spread, px². Noise explains a further blur by
+# this number of its standard deviations.
+KNOWN_BLUR = 0.002
+LARGEST_BLUR = 3.0
+# Standard deviation of a shift along one axis that all centres share, px, for half a variance of 1
+# px² by which a point spread is wider than the known one. Coma of a lens, and interpolation between
+# pixels, shift centres by so much.
+LEAN = 0.6
 # Shortest smear that changes the result of a fit, in standard deviations of the point spread.
 SHORTEST_SMEAR = 1.5
 
@@ -64,6 +72,12 @@ class StickerObservation:
     outlines                   ellipses of the stickers; None if the detector states no ellipses
     searched                   (f,), number of stickers that were searched in each of f exposures;
                                None if all were found
+    spreads                    (k, 2, 2, 2), covariances of the pixels in both images, px²; None if
+                               only the points are known
+    shifts                     (f, 2), standard deviation, px, of a shift that all centres in an
+                               image share; None if there is none
+    frame_ends                 (f, 2, 4, 4), camera_from_body half a frame period before and after
+                               the middle of the exposures; None if the movement is not known
     """
 
     index: NDArray[np.int_]
@@ -75,13 +89,20 @@ class StickerObservation:
     rays: Array
     outlines: Outlines | None = None
     searched: NDArray[np.int_] | None = None
+    spreads: Array | None = None
+    shifts: Array | None = None
+    frame_ends: Array | None = None
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """Return the observation with only some of its stickers."""
-        whole = ("outlines", "searched")
-        kept = {name: values[keep] for name, values in vars(self).items() if name not in whole}
+        frames = ("searched", "shifts", "frame_ends")
+        kept = {
+            name: values[keep]
+            for name, values in vars(self).items()
+            if isinstance(values, np.ndarray) and name not in frames
+        }
         outlines = None if self.outlines is None else self.outlines.selected(keep)
-        return StickerObservation(**kept, outlines=outlines, searched=self.searched)
+        return replace(self, **kept, outlines=outlines)
 
 
 @dataclass(frozen=True)
@@ -128,7 +149,9 @@ class StickerWindows:
         smears = np.zeros((2, len(self.index), 2))
         if exposure_ends is not None and self.found is None:
             fits = self._more_likely(fits, exposure_ends, smears)
+        shifts = None
         if self.found is None and isinstance(fits, EllipseFits):
+            shifts = self._shifts(fits)
             fits = self._lit(fits, smears)
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         if settings.row_share > 0.0 and frame_ends is not None:
@@ -156,7 +179,16 @@ class StickerWindows:
         exposures = len(self.camera_from_body.reshape(-1, 4, 4))
         searched = np.bincount(self.exposures, minlength=exposures)
         good &= seen.ray_gap < settings.largest_ray_gap
-        return replace(found, searched=searched).selected(good)
+        ends = None
+        if frame_ends is not None:
+            ends = np.stack([one.reshape(-1, 4, 4) for one in frame_ends], axis=1)
+        return replace(
+            found,
+            searched=searched,
+            spreads=spread.swapaxes(0, 1),
+            shifts=shifts,
+            frame_ends=ends,
+        ).selected(good)
 
     def ellipses(self, smears: Array | None = None, lit: bool = False) -> EllipseFits:
         """Fit ellipses to all 2k windows, without a limit on the misfit.
@@ -228,6 +260,28 @@ class StickerWindows:
         """Windows (2k, h, h) and corners (2k, 2) of both images together."""
         return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
 
+    def _shifts(self, even: EllipseFits) -> Array | None:
+        """Return the standard deviation (f, 2), px, of the common shift of centres in each image.
+
+        A point spread that is wider than the known one can lean to one side. The result is None if
+        print that is not perfect widens the images as well.
+        """
+        if self.observer.settings.allowed.known:
+            return None
+        good = np.all(even.good.reshape(2, -1), axis=0)
+        exposures = len(self.camera_from_body.reshape(-1, 4, 4))
+        evidence = np.zeros((exposures, 2, 2))
+        np.add.at(
+            evidence,
+            self.exposures[good],
+            even.lights[:, 5:].reshape(2, -1, 2)[:, good].swapaxes(0, 1),
+        )
+        right, information = np.moveaxis(evidence, -1, 0)
+        seen = information > 0.0
+        deviation = 1.0 / np.sqrt(np.where(seen, information, np.inf))
+        blur = np.abs(right) * deviation**2
+        return LEAN * np.maximum(blur - LARGEST_BLUR * deviation - KNOWN_BLUR, 0.0)
+
     def _lit(self, even: EllipseFits, smears: Array) -> DetectedCentres:
         """Fit light that rises across each sticker, in the exposures in which it moves the pose.
 
@@ -248,7 +302,7 @@ class StickerWindows:
             near,
             near - moves[:, :3, 3],
             np.ascontiguousarray(even.covariances.reshape(2, -1, 2, 2)[:, good]),
-            np.ascontiguousarray(even.lights.reshape(2, -1, 5)[:, good]),
+            np.ascontiguousarray(even.lights.reshape(2, -1, 7)[:, good]),
             np.searchsorted(self.exposures[good], exposures),
             sizes,
         )

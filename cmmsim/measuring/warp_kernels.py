@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.camera_kernels import Cameras, point_derivatives, project, transformed
+from cmmsim.geometry.camera_kernels import Cameras, pose_slopes, weigh
 from cmmsim.geometry.matrix_kernels import factorise, solve_factored
 
 # Strains of the stickers' places, and changes of the distance of their rays.
@@ -105,7 +105,7 @@ def light_sizes(
     A pose moves if rising light is fitted with each sticker in place of even light. Its squared
     movement is in units of its noise. Noise alone gives chi-square numbers with six degrees of
     freedom. Frame j has the stickers ``starts[j]`` to ``starts[j + 1]`` at ``points`` (k, 3), with
-    ``arms`` (k, 3). The centres have covariances ``spreads`` (2, k, 2, 2). ``lights`` (2, k, 5) are
+    ``arms`` (k, 3). The centres have covariances ``spreads`` (2, k, 2, 2). ``lights`` (2, k, 7) are
     those of ``EllipseFits``.
     """
     slope = np.zeros((2, 6))
@@ -119,29 +119,13 @@ def light_sizes(
             camera = cameras.intrinsics[side]
             move = cameras.extrinsics[side]
             for n in range(starts[f], starts[f + 1]):
-                x, y, z = transformed(move, points[n])
-                _, _, a, b, c, d = project(camera, x, y, z)
-                f_x = camera[0] / z
-                f_y = camera[1] / z
-                slope[0, :3] = point_derivatives(move, a, b, f_x, f_y, x / z, y / z)
-                slope[1, :3] = point_derivatives(move, c, d, f_x, f_y, x / z, y / z)
-                arm = arms[n]
-                for i in range(2):
-                    slope[i, 3] = slope[i, 2] * arm[1] - slope[i, 1] * arm[2]
-                    slope[i, 4] = slope[i, 0] * arm[2] - slope[i, 2] * arm[0]
-                    slope[i, 5] = slope[i, 1] * arm[0] - slope[i, 0] * arm[1]
-                spread = spreads[side, n]
-                share = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
-                weight[0, 0] = spread[1, 1] / share
-                weight[0, 1] = weight[1, 0] = -spread[0, 1] / share
-                weight[1, 1] = spread[0, 0] / share
+                pose_slopes(camera, move, points[n], arms[n], slope)
+                weigh(slope, spreads[side, n], weight, pushed)
                 light = lights[side, n]
                 noise[0, 0] = light[2]
                 noise[0, 1] = noise[1, 0] = light[3]
                 noise[1, 1] = light[4]
                 for i in range(6):
-                    for j in range(2):
-                        pushed[i, j] = slope[0, i] * weight[0, j] + slope[1, i] * weight[1, j]
                     moved[i] += pushed[i, 0] * light[0] + pushed[i, 1] * light[1]
                 for i in range(6):
                     for j in range(i + 1):

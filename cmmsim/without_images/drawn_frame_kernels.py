@@ -24,6 +24,7 @@ from cmmsim.geometry.transform_kernels import (
 )
 from cmmsim.geometry.triangulation_kernels import signed_distance, triangulate_point
 from cmmsim.measuring.outline_kernels import Outlines
+from cmmsim.measuring.shared_error_kernels import Images
 from cmmsim.measuring.solver_kernels import (
     MEASURED,
     STATE,
@@ -318,9 +319,15 @@ def measure_frame(
     stickers = scene.stickers
     none = np.empty((0, 2, 3)), np.empty((0, 2, 6))
     outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, scene.assumed_cameras)
+    # Only the direction of the movement counts, and only if the right camera exposes later.
+    ends = np.empty((1, 2, 4, 4))
+    for end in range(2):
+        pose_transform(poses[3 * end], platform)
+        multiply(scene.camera_from_base, platform, ends[0, end])
+    images = Images(frame.pixels, frame.spreads, np.zeros((1, 2)), ends, scene.assumed_cameras)
     solve(
         frame.stickers, stickers.taught, outlines, scene.solver_limits, place, covariance,
-        searched, verdict,
+        searched, images, 0, np.empty((6, 6)), verdict,
     )  # fmt: skip
     if verdict[STATE] == MEASURED:
         multiply(scene.base_from_camera, place, platform)

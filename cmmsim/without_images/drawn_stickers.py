@@ -321,7 +321,7 @@ class DrawnStickers:
             np.ones(count),
             found.contrasts,
             found.grounds,
-            np.zeros((count, 5)),
+            np.zeros((count, 7)),
         )
 
     def _lit(self, even: "Fits", windows: "Windows", how: "FitSettings") -> "Fits":

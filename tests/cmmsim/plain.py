@@ -10,6 +10,7 @@ from cmmsim.geometry.pose import rigid, skew
 
 FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 5, chi2.isf(1e-4, 3), 6.0
 FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-3, 8.0, 4.0, 0.999
+LARGEST_DELAY, DELAY_SHARE = 2.5, 2.0
 LARGEST_STRAIN, LARGEST_PARTING = 1e-3, 1e3  # a metre
 SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
 
@@ -128,6 +129,40 @@ def warp(transform, places, points, covariances, rays):
         _decrease(np.vstack([linear, np.eye(4) / LARGEST_PARTING]), np.append(rays, np.zeros(4))),
     ]
     return sum(found) - _decrease(rows[0], residuals)
+
+
+def shared_errors(rig, transform, places, pixels, spreads, shifts, ends):
+    """Covariance (6, 6) of a pose by errors that pixels (n, 2, 2) share, from whitened rows.
+
+    ``shifts`` (2,) px are deviations of a shift of each image. Delays are fitted with the pose:
+    that of the right image, and that of rows, along the movement between both ``ends`` (2, 4, 4).
+    """
+    turned = places @ transform[:3, :3].T
+    pose = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), -skew(turned)], axis=2)
+    rows, columns, right = [], [[] for _ in range(6)], []
+    for side, (camera, move) in enumerate(zip(rig.cameras, rig.from_camera, strict=True)):
+        found, slopes = project(camera, (turned + transform[:3, 3]) @ move[:3, :3].T + move[:3, 3])
+        whiten = np.linalg.inv(np.linalg.cholesky(spreads[:, side]))
+        rows.append(whiten @ slopes @ move[:3, :3] @ pose)
+        right.append(np.einsum("nij,nj->ni", whiten, pixels[:, side] - found))
+        before, after = (
+            project(camera, places @ one[:3, :3].T + one[:3, 3])[0] for one in move @ ends
+        )
+        late = (found[:, 1:] / camera.height - 0.5) * (after - before)
+        shared = [np.eye(2)[i] * (own == side) for own in range(2) for i in range(2)]
+        for column, part in zip(columns, [*shared, side * (after - before), late], strict=True):
+            column.append(whiten @ np.broadcast_to(part, found.shape)[..., None])
+    rows, right = np.concatenate(rows).reshape(-1, 6), np.concatenate(right).ravel()
+    spread = np.zeros((6, 6))
+    for k, column in enumerate(columns):
+        column = np.concatenate(column).ravel()
+        change = np.linalg.lstsq(rows, column, rcond=None)[0]
+        rest = column - rows @ change
+        deviation = 1.0 / np.sqrt(rest @ rest + 1.0)
+        beyond = max(abs(rest @ right) * deviation - LARGEST_DELAY, 0.0)
+        size = shifts[k // 2] if k < 4 else DELAY_SHARE * deviation * beyond
+        spread += size**2 * np.outer(change, change)
+    return spread
 
 
 def _decrease(rows, right):

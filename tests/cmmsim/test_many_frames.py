@@ -137,15 +137,17 @@ def test_each_in_motion_is_measured_as_alone(kind):
     near = poses + 0.01 * REACH * rng.uniform(-1, 1, poses.shape)
     plain = []
     for pose, rate, around in zip(poses, rates, near, strict=True):
-        half, moved = 0.001 * rate, expected(sensor, around) @ invert(pose_to_transform(pose))
-        exposure_ends = (
-            moved @ pose_to_transform(pose - half),
-            moved @ pose_to_transform(pose + half),
+        moved = expected(sensor, around) @ invert(pose_to_transform(pose))
+        exposure_ends, frame_ends = (
+            tuple(moved @ pose_to_transform(pose + half * rate) for half in (-end, end))
+            for end in (0.001, 0.5 / sensor.timing.frame_rate)
         )
         images = sensor.look(pose, rod, pose_rate=rate)
         try:
             plain.append(
-                sensor.estimator.measure(images, expected(sensor, around), exposure_ends)[0]
+                sensor.estimator.measure(
+                    images, expected(sensor, around), exposure_ends, frame_ends
+                )[0]
             )
         except cmmsim.LostError:
             plain.append(None)
