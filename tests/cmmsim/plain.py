@@ -10,7 +10,7 @@ from cmmsim.geometry.pose import rigid, skew
 
 FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 5, chi2.isf(1e-4, 3), 6.0
 FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-3, 8.0, 4.0, 0.999
-LARGEST_DELAY, DELAY_SHARE = 2.5, 2.0
+LARGEST_DELAY, DELAY_SHARE = 3.0, 2.0
 LARGEST_STRAIN, LARGEST_PARTING = 1e-3, 1e3  # a metre
 SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
 
