@@ -205,7 +205,8 @@ def scale_warnings(
         return (
             f"the scale anchor {anchor.name} fixes the scale of this robot only to "
             f"{whole_std:.1%}, the standard deviation of {gain}; all values in kg, N m or N share "
-            "this error: use identification.scale_anchor = payload or joint_gain",
+            "this error: a new run with --set identification.scale_anchor=joint_gain, or payload, "
+            "makes it smaller",
         )
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "

@@ -127,7 +127,7 @@ def parameter_section(data: RunData) -> Section:
     text = [
         f"The record identifies {tables.identified_counts(found)}. A quantity is identified if its "
         f"standard deviation is less than {100 * IDENTIFIABLE_SHARE:g} % of that of its initial "
-        "guess, and of its size.",
+        "guess, and of the size of that guess.",
         parameter_tables.scale_sentence(found),
         *filter(None, [tables.common_scale_sentence(found)]),
         *filter(None, [parameter_tables.drive_sentence(found)]),

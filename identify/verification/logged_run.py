@@ -17,6 +17,7 @@ from dynamics import closed_loop, load_robot
 from dynamics.closed_loop import ClosedLoopRun, Reference
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
+from identify.errors import RecordError
 from identify.estimation.base_parameters import structure
 from identify.estimation.identifiability import group_rows, identifiability
 from identify.estimation.prior import friction, model_guess
@@ -24,7 +25,7 @@ from identify.estimation.scale_anchor import MEASURING, default_std, measured_pa
 from identify.model.model_side import ModelSide, model_side
 from identify.record.conditions import COMMAND_TIME
 from identify.record.delays import MotionLag, ServoDelay, servo_delay
-from identify.record.frame_times import GAP
+from identify.record.frame_times import GAP, mean_rate
 from identify.record.own_record import (
     description_file,
     is_log,
@@ -149,8 +150,8 @@ class LoggedRun:
         commands = self.telemetry.commands
         period = self.side.timing.frame_period_s
         inside = (commands.time > begin + period / 2) & (commands.time < end - period / 2)
-        held = commands.command[inside]
-        return len(held) > 1 and bool(np.ptp(held, axis=0).any())
+        held = self.commands_at(np.array([begin + period / 2]))
+        return bool((commands.command[inside] != held).any())
 
     def commands_are_missing(self, begin: float, end: float) -> bool:
         """Return whether the command changed between two times without a row between them."""
@@ -185,13 +186,15 @@ class LoggedRun:
 def read_logged_run(path: Path) -> LoggedRun:
     """Read a record, and what its description or its scenario states about it.
 
-    Raises the errors of `read_own_records`, but accepts any motion and any clock.
+    Raises the errors of `read_own_records`, but accepts any motion, and any clock in a possible
+    unit.
     """
     if is_log(path):
         about = read_description(description_file(path), path)
         scenario = about.scenario
         robot = load_robot(scenario.robot)
         telemetry = read_telemetry(path, about, robot)
+        _check_unit_of_times(telemetry.poses.time, scenario.timing.frame_rate_hz, path)
         suspected = log_suspicions(path, about, telemetry, robot)
         measured = about.measured
         stds = [measured.position_std_m, measured.orientation_std_rad]
@@ -201,6 +204,7 @@ def read_logged_run(path: Path) -> LoggedRun:
         scenario = recorded_scenario(record)
         robot = load_robot(scenario.robot)
         telemetry = recorded_telemetry(record, str(path))
+        _check_unit_of_times(telemetry.poses.time, scenario.timing.frame_rate_hz, path)
         suspected = suspicions(telemetry, robot)
         stated = None
     if telemetry.poses.covariance is not None:
@@ -209,6 +213,24 @@ def read_logged_run(path: Path) -> LoggedRun:
     return LoggedRun(
         telemetry, model_side(robot, scenario), scenario.identification, stated, tuple(suspected)
     )
+
+
+def _check_unit_of_times(times: Array, rate_hz: float, path: Path) -> None:
+    """Raise RecordError if rows are nearer to a power of 1000 frames apart than to one frame.
+
+    The checks of such a record would take hours, and tell nothing.
+    """
+    if len(times) < 2:
+        return
+    rate = mean_rate(times)
+    powers = round(np.log10(rate / rate_hz) / 3)
+    if powers:
+        raise RecordError(
+            f"{path}: rows of poses are {1 / rate:.3g} s apart, and frames of "
+            f"timing.frame_rate_hz = {rate_hz:g} are {1 / rate_hz:.3g} s apart: the unit of the "
+            f"times seems wrong by a factor of {1000 ** abs(powers):g}; tables state it by "
+            "time_unit in [columns]"
+        )
 
 
 def recorded_telemetry(record: xr.Dataset, source: str) -> Telemetry:

@@ -147,7 +147,7 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
         )
         ok = stated is None or 1 / NOISE <= value / stated <= NOISE
         if stated is not None:
-            text += f"; stated are {scale * stated:.3g} {word}, {value / stated:.2g} times that"
+            text += f"; {value / stated:.2g} times the stated {scale * stated:.3g} {word}"
         yield Finding(name, ok, value, text, limit=stated, unit=unit, relation="about")
     jumps = logged.jumps
     listed = ", ".join(f"{one:.4f}" for one in jumps[:LISTED])

@@ -78,7 +78,7 @@ def test_what_is_wrong_with_the_poses_is_found_with_its_size(record):
     assert found["frozen poses"].value == pytest.approx(19 / 557)
     assert "the first at 6.6833 s" in found["frozen poses"].text
     assert "at 5.0000" in found["jumps"].text
-    assert "stated are 15 um, 0.3" in found["position noise"].text
+    assert "times the stated 15 um" in found["position noise"].text
 
 
 def test_rows_that_are_missing_are_told_from_commands_that_changed(record):
@@ -179,6 +179,11 @@ def test_a_log_is_checked_by_its_description_and_a_robot_is_told_from_it(
     assert command("check", "take.csv", "--scenario", "quick") == MISUSED
     assert command("check", "rss6", "--page", "x.html") == MISUSED
     capfd.readouterr()
+    table = (tmp_path / "take.toml").read_text()
+    change(tmp_path / "take.toml", "[columns.measured]", '[columns.measured]\ntime_unit = "ms"')
+    assert command("check", "take.csv", "--page", "x.html") == NOT_DONE
+    assert "unit of the times seems wrong by a factor of 1000" in one_line(capfd.readouterr().err)
+    (tmp_path / "take.toml").write_text(table)
     (tmp_path / "take.toml").unlink()
     assert command("check", "take.csv", "--page", "x.html") == NOT_DONE
     assert "there is no file take.toml, which must describe the record" in one_line(
