@@ -251,7 +251,7 @@ def pose_covariance(transforms: Array, covariances: Array) -> Array:
     """Return the covariances (..., 6, 6) of the poses of transforms (..., 4, 4), to first order.
 
     ``covariances`` (..., 6, 6) are those of the transforms' small errors [dt, dphi], which
-    ``rigid_kernels`` computes for a transform that is fitted to points.
+    ``pose_fit_kernels`` computes for a transform that is fitted to points.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.geometry.transform_kernels import pose_covariances

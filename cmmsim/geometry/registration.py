@@ -84,7 +84,7 @@ def register_sets(source: Array, targets: Array, covariances: Array) -> Registra
     (c, 4, 4), covariances (c, 6, 6) and misfits (c n,). The spread of the points is not checked.
     """
     # Imported late, because importing numba takes time.
-    from cmmsim.geometry.rigid_kernels import rigid_fits
+    from cmmsim.geometry.pose_fit_kernels import rigid_fits
 
     sets, count = targets.shape[:2]
     transforms = rigid_starts(source, targets, np.ones((sets, count)))

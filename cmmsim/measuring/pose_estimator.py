@@ -1,7 +1,8 @@
 """Measurement of one stereo frame (paper eq. 27 and 28). The true pose is not used.
 
 The pose in camera axes and its covariance come from ``frame_solver``, or from ``by_planes``. They
-are then transformed to the base frame.
+are then transformed to the base frame. ``geometry.pose_fit_kernels`` computes the covariance due to
+noise, and ``solver_kernels`` enlarges it where residuals show more.
 """
 
 from __future__ import annotations

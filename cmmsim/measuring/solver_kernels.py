@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compilation import Array, compiled
-from cmmsim.geometry.rigid_kernels import (
+from cmmsim.geometry.pose_fit_kernels import (
     add_point,
     lie_on_a_line,
     residual_covariance,
@@ -55,7 +55,7 @@ class ObservedStickers(NamedTuple):
     points        (n, 3), in the camera frame, m
     informations  (n, 3, 3), inverse covariances of the points
     covariances   (n, 3, 3), covariances of the points
-    arms, gaps    (n, 3), overwritten; ``rigid_kernels`` explains them
+    arms, gaps    (n, 3), overwritten; ``pose_fit_kernels`` explains them
     rays          (n,), signed distances of both rays of a sticker, in units of their noise
     """
 

@@ -5,7 +5,8 @@ joints, and e is the desired minus the measured pose of the frame. The measured 
 difference of the newest two measurements divided by the time between them. The start state has the
 measurement before the first frame. The integral is the sum of the errors, up to this frame, times
 the frame period. At a lost frame the servo does not run: its last measurement, integral and command
-stay as they are. The feedforward is added at every frame.
+stay as they are. The feedforward is added at every frame. Model-based laws predict the pose at a
+lost frame (`dynamics.control.observer`).
 """
 
 import numpy as np

@@ -14,7 +14,7 @@ import cmmsim
 
 # A small kernel, and one of another file that it calls: they are compiled in half a second.
 PROBE = (
-    "import numpy as np; from cmmsim.geometry.rigid_kernels import turn_arm;"
+    "import numpy as np; from cmmsim.geometry.pose_fit_kernels import turn_arm;"
     "arm, gap = np.zeros((2, 3));"
     "turn_arm(np.eye(3, 4), np.array([1.0, 2.0, 4.0]), np.zeros(3), arm, gap);"
     "print(arm.sum())"
@@ -50,7 +50,7 @@ def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
 
     first = kept()
     assert {path.name.partition(".")[0] for path in first} == {
-        "rigid_kernels",
+        "pose_fit_kernels",
         "transform_kernels",
     }
     assert run_copy(copied, {}) == PROBED
@@ -77,4 +77,4 @@ def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
     for place in (tmp_path / "home", tmp_path / "nowhere"):
         users = {"HOME": str(place), "XDG_CACHE_HOME": str(place)}
         assert run_copy(copied, users) == PROBED
-    assert list((tmp_path / "home").rglob("rigid_kernels*.nbi"))
+    assert list((tmp_path / "home").rglob("pose_fit_kernels*.nbi"))

@@ -26,8 +26,8 @@ from cmmsim.geometry.pose import (
     pose_to_transform,
     transform_to_pose,
 )
+from cmmsim.geometry.pose_fit_kernels import residual_covariance, residual_misfit, turn_arm
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.rigid_kernels import residual_covariance, residual_misfit, turn_arm
 from cmmsim.geometry.stereo_rig import toed_in_rig
 from cmmsim.geometry.triangulation import triangulate
 from cmmsim.measuring.frame_solver import (

@@ -1,4 +1,4 @@
-"""Compiled kernels for rigid fits of points by Gauss-Newton, and tests of their residuals.
+"""Compiled kernels that fit a pose to points by Gauss-Newton, with its covariance, and test it.
 
 A point is known in the axes of a body, and measured with a covariance. ``arm`` is the known point
 rotated by the transform. ``gap`` is the measured point minus the transformed known point. The
