@@ -76,7 +76,11 @@ def cramer_rao_bound(
         [contrast * derivatives, shares[..., None], np.ones_like(shares)[..., None]], axis=-1
     )
     fisher = np.einsum("nyxi,nyxj,nyx->nij", jacobian, jacobian, information, optimize=True)
-    return np.linalg.inv(fisher)[:, :2, :2]
+    try:
+        return np.linalg.inv(fisher)[:, :2, :2]
+    except np.linalg.LinAlgError:
+        # A disc of hardly a pixel leaves a part of its shape undetermined.
+        return np.linalg.pinv(fisher, rcond=1e-13, hermitian=True)[:, :2, :2]
 
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
