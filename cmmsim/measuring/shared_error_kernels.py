@@ -32,8 +32,8 @@ SHIFTS = 4
 KNOWN_DELAY = 1.0
 # Largest delay that noise explains, in its standard deviations. What it is beyond this, times the
 # share, is the standard deviation of the delay. A movement along the line between the cameras
-# leaves up to four times less in the residuals than in the pose. A limit of 2.5 would notice more of
-# it, but doubles the variance of clean frames that move along this line.
+# leaves up to four times less in the residuals than in the pose. A limit of 2.5 would notice more
+# of it, but doubles the variance of clean frames that move along this line.
 LARGEST_DELAY = 3.0
 DELAY_SHARE = 2.0
 
