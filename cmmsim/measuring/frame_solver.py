@@ -190,18 +190,18 @@ def solve_frames(
     )
 
 
-def consistent(
+def solve_frame(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
-) -> tuple[StickerObservation, Array, Array]:
-    """Return the stickers of one frame that agree with each other, and the pose from them.
+) -> SolvedFrames:
+    """Return the solution of one frame, as ``solve_frames`` does of several.
 
-    The pose is camera_from_body (4, 4) with its covariance (6, 6). ``near`` (4, 4) is a first guess
-    of the pose. Raises LostError if too few stickers agree.
+    ``near`` (4, 4) is a first guess of camera_from_body. Raises LostError if the frame is lost, for
+    example since too few stickers agree.
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
         raise solved.error(0)
-    return solved.of(0), solved.camera_from_body[0], solved.covariances[0]
+    return solved
 
 
 def solver_limits(

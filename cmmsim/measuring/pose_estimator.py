@@ -21,7 +21,7 @@ from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points, fram
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, poses_of, skew
 from cmmsim.geometry.registration import register
 from cmmsim.measuring.first_movement import frame_ends_of
-from cmmsim.measuring.frame_solver import SolvedFrames, solve_frames
+from cmmsim.measuring.frame_solver import SolvedFrames, solve_frame
 from cmmsim.measuring.layout_search import (
     ENOUGH,
     FEWEST_TAUGHT,
@@ -241,10 +241,7 @@ class PoseEstimator(Observer):
         ``near`` is a first guess of camera_from_platform. Raises LostError.
         """
         places = self.taught.platform_places
-        solved = solve_frames(seen, near[None], self, self.platform, places)
-        if solved.lost[0]:
-            raise solved.error(0)
-        return self._measured(solved, 0)
+        return self._measured(solve_frame(seen, near, self, self.platform, places), 0)
 
     def measurement_of(self, solved: SolvedFrames, frame: int) -> Measurement:
         """Return the measurement, or the lost measurement, of one of several solved frames."""

@@ -9,7 +9,7 @@ from threadpoolctl import ThreadpoolController
 
 from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.pose import Array
-from cmmsim.measuring.frame_solver import consistent
+from cmmsim.measuring.frame_solver import solve_frame
 from cmmsim.measuring.measurement import Measurement
 from cmmsim.measuring.observation import Observer
 from cmmsim.measuring.sticker_windows import StickerObservation
@@ -130,7 +130,7 @@ class DriftWatch:
         camera_from_base = self.geometry.camera_from_base
         seen = observer.observe(images, camera_from_base, places, body.sticker_normals)
         try:
-            return consistent(seen, camera_from_base, observer, body, places)[0]
+            return solve_frame(seen, camera_from_base, observer, body, places).of(0)
         except LostError:
             return None
 

@@ -34,7 +34,7 @@ from cmmsim.measuring.frame_solver import (
     FEWEST,
     LARGEST_MISFIT,
     SMALLEST_SHARE,
-    consistent,
+    solve_frame,
 )
 from cmmsim.measuring.observation import DetectionSettings, Observer
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
@@ -144,7 +144,8 @@ def seen_from_home(rng, stickers, shift_px=0.0, shrink_px=0.0, slipped=0.0, apar
 def solved(seen):
     """Stickers that agree, camera_from_body and its covariance, from half a millimetre beside."""
     near = CAMERA_FROM_BASE @ pose_to_transform(HOME + 5e-4)
-    return consistent(seen, near, OBSERVER, BODY, BODY.nominal)
+    found = solve_frame(seen, near, OBSERVER, BODY, BODY.nominal)
+    return found.of(0), found.camera_from_body[0], found.covariances[0]
 
 
 def misfits_of(fit, points, places, covariances):
@@ -220,7 +221,9 @@ def test_rounding_errors_of_a_predicted_place_do_not_grow_from_frame_to_frame():
     for _ in range(1000):
         last, move = (
             move,
-            consistent(seen, move @ invert(last) @ move, OBSERVER, BODY, BODY.nominal)[1],
+            solve_frame(
+                seen, move @ invert(last) @ move, OBSERVER, BODY, BODY.nominal
+            ).camera_from_body[0],
         )
     assert np.abs(move[:3, :3].T @ move[:3, :3] - np.eye(3)).max() < 1e-13
     np.testing.assert_allclose(move, solved(seen)[1], rtol=0, atol=1e-12)
