@@ -41,7 +41,6 @@ wait for OpenCV and OpenGL.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cmmsim.__main__ import warn_of_foreign_identify
 from cmmsim.errors import (
     CmmError,
     LostError,
@@ -54,6 +53,7 @@ from cmmsim.errors import (
     UnknownOptionError,
     UnknownSensorError,
 )
+from cmmsim.foreign_identify import warn_of_foreign_identify
 
 if TYPE_CHECKING:
     from cmmsim.allowed_plugins import allow_plugin as allow_plugin

@@ -1,58 +1,12 @@
-"""The command `cmmsim`, and a warning if another package is imported as `identify`.
+"""The command `cmmsim`, which refuses to run if another package is imported as `identify`.
 
-cmmsim is installed together with its package `identify`. PyPI has another package of this name,
-which pre-commit needs. Both packages write the file `identify/__init__.py`, so the one that is
-installed last breaks the other. The command therefore begins here, in the only module of this
-package that imports `identify`, and refuses to run beside the other package.
+This is the only module of the package that imports `identify`.
 """
 
 import sys
-import warnings
-from functools import cache
-from importlib import import_module, metadata
-from importlib.util import find_spec
-from pathlib import Path
+from importlib import import_module
 
-# Text that only our `identify/__init__.py` contains.
-OURS = "IdentifyError"
-
-
-def foreign_identify() -> str:
-    """Return one line that names the wrong package `identify` and says what to do.
-
-    The line is empty if our `identify` is found.
-    """
-    spec = find_spec("identify")
-    path = Path(spec.origin) if spec and spec.origin else None
-    if path and path.is_file() and OURS in path.read_text(encoding="utf-8", errors="replace"):
-        beside = _installed_beside()
-        if not beside:
-            return ""
-        where = f"identify {beside} of PyPI is installed beside cmmsim, which replaced its files"
-    elif path:
-        where = f"another package is imported instead of cmmsim's `identify`: {path.parent}"
-    else:
-        where = "no `identify`"
-    return (
-        f"{where}; install cmmsim into a virtual environment of its own (a PyPI package has the "
-        "same name)"
-    )
-
-
-def _installed_beside() -> str:
-    """Return the version of PyPI's package `identify` in this environment, or an empty text."""
-    try:
-        return metadata.version("identify")
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-@cache
-def warn_of_foreign_identify() -> None:
-    """Warn once if another package is imported as `identify`."""
-    warning = foreign_identify()
-    if warning:
-        warnings.warn(warning, stacklevel=4)
+from cmmsim.foreign_identify import foreign_identify
 
 
 def main() -> None:

@@ -132,7 +132,7 @@ def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     assert warned.returncode == 0
     assert f"UserWarning: {said}" in warned.stderr
     command = python(
-        "-c", "import cmmsim.__main__ as c; c.main()", cwd=tmp_path, path=[tmp_path, ROOT]
+        "-W", "error::RuntimeWarning", "-m", "cmmsim", cwd=tmp_path, path=[tmp_path, ROOT]
     )
     assert command.returncode == 1
     assert command.stderr.startswith(f"error: {said}")

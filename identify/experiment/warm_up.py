@@ -71,14 +71,19 @@ def _compile_plant(plant: Plant) -> None:
 
 
 def _compile_sensor(plant: Plant, planned: SensorPlan) -> None:
-    """Teach the sensor and measure some frames, with the planned and the analytic renderer."""
+    """Teach the sensor and measure some frames, with the planned and the analytic renderer.
+
+    A record also contains the common errors of its poses.
+    """
     motion = _nearby(plant)
     rate_hz = plant.runs.timing.frame_rate_hz
     for renderer in dict.fromkeys((planned.renderer, "analytic")):
         plan = replace(planned, renderer=renderer)
-        eye = SensorInLoop(plan.taught(plant.nominal, 0, SilentProgress()), plant.robot, 0)
+        sensor = plan.taught(plant.nominal, 0, SilentProgress())
+        eye = SensorInLoop(sensor, plant.robot, 0)
         for frame, (pose, rate) in enumerate(zip(motion.poses, motion.rates, strict=True)):
             eye.measure(frame, frame / rate_hz, pose, rate)
+    sensor.common_errors(motion.poses, motion.rates)
 
 
 def _compile_named(name: str) -> None:
