@@ -5,8 +5,8 @@ Each message states the evidence, such as the value, the limit or the valid name
 
 from collections.abc import Iterable
 
-# Largest number of characters of a message.
-LONGEST = 4000
+LONGEST = 4000  # number of characters above which the middle of a message is left out
+END = 1000  # number of characters at the end that stay, because the remedy is there
 
 
 class CmmError(ValueError):
@@ -25,9 +25,9 @@ class CmmError(ValueError):
     """
 
     def __str__(self) -> str:
-        """Return the message on one line, cut after `LONGEST` characters."""
+        """Return the message on one line of about `LONGEST` characters at most."""
         text = " ".join(super().__str__().splitlines())
-        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - END]} ... {text[-END:]}"
 
 
 class UnknownSensorError(CmmError):

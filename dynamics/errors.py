@@ -3,16 +3,17 @@
 Messages state the value, the limit, and the leg or name, where there are such.
 """
 
-LONGEST = 4000  # number of characters after which a message is cut
+LONGEST = 4000  # number of characters above which the middle of a message is left out
+END = 1000  # number of characters at the end that stay, because the remedy is there
 
 
 class DynamicsError(Exception):
     """Base class of all errors of this package. The message is one line."""
 
     def __str__(self) -> str:
-        """Message on one line, even if it quotes a file, and cut after `LONGEST` characters."""
+        """Message on one line of about `LONGEST` characters at most, even if it quotes a file."""
         text = " ".join(super().__str__().splitlines())
-        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - END]} ... {text[-END:]}"
 
 
 class RobotFileError(DynamicsError):

@@ -1,15 +1,16 @@
 """Errors that a user can cause or meet. Messages state value, limit and valid names."""
 
-LONGEST = 4000  # number of characters after which a message is cut
+LONGEST = 4000  # number of characters above which the middle of a message is left out
+END = 1000  # number of characters at the end that stay, because the remedy is there
 
 
 class IdentifyError(Exception):
     """Base of the errors of this package. The command line shows them as one line."""
 
     def __str__(self) -> str:
-        """Return the message on one line, cut because it can quote the content of a file."""
+        """Return the message on one line, shortened because it can quote the content of a file."""
         text = " ".join(super().__str__().splitlines())
-        return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - END]} ... {text[-END:]}"
 
 
 class ScenarioError(IdentifyError):

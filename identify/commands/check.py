@@ -134,7 +134,7 @@ def _tell(
             "yes" if finding.ok else "NO",
             finding.check,
             "" if finding.limit is None else f"{finding.relation} {finding.limit:.3g}",
-            finding.text,
+            finding.whole,
         )
         for finding in findings
     ]
@@ -145,7 +145,7 @@ def _tell(
     }
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        said = "; ".join(f"{finding.check}: {finding.brief}" for finding in failed)
+        said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
         raise VerificationError(
             f"{len(failed)} of {len(findings)} findings about {about} fail: {said}"
         )

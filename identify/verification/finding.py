@@ -1,10 +1,7 @@
 """Result of one check of a robot or of a record."""
 
 from dataclasses import asdict, dataclass, field
-from textwrap import shorten
 from typing import Any
-
-LONGEST = 160  # largest number of characters of a finding in a message
 
 
 @dataclass(frozen=True)
@@ -14,7 +11,8 @@ class Finding:
     ``ok`` is false for a fault. ``value`` is None if it cannot be determined. ``limit`` is None if
     there is none. ``relation`` is that of a good value to its limit: a sign, or ``about`` for the
     middle of a range. ``leg`` is the number 1..n of the leg concerned, or None if no single leg is
-    concerned. ``text`` is a sentence.
+    concerned. ``text`` is a sentence. ``listed`` is further evidence, which tables and JSON show
+    after the text, and an error line does not.
     """
 
     check: str
@@ -24,15 +22,16 @@ class Finding:
     unit: str = field(default="1", kw_only=True)
     leg: int | None = field(default=None, kw_only=True)
     text: str
+    listed: str = field(default="", kw_only=True)
     relation: str = field(default="<=", kw_only=True)
 
     @property
-    def brief(self) -> str:
-        """The text, cut after LONGEST characters unless it holds a command as a remedy."""
-        if "cmmsim " in self.text:
-            return self.text
-        return shorten(self.text, LONGEST, placeholder=" …")
+    def whole(self) -> str:
+        """The text with all evidence."""
+        return f"{self.text}: {self.listed}" if self.listed else self.text
 
     def entry(self) -> dict[str, Any]:
         """Return the finding as a JSON entry."""
-        return asdict(self)
+        entry = asdict(self) | {"text": self.whole}
+        del entry["listed"]
+        return entry

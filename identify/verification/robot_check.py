@@ -101,7 +101,7 @@ def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
         return None
     more = f"; further faults: {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
     return (
-        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].brief}{more}; the run "
+        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].text}{more}; the run "
         f"begins nevertheless; cmmsim check {file} shows all findings"
     )
 
@@ -225,18 +225,25 @@ def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
     leg = None
     if inertias.changes:
         # The finding names the leg of the body with the largest effect of its correction.
-        worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
+        body = max(effects, key=effects.__getitem__)
+        worst = robot.layout.bodies.index(body)
         leg = next(
             (leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None
         )
         felt = (
-            f"accelerations change by up to {100 * largest:.2g} %"
+            f"accelerations change by up to {100 * largest:.2g} %, most by {body}"
             if largest > NEGLIGIBLE_CHANGE
             else "no motion changes"
         )
-        text = f"no rigid body has these; corrected, {felt}: {'; '.join(grouped(inertias.changes))}"
+        text = f"no rigid body has these; corrected, {felt}"
     yield Finding(
-        "inertias", largest <= NEGLIGIBLE_CHANGE, largest, text, limit=NEGLIGIBLE_CHANGE, leg=leg
+        "inertias",
+        largest <= NEGLIGIBLE_CHANGE,
+        largest,
+        text,
+        limit=NEGLIGIBLE_CHANGE,
+        leg=leg,
+        listed="; ".join(grouped(inertias.changes)),
     )
 
 

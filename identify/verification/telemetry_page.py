@@ -23,7 +23,7 @@ def findings_table(findings: Sequence[Finding]) -> Table:
             "-" if one.value is None else number(one.value),
             "-" if one.limit is None else number(one.limit),
             "" if one.unit == "1" else one.unit,
-            one.text,
+            one.whole,
         )
         for one in findings
     )

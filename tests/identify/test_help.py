@@ -10,9 +10,12 @@ import sys
 
 import pytest
 
+from cmmsim.errors import CmmError
 from dynamics import built_in_robots
+from dynamics.errors import DynamicsError
 from identify.commands.help import BEYOND_LIMIT, NOT_DONE, STATUSES
 from identify.commands.options import BUILT_IN, built_in_names, completion
+from identify.errors import IdentifyError
 from identify.scenario import scenario_names
 from identify.scenario.timing import sensor_names
 from identify.studies.study_file import STUDIES
@@ -127,3 +130,21 @@ def test_a_shell_is_offered_names(words, offered):
         start, env=os.environ | given, capture_output=True, text=True, check=False
     )
     assert made.stdout.split() == offered, made.stderr
+
+
+@pytest.mark.parametrize("kind", [IdentifyError, DynamicsError, CmmError])
+def test_an_error_that_quotes_much_keeps_its_remedy(kind):
+    said = str(kind(f"begins {'x' * 9000}; set plant.steps_per_frame = 9"))
+    assert said.startswith("begins ")
+    assert said.endswith("; set plant.steps_per_frame = 9")
+    assert len(said) < 5000
+
+
+def test_a_failed_check_is_told_with_its_remedy_and_without_its_lists(tmp_path, capfd, monkeypatch):
+    text = f"the loop is unstable {'a' * 300}: set kp = 3"
+    found = Finding("loop", False, None, text, listed="evidence")
+    monkeypatch.setattr("identify.verification.robot_check.check_robot", lambda *_: [found])
+    assert command("check", "rss6", "--quiet", "--json", tmp_path / "found.json") == BEYOND_LIMIT
+    assert one_line(capfd.readouterr().err).rstrip().endswith(": set kp = 3")
+    (entry,) = json.loads((tmp_path / "found.json").read_text())["findings"]
+    assert entry["text"] == f"{text}: evidence"
