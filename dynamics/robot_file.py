@@ -136,11 +136,24 @@ def robot_schema() -> dict[str, Any]:
 
 
 def _check_types(legs: Any) -> None:
-    """Raise ValueError for a leg of an unknown kind."""
+    """Raise ValueError for a leg of an unknown kind, or with a key in the plural."""
     for number, leg in enumerate(legs if isinstance(legs, list) else (), 1):
         if isinstance(leg, dict) and leg.get("type") not in KINDS:
             raise ValueError(
                 f"leg {number}: its type is {leg.get('type')!r}; valid: {', '.join(KINDS)}"
+            )
+        if isinstance(leg, dict):
+            _check_singular(leg, number)
+
+
+def _check_singular(leg: dict[str, Any], number: int) -> None:
+    """Raise ValueError for a key of one leg in the plural, which is for all legs."""
+    names = KINDS[leg["type"]].model_fields
+    for name in names:
+        if plural(name) in leg and plural(name) not in names:
+            raise ValueError(
+                f"leg {number}: {plural(name)} is a key of all legs, in the table [legs]; in a "
+                f"table [[legs]] of one leg it is {name}"
             )
 
 
@@ -152,7 +165,12 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
     fields = {plural(name): name for name in KINDS[family.kind].model_fields}
     legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
     for key, value in columns.items():
-        name = key if key in fields.values() else fields.get(key)
+        name = fields.get(key)
+        if name is None and key in fields.values():
+            raise ValueError(
+                f"legs: {key} is a key of one leg, in a table [[legs]]; in the table [legs] of all "
+                f"legs it is {plural(key)}"
+            )
         if name is None:
             raise ValueError(f"legs: unknown key {key}; valid: {', '.join(fields)}")
         vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
@@ -257,6 +275,7 @@ def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
         raise RobotFileError(f"unknown chart `{content.chart}`; valid: {', '.join(FREEDOMS)}")
+    _check_units(content)
     chart = Chart(content.chart, tuple(content.home_pose))
     forms = {"all": content.inertia} if isinstance(content.inertia, str) else content.inertia
     full = tuple(name for name, form in forms.items() if form == "full")
@@ -275,6 +294,41 @@ def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
         unstated=content.unstated,
         meshes=tuple(meshes),
     )
+
+
+# Largest ratio of a position of home, or of the travel of sliders, to the size of the robot, beyond
+# which it is likely in mm.
+MOST_SIZES = 50.0
+# Largest travel of joints that turn, and angle of home, rad. Larger ones are likely in degrees.
+MOST_TRAVEL = 4 * np.pi
+MOST_ANGLE = 2 * np.pi
+
+
+def _check_units(content: RobotFile) -> None:
+    """Raise RobotFileError for a home or a travel that is likely in mm or in degrees.
+
+    The size of the robot is the largest coordinate of a joint on base or platform.
+    """
+    size = max(np.abs([*leg.base_joint, *leg.platform_joint]).max() for leg in content.legs)
+    far = max(content.home_pose[:3], key=abs)
+    angle = max(content.home_pose[3:], key=abs)
+    travel = content.travel_limit
+    slides = content.legs[0].prismatic
+    inside = f"all joints on base and platform lie within {size:.3g} m of their frames"
+    if abs(far) > MOST_SIZES * size > 0:
+        found = f"home_pose has a position of {far:g} m, and {inside}", "mm", 1e-3 * far, "m"
+    elif abs(angle) > MOST_ANGLE:
+        found = f"home_pose has an angle of {angle:g} rad", "degrees", np.radians(angle), "rad"
+    elif slides and travel > MOST_SIZES * size > 0:
+        found = f"travel_limit is {travel:g} m, and {inside}", "mm", 1e-3 * travel, "m"
+    elif not slides and travel > MOST_TRAVEL:
+        turns = travel / (2 * np.pi)
+        text = f"travel_limit is {travel:g} rad, {turns:.3g} turns"
+        found = text, "degrees", np.radians(travel), "rad"
+    else:
+        return
+    text, other, value, unit = found
+    raise RobotFileError(f"{text}; if it is in {other}, it is {value:.6g} in {unit}")
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:

@@ -77,7 +77,7 @@ def _columns(legs: Sequence[Leg]) -> list[str]:
         meaning = type(legs[0]).model_fields[name].description
         lines += [f"# {meaning}"] if meaning else []
         if all(np.array_equal(value, column[0]) for value in column):
-            lines.append(f"{name} = {_value(column[0])}")
+            lines.append(f"{plural(name)} = {_value(column[0])}")
         elif isinstance(column[0], np.ndarray):
             rows = [f"    {_value(value)}," for value in column]
             lines += [f"{plural(name)} = [", *rows, "]"]

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 import dynamics
 from dynamics.errors import ChartError, RobotFileError
 from dynamics.geometry import RobotGeometry
-from dynamics.robot_file import robot_schema
+from dynamics.robot_file import RobotFile, parsed_robot, robot_schema
 from tests.dynamics.conftest import BOX, of_legs, place_legs
 
 
@@ -122,6 +122,26 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
             "unknown key colour; valid: name, family, chart, home_pose",
         ),
         (
+            "crank_axes = [",
+            "crank_axis = [",
+            "legs: crank_axis is a key of one leg, .* all legs it is crank_axes",
+        ),
+        (
+            "travel_limit = 0.9948",
+            "travel_limit = 57.0",
+            "travel_limit is 57 rad, 9.07 turns; if it is in degrees, it is 0.994838 in rad",
+        ),
+        (
+            "home_pose = [0.0, 0.0, 0.2,",
+            "home_pose = [0.0, 0.0, 200.0,",
+            "position of 200 m, .* within 0.33.* m of their frames; if it is in mm, it is 0.2 in m",
+        ),
+        (
+            "home_pose = [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]",
+            "home_pose = [0.0, 0.0, 0.2, 0.0, 0.0, -30.0]",
+            "an angle of -30 rad; if it is in degrees, it is -0.523599 in rad",
+        ),
+        (
             "crank_length = 0.06",
             "crank_lenght = 0.06",
             "legs: unknown key crank_lenght; valid: base_joints",
@@ -190,6 +210,16 @@ def test_robot_files_that_make_no_robot(load_changed, old, new, message):
     """
     with pytest.raises(RobotFileError, match=rf"robot file .*changed.toml.*{message}"):
         load_changed({old: new})
+
+
+def test_a_travel_of_sliders_in_mm_and_a_key_of_all_legs_in_one_are_named():
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    changed = text.replace("travel_limit = 0.06 ", "travel_limit = 60.0 ")
+    assert changed != text
+    with pytest.raises(RobotFileError, match=r"travel_limit is 60 m, .* in mm, it is 0.06 in m"):
+        parsed_robot(changed, "mine.toml")
+    with pytest.raises(ValueError, match=r"leg 1: crank_axes is a key of all legs, .* crank_axis"):
+        RobotFile.model_validate({"legs": [{"type": "rss", "crank_axes": [0, 0, 1]}]})
 
 
 @pytest.mark.slow
