@@ -32,6 +32,7 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.estimation.scale_anchor import measured_parameter
 from identify.files.dataset import POSE
 from identify.model.loop_model import LoopModel
+from identify.model.timed_model import TimedModel
 from identify.record.stored_common_errors import kind_of
 
 STEPS = np.repeat([1e-6, 1e-5], 3)
@@ -138,11 +139,20 @@ def gross_errors(problem: OutputErrorProblem, runs: Sequence[ClosedLoopRun]) -> 
         for frame in suspicious_frames(run.without_common(run.run_residuals(found)), run.ok)
     ][:MOST_FRAMES]
     return tuple(
-        _gross(number, frame, component) for number, frame in places for component in range(6)
+        _gross(number, frame, component, _time(problem.runs[number], frame))
+        for number, frame in places
+        for component in range(6)
     )
 
 
-def _gross(number: int, frame: int, component: int) -> Cause:
+def _time(run: LoopModel, frame: int) -> float:
+    """Return the time of a frame, s, by which the user finds its row in a log."""
+    if isinstance(run, TimedModel):
+        return float(run.times[frame])
+    return frame / run.settings.timing.frame_rate_hz
+
+
+def _gross(number: int, frame: int, component: int, time: float) -> Cause:
     def without(problem: OutputErrorProblem, size: float) -> OutputErrorProblem:
         runs = list(problem.runs)
         measured = runs[number].measured.copy()
@@ -162,7 +172,9 @@ def _gross(number: int, frame: int, component: int) -> Cause:
         group="gross errors",
         change=without,
         step=float(STEPS[component]),
-        remedy=lambda size: f"mark frame {frame}{which} as lost: measured_ok = 0",
+        remedy=lambda size: (
+            f"mark frame {frame}{which}, at t = {time:.7g} s, as lost: measured_ok = 0"
+        ),
         effect=OnPoses(changes),
         exact=True,
         alone=False,

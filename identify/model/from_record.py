@@ -61,7 +61,8 @@ def identified_model(record: xr.Dataset, side: ModelSide) -> LoopModel:
     check_channels(side.robot.geometry.chart, run.measured, run.logged, run.ok)
     # Torques cannot be compared with joint coordinates.
     joint_commands = None if run.settings.drives.torques else run.logged
-    check_plausible(side.robot, run.reference, run.measured, run.ok, joint_commands)
+    times = record["time"].values
+    check_plausible(side.robot, run.reference, run.measured, run.ok, joint_commands, times)
     return run
 
 
@@ -90,7 +91,9 @@ def _model(record: xr.Dataset, side: ModelSide) -> LoopModel:
         reference=recorded_reference(record),
         measured=poses(record, "measured"),
         ok=ok,
-        covariance=checked_covariance(record["measured_covariance"].values, ok),
+        covariance=checked_covariance(
+            record["measured_covariance"].values, ok, record["time"].values
+        ),
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_errors=load_errors,
@@ -130,8 +133,8 @@ def timed_model(record: xr.Dataset, side: ModelSide) -> TimedModel:
     check_channels(robot.geometry.chart, measured, logged, ok)
     within = (acting >= times[ok][0]) & (acting <= times[ok][-1])
     followed = interpolated(acting[within], times[ok], measured[ok])
-    check_timed_units(robot, measured[ok], followed, logged[within])
-    covariance = checked_covariance(record["measured_covariance"].values, ok)
+    check_timed_units(robot, measured[ok], times[ok], followed, logged[within], acting[within])
+    covariance = checked_covariance(record["measured_covariance"].values, ok, times)
     settings = _settings(side.settings, acting)
     load, load_errors = recorded_payload(record, robot.layout)
     run = TimedModel(

@@ -1,7 +1,8 @@
 """Checks that a record is suitable for an identification.
 
 A record must come from this robot and loop, be long enough, and contain motion. It must begin at
-rest and be in m and rad. Each check raises EstimationError with its finding. Frames count from 0.
+rest and be in m and rad. Each check raises EstimationError with its finding. A message names a row
+of the record by its time, because rows of a log can have been left out before.
 """
 
 from collections.abc import Callable, Sequence
@@ -74,8 +75,9 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
         worst = int(np.abs(steps - 1).argmax())
         raise EstimationError(
-            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {rate_hz:g} Hz "
-            "apart: frames are missing in the record; store lost frames with measured_ok = 0"
+            f"the frame at {moment(record['time'].values, worst)} is {steps[worst]:.3f} periods of "
+            f"{rate_hz:g} Hz before the next: frames are missing in the record; store lost frames "
+            "with measured_ok = 0"
         )
 
 
@@ -182,20 +184,21 @@ def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.
             )
 
 
-def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
+def checked_covariance(covariances: Array, ok: NDArray[np.bool_], times: Array) -> Array:
     """Return the mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,).
 
-    Raises EstimationError unless they are symmetric and the mean is positive definite.
+    times (N,): times of the frames, s, which messages name. Raises EstimationError unless they are
+    symmetric and the mean is positive definite.
     """
-    _check_symmetry(covariances[ok], np.flatnonzero(ok))
+    _check_symmetry(covariances[ok], times[ok])
     mean = covariances[ok].mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] <= 0:
         raise EstimationError("the record's mean measured_covariance is not positive definite")
     return np.asarray(mean, dtype=float)
 
 
-def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
-    """Check that the covariances (n, 6, 6) of these frames (n,) are symmetric.
+def _check_symmetry(covariances: Array, times: Array) -> None:
+    """Check that the covariances (n, 6, 6) of frames at times (n,) are symmetric.
 
     Later computations read only one triangle of each matrix.
     """
@@ -207,7 +210,7 @@ def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
     worst, row, column = np.unravel_index(int(np.argmax(excess > 0)), excess.shape)
     raise EstimationError(
         f"measured_covariance is not symmetric in {np.sum((excess > 0).any(axis=(1, 2)))} frames: "
-        f"in frame {frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is "
+        f"at {moment(times, worst)} its entry ({POSE[row]}, {POSE[column]}) is "
         f"{covariances[worst, row, column]:.6g} and ({POSE[column]}, {POSE[row]}) is "
         f"{covariances[worst, column, row]:.6g}"
     )
@@ -234,38 +237,53 @@ OTHER_UNITS = {
 
 
 def check_plausible(
-    robot: Robot, reference: Reference, measured: Array, ok: NDArray[np.bool_], logged: Array | None
+    robot: Robot,
+    reference: Reference,
+    measured: Array,
+    ok: NDArray[np.bool_],
+    logged: Array | None,
+    times: Array,
 ) -> None:
     """Refuse a record that does not begin at rest, or is in other units or frames than the robot.
 
     measured (N, 6): poses, NaN where lost. ok (N,): true for measured frames. logged (N, n): joint
-    commands, or None. Raises EstimationError with the frame, the finding, and the units in which
-    the record would fit, if there are any.
+    commands, or None. times (N,): times of the frames, s. Raises EstimationError with the time, the
+    finding, and the units in which the record would fit, if there are any.
     """
-    _check_reach(robot, reference.poses, "the reference")
+    _check_reach(robot, reference.poses, times, "the reference")
     _check_rest(reference)
-    _check_measured(reference, measured, ok)
+    _check_measured(reference, measured, ok, times)
     if logged is not None:
-        _check_commands(robot, reference.poses, logged, "the reference")
+        _check_commands(robot, reference.poses, logged, times, "the reference")
 
 
-def check_timed_units(robot: Robot, measured: Array, followed: Array, logged: Array) -> None:
+def check_timed_units(
+    robot: Robot, measured: Array, times: Array, followed: Array, logged: Array, acting: Array
+) -> None:
     """Refuse a record in other units or frames than the robot. The record has no reference.
 
-    measured (k, 6): measured poses without lost ones. followed (M, 6): measured poses at the times
-    of the commands logged (M, n). Raises EstimationError as `check_plausible` does.
+    measured (k, 6): measured poses at times (k,), s, without lost ones. followed (M, 6): measured
+    poses at the times acting (M,), s, of the commands logged (M, n). Raises EstimationError as
+    `check_plausible` does.
     """
-    _check_reach(robot, measured, "the measured motion")
-    _check_commands(robot, followed, logged, "the measured motion")
+    _check_reach(robot, measured, times, "the measured motion")
+    _check_commands(robot, followed, logged, acting, "the measured motion")
 
 
-def _check_reach(robot: Robot, poses: Array, what: str) -> None:
+def moment(times: Array, row: int | np.intp) -> str:
+    """Return the name of a row of a record by its time, s, which counts from the first pose."""
+    return f"t = {times[row]:.7g} s after the first pose"
+
+
+def _check_reach(robot: Robot, poses: Array, times: Array, what: str) -> None:
     def reached(one: Array) -> bool:
         return bool((robot.reach_margin(one) > 0).all())
 
     if not reached(poses):
+        # `~(...)` also finds margins of NaN.
+        row = int(np.argmax(~(robot.reach_margin(poses) > 0).all(axis=1)))
         try:
-            robot.check_reach(poses, what, "frame")
+            robot.check_reach(poses[row], f"{what} at {moment(times, row)},")
         except UnreachablePoseError as error:
             raise EstimationError(f"{error}{_unit_hint(poses, reached)}") from None
 
@@ -289,7 +307,9 @@ def _check_rest(reference: Reference) -> None:
         )
 
 
-def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]) -> None:
+def _check_measured(
+    reference: Reference, measured: Array, ok: NDArray[np.bool_], times: Array
+) -> None:
     """Check that the measured poses begin at the reference, and stay near it."""
     travel = np.repeat(np.ptp(reference.poses, axis=0).reshape(2, 3).max(axis=1), 3)
     # Without travel of the reference there is no scale to compare with.
@@ -310,14 +330,15 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
         worst = int(np.argmax(found[frame]))
         rest = "the record does not begin at rest, or " if frame == 0 else ""
         raise EstimationError(
-            f"in frame {frame} the measured {POSE[worst]} is {measured[frame, worst]:.6g} and the "
-            f"reference {reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of "
-            f"its travel apart: {rest}the two poses are in different coordinate frames or "
-            f"units{_unit_hint(measured, near)}"
+            f"at {moment(times, frame)} the measured {POSE[worst]} is "
+            f"{measured[frame, worst]:.6g} and the reference "
+            f"{reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of "
+            f"its travel apart: {rest}the two poses are in different coordinate frames or units"
+            f"{_unit_hint(measured, near)}"
         )
 
 
-def _check_commands(robot: Robot, poses: Array, logged: Array, what: str) -> None:
+def _check_commands(robot: Robot, poses: Array, logged: Array, times: Array, what: str) -> None:
     wanted = robot.inverse_kinematics(poses)
     travel = float(np.ptp(wanted, axis=0).max())
     allowed = max(TRAVELS * travel, BUILT * robot.geometry.travel_limit)
@@ -335,9 +356,10 @@ def _check_commands(robot: Robot, poses: Array, logged: Array, what: str) -> Non
         if follows(factor * logged):
             hint = f"; in {other} it would fit, and records are in {unit}"
         raise EstimationError(
-            f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and "
-            f"{what} needs {wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} "
-            f"{unit} away: zero, direction or unit of the joints differ from the robot file{hint}"
+            f"the command of joint {joint + 1} at {moment(times, frame)} is "
+            f"{logged[frame, joint]:.6g}, and {what} needs {wanted[frame, joint]:.6g} {unit}, "
+            f"more than {allowed:.3g} {unit} away: zero, direction or unit of the joints differ "
+            f"from the robot file{hint}"
         )
 
 

@@ -142,6 +142,11 @@ class PoseColumns(Log):
     ok: str | None = Field(
         None, description="column that is 1 where the pose was measured, and 0 where it was lost"
     )
+    lost: Literal["empty", "zeros", "repeated"] = Field(
+        "empty",
+        description="cells of a lost pose: empty or NaN; zeros; or repeated, those of the row "
+        "before. Empty cells always count as lost",
+    )
     covariance: list[str] | None = Field(
         None,
         description="columns of the covariance of the position and of small turns about fixed axes "

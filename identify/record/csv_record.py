@@ -17,6 +17,7 @@ from dynamics.files import read_bytes
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
+from identify.record.lost_frames import check_zeros
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
 # Rules for users' tables, which templates and the documentation show.
@@ -47,6 +48,9 @@ LARGEST = 200_000_000
 # These columns are not read. The column ok that `cmmsim measure` writes is read as measured_ok.
 BESIDE = ("pair", "stickers", "why", "common_")
 
+ZEROS_REMEDY = (
+    "leave their measured cells empty, or add a column measured_ok that is 0 there and 1 elsewhere"
+)
 UNITS = {name: "m" if name in POSE[:3] else "rad" for name in POSE}
 
 
@@ -120,6 +124,8 @@ class Table:
         time = self.groups["time"][:, 0] - start
         rows = Rows(str(self.path), self.lines)
         ok = self._measured_ok()
+        measured = self.groups["measured"]
+        check_zeros(measured[:, :3], measured[:, 3:], ok, rows, ZEROS_REMEDY)
         written = self.groups.get("command_time")
         # In all other rows, the last command was held.
         commands = np.flatnonzero(np.isfinite(self.groups["command"]).any(axis=1))
@@ -129,7 +135,7 @@ class Table:
                 "was held: the first row must hold one"
             )
         # Poses in rows that are marked as lost are ignored.
-        poses = np.where(ok[:, None], self.groups["measured"], np.nan)
+        poses = np.where(ok[:, None], measured, np.nan)
         return Telemetry(
             PoseLog(time, poses, ok, rows, self._covariances()),
             CommandLog(

@@ -23,6 +23,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.checks import begins_at_rest
 from identify.record.frame_times import GAP, frame_grid, likelier_times, mean_rate
+from identify.record.lost_frames import repeated_note
 from identify.record.recording import build_record
 from identify.record.smoothness import wrong_poses
 from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, ReferenceLog, Telemetry
@@ -35,6 +36,7 @@ OTHER_RATE = 0.05
 NAMED = 10  # largest number of gross errors whose times a note names
 # Attribute of a record with what was decided when its file was read, as a JSON list.
 NOTES = "notes"
+LOGGED_ROWS = "logged_rows"  # attribute of a record with the number of rows of poses in its log
 
 
 def record_of(
@@ -55,6 +57,7 @@ def record_of(
     wrong, notes = _gross(telemetry.poses, covariances)
     poses = replace(telemetry.poses, ok=ok & ~wrong, covariance=covariances)
     telemetry = replace(telemetry, poses=poses)
+    notes += repeated_note(poses)
     given: dict[str, Any] = {
         "robot": robot.name,
         "scenario_toml": scenario_toml,
@@ -90,6 +93,7 @@ def record_of(
             **given,
         )
         notes += [f"the commands drive the model: {why}", *more, *held]
+    record.attrs[LOGGED_ROWS] = len(ok)
     if notes:
         record.attrs[NOTES] = json.dumps(notes)
     return record

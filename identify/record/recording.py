@@ -285,7 +285,8 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
         if len(bad):
             which = "frames that count as measured" if name in MAY_BE_LOST else "frames"
             raise RecordError(
-                f"{source}: {name} is not finite in {len(bad)} {which}, first in frame {bad[0]}"
+                f"{source}: {name} is not finite in {len(bad)} {which}, first in frame {bad[0]} "
+                f"({record[name].dims[0]} = {record[record[name].dims[0]].values[bad[0]]:.7g} s)"
             )
     steps = np.diff(record["time"].values)
     if not (steps > 0).all():

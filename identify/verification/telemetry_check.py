@@ -18,6 +18,7 @@ from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
 from identify.record.frame_times import mean_rate
 from identify.record.from_telemetry import MOST_GROSS
+from identify.record.lost_frames import REPEATED_REMEDY
 from identify.record.suspicions import joint_motion
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
@@ -165,11 +166,12 @@ def _noise(logged: LoggedRun) -> Iterator[Finding]:
 def _frozen(logged: LoggedRun) -> Iterator[Finding]:
     same = (np.diff(logged.poses, axis=0) == 0).all(axis=1)
     first = f", the first at {logged.time[1:][same][0]:.4f} s" if same.any() else ""
+    remedy = f": {REPEATED_REMEDY}" if same.mean() > FROZEN else ""
     yield Finding(
         "frozen poses",
         bool(same.mean() <= FROZEN),
         float(same.mean()),
-        f"{same.sum()} poses equal the previous pose in all digits{first}",
+        f"{same.sum()} poses equal the previous pose in all digits{first}{remedy}",
         limit=FROZEN,
     )
 

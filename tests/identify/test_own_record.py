@@ -267,19 +267,19 @@ def moved(column, factor=1.0, shift=0.0):
         (lambda t: t.iloc[:20], "20 frames .0.333 s., at least 120 are needed"),
         (
             moved("measured_alpha", shift=0.02),
-            "in frame 0 the measured alpha is 0.0.* does not begin at rest",
+            "at t = 0 s after the first pose the measured alpha is 0.0.* does not begin at rest",
         ),
         (
             moved("measured_z", shift=0.1),
-            "in frame 0 the measured z is 0.3.* does not begin at rest, or the two poses are in",
+            "at t = 0 s after the first pose the measured z is 0.3.* does not begin at rest, or the two poses are in",
         ),
         (
             moved("command_", 180 / np.pi),
-            "command of joint . in frame .* in degrees it would fit, and records are in rad",
+            "command of joint . at t = .* s after the first pose is .* in degrees it would fit, and records are in rad",
         ),
         (
             moved("command_1", shift=2.0),
-            "command of joint 1 in frame .* zero, direction or unit of the joints differ",
+            "command of joint 1 at t = .* zero, direction or unit of the joints differ",
         ),
     ],
 )

@@ -94,7 +94,7 @@ def bodies_of(place: Place) -> Iterator[Body]:
     positions: dict[str, dict[str, str]] = {}
     turns: dict[str, dict[str, str]] = {}
     for name in place.header.names:
-        words = words_of(name)
+        words = _pose_words(name)
         if not words or has_word(name, OTHERWISE):
             continue
         last, before = words[-1].lower(), words[:-1]
@@ -110,14 +110,24 @@ def bodies_of(place: Place) -> Iterator[Body]:
             positions.setdefault(stem, {})[last[-1]] = name
         elif any(last in angles for angles in ANGLES) or re.fullmatch("[rm][0-3][0-3]", last):
             turns.setdefault(stem, {})[last] = name
-    if len(positions) == len(turns) == 1:
-        # There is one pose, even if only its position names the body, as in tcp_x and yaw.
-        turns = dict(zip(positions, turns.values(), strict=True))
+    alone = [stem for stem in positions if stem not in turns]
+    others = [stem for stem in turns if stem not in positions]
+    if len(alone) == len(others) == 1:
+        # They are one pose, even if only its position names the body, as in tcp_x and yaw.
+        turns[alone[0]] = turns.pop(others[0])
     for stem, three in positions.items():
         if len(three) == 3 and stem in turns:
             turned, convention = _turned(turns[stem])
             if turned:
                 yield Body(place, stem, tuple(three[one] for one in "xyz"), turned, convention)
+
+
+def _pose_words(name: str) -> list[str]:
+    """Return the words of a name, with a word for desired poses first: x_ref, xRef and ref_x."""
+    words = words_of(name)
+    parts = [part for word in words for part in re.findall("[A-Z]?[a-z0-9]+|[A-Z]+", word)]
+    wanted = [part for part in parts if part.lower() in WANTED]
+    return [*wanted, *(part for part in parts if part not in wanted)] if wanted else words
 
 
 def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
@@ -138,7 +148,7 @@ def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:
 
 def axes_of(angles: Sequence[str]) -> str:
     """Return the axes of three angles by their names, such as "zyx", or "" if they tell none."""
-    last = [(words_of(name) or [""])[-1].lower() for name in angles]
+    last = [(_pose_words(name) or [""])[-1].lower() for name in angles]
     for known in (*ANGLES, ("qx", "qy", "qz")):
         if set(last) == set(known):
             return "".join("xyz"[known.index(one)] for one in last)

@@ -29,6 +29,7 @@ from identify.record.columns import (
     PoseColumns,
 )
 from identify.record.csv_record import symmetric
+from identify.record.lost_frames import check_zeros, lost_rows
 from identify.record.readers.bags import Bag, is_bag
 from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
@@ -38,6 +39,7 @@ from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, T
 UNIT_LENGTH = 0.01
 # Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones may be degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
+ZEROS_REMEDY = 'lost = "zeros" in [columns.measured] takes them as lost'
 
 
 def open_log(path: Path) -> LoggedFile:
@@ -110,7 +112,7 @@ class _Reader:
             return None
         own = given if given.is_own else _shared(given, columns.measured)
         stream = self._stream(own, _pose_names(given), columns.holds_events)
-        poses, ok = _poses(stream, given)
+        poses, ok = _poses(stream, given, measured=False)
         if not ok.all():
             row = int(np.argmin(ok))
             raise RecordError(f"{stream.rows.place(row)}: the desired pose has an empty cell")
@@ -163,14 +165,18 @@ def _since(moments: Iterable[Decimal], start: Decimal) -> Array:
     return np.array([float(moment - start) for moment in moments])
 
 
-def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
+def _poses(
+    stream: Stream, log: PoseColumns, measured: bool = True
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured.
 
-    Other poses are NaN. Raises RecordError for an invalid mark or rotation, or if all are NaN.
+    Other poses are NaN. measured: False for desired poses, which are never lost. Raises RecordError
+    for an invalid mark or rotation, for zeros in place of lost poses, or if all are NaN.
     """
     position = np.stack([stream.numbers(name) for name in log.position], axis=1)
     orientation = np.stack([stream.numbers(name) for name in log.orientation], axis=1)
-    ok = np.asarray(np.isfinite(np.hstack([position, orientation])).all(axis=1))
+    cells = np.hstack([position, orientation])
+    ok = np.asarray(np.isfinite(cells).all(axis=1)) & ~lost_rows(log.lost, position, orientation)
     if log.ok is not None:
         stated = stream.numbers(log.ok)
         strange = np.flatnonzero(~np.isin(stated, (0, 1)))
@@ -180,6 +186,8 @@ def _poses(stream: Stream, log: PoseColumns) -> tuple[Array, NDArray[np.bool_]]:
                 f"{stream.rows.place(row)}: {log.ok} is {stated[row]:g}, must be 1 or 0"
             )
         ok &= stated == 1
+    if measured:
+        check_zeros(position, orientation, ok, stream.rows, ZEROS_REMEDY)
     poses = np.full((len(ok), 6), np.nan)
     if not ok.any():
         raise RecordError(f"{stream.rows.source}: no row has a whole pose")
@@ -350,9 +358,12 @@ def _joint_coordinates(stream: Stream, given: CommandColumns, robot: Robot) -> A
     missing = np.argwhere(~np.isfinite(cells))
     if len(missing):
         row, joint = missing[0]
+        count = int((~np.isfinite(cells)).any(axis=1).sum())
         raise RecordError(
             f"{stream.rows.place(int(row))}: the command {given.names[joint]} is empty or not "
-            "finite"
+            f"finite, as in {count} of {len(cells)} rows; if the last command was held there, "
+            "state the column of the times in [columns.command], too (time = ...): rows without a "
+            "command are then left out"
         )
     signs = np.ones(joints) if given.signs is None else np.array(given.signs, dtype=float)
     zeros = np.zeros(joints) if given.zeros is None else np.array(given.zeros)

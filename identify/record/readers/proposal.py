@@ -100,6 +100,13 @@ def propose(
     reference = [one for one in wanted if body is None or one.label != measured.label]
     if len(reference) == 1:
         _propose_body(made, "reference", reference[0], measured.place, robot)
+    else:
+        listed = ", ".join(one.label for one in reference)
+        made.lines += [
+            "",
+            "# [columns.reference] has the keys of [columns.measured], for desired poses;",
+            f"# in this log {f'are several: {listed}' if listed else 'none is found'}",
+        ]
     return made
 
 

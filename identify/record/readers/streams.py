@@ -47,7 +47,7 @@ class Stream:
         """Return the rows in which at least one of these columns is not empty."""
         columns = [self.columns[name] for name in names]
         cells = zip(*columns, strict=True)
-        return [row for row, some in enumerate(cells) if any(c not in (None, "") for c in some)]
+        return [row for row, some in enumerate(cells) if not all(_is_empty(c) for c in some)]
 
     def kept(self, rows: Sequence[int]) -> "Stream":
         """Return the stream with only these rows."""
@@ -102,6 +102,13 @@ class Stream:
                 ) from None
             found.append(moment * factor)
         return found
+
+
+def _is_empty(cell: Cell) -> bool:
+    """Return whether a cell is empty. Some programs write NaN into empty cells."""
+    if isinstance(cell, str):
+        return not cell or cell.lower() == "nan"
+    return cell is None or cell != cell
 
 
 def _comma_hint(cell: Cell) -> str:
