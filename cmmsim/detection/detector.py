@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from cmmsim.allowed_plugins import DETECTORS, find
 from cmmsim.checks import finite_array, require_kind
+from cmmsim.detection.own_centres import likely_fault
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
@@ -127,8 +129,14 @@ def find_detector(name: str) -> Detector:
     return find("detector", name, DETECTORS, Detector, _check_centres)
 
 
+_WARNED: set[str] = set()  # detectors of users of which a warning was issued in this process
+
+
 def _check_centres(part: str, found: object, spots: SpotWindows) -> None:
-    """Raise CmmError if the result of a user's detector has a wrong type, shape or value."""
+    """Raise CmmError if the result of a user's detector has a wrong type, shape or value.
+
+    Warns of a constant offset of the centres.
+    """
     require_kind(found, DetectedCentres, f"{part} must return DetectedCentres")
     count = len(spots.windows)
     for name, shape in (("centres", (count, 2)), ("covariances", (count, 2, 2))):
@@ -136,3 +144,17 @@ def _check_centres(part: str, found: object, spots: SpotWindows) -> None:
     good = np.asarray(getattr(found, "good"))  # noqa: B009
     if good.dtype != bool or good.shape != (count,):
         raise CmmError(f"{part} must return good ({count},) of bool, got {good.dtype} {good.shape}")
+    centres = np.asarray(found.centres)[good]  # type: ignore[attr-defined]
+    fault, certain = likely_fault(spots.windows[good], spots.corners[good], centres)
+    if fault and not certain and part not in _WARNED:
+        _WARNED.add(part)
+        warnings.warn(
+            f"{part}: {fault} from the bright spots in their windows; (0, 0) is the middle of the "
+            "first pixel of the whole image",
+            stacklevel=2,
+        )
+    if certain:
+        raise CmmError(
+            f"{part} must return centres (x, y) in px of the whole image, but those of "
+            f"{len(centres)} windows are far from the bright spots in them: {fault}"
+        )

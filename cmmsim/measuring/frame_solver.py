@@ -137,7 +137,19 @@ class SolvedFrames:
         if verdict[FIRST] >= 0:
             row = self.starts[frame] + int(verdict[FIRST])
             first = str(self.body.sticker_ids[self.stickers.index[row] % len(self.places)])
-        return lost_reason(verdict, first, self.places[self.of(frame).index])
+        reason = lost_reason(verdict, first, self.places[self.of(frame).index])
+        seen = int(self.starts[frame + 1] - self.starts[frame])
+        detected = self.stickers.detected
+        if seen >= FEWEST or detected is None or self.stickers.searched is None:
+            return reason
+        found = int(detected[frame])
+        apart = ""
+        if found > seen:
+            apart = f"; in {found - seen} of these the rays miss each other by more than is stated"
+        return (
+            f"{reason}: of {self.stickers.searched[frame]} that were searched, the detector found "
+            f"{found} in both images{apart}"
+        )
 
 
 def solve_frames(

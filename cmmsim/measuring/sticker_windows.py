@@ -72,6 +72,7 @@ class StickerObservation:
     outlines                   ellipses of the stickers; None if the detector states no ellipses
     searched                   (f,), number of stickers that were searched in each of f exposures;
                                None if all were found
+    detected                   (f,), number of these that the detector found in both images, or None
     spreads                    (k, 2, 2, 2), covariances of the pixels in both images, px²; None if
                                only the points are known
     shifts                     (f, 2), standard deviation, px, of a shift that all centres in an
@@ -89,13 +90,14 @@ class StickerObservation:
     rays: Array
     outlines: Outlines | None = None
     searched: NDArray[np.int_] | None = None
+    detected: NDArray[np.int_] | None = None
     spreads: Array | None = None
     shifts: Array | None = None
     frame_ends: Array | None = None
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """Return the observation with only some of its stickers."""
-        frames = ("searched", "shifts", "frame_ends")
+        frames = ("searched", "detected", "shifts", "frame_ends")
         kept = {
             name: values[keep]
             for name, values in vars(self).items()
@@ -140,9 +142,8 @@ class StickerWindows:
         if len(self.index) == 0:
             none = np.zeros((0, 3))
             pixels = none[:, :2]
-            each = none[:, 0]
             return StickerObservation(
-                self.index, pixels, pixels, none, np.zeros((0, 3, 3)), each, each
+                self.index, pixels, pixels, none, np.zeros((0, 3, 3)), none[:, 0], none[:, 0]
             )
         settings = self.observer.settings
         fits = self.found or self.centres()
@@ -178,6 +179,7 @@ class StickerWindows:
         )
         exposures = len(self.camera_from_body.reshape(-1, 4, 4))
         searched = np.bincount(self.exposures, minlength=exposures)
+        detected = np.bincount(self.exposures[good], minlength=exposures)
         good &= seen.ray_gap < settings.largest_ray_gap
         ends = None
         if frame_ends is not None:
@@ -185,6 +187,7 @@ class StickerWindows:
         return replace(
             found,
             searched=searched,
+            detected=detected,
             spreads=spread.swapaxes(0, 1),
             shifts=shifts,
             frame_ends=ends,

@@ -29,4 +29,4 @@ def find_centres(given):
     return DetectedCentres(np.stack([x, y], axis=1) + given.corners, covariances, good)
 
 
-find_centres.bias_px = 0.012  # its error without noise, which the covariance does not contain
+find_centres.bias_px = 0.026  # its error without noise, which the covariance does not contain
