@@ -40,6 +40,8 @@ ESTIMATOR_SECTIONS = ("identification", "model", "filter")
 # Settings in these sections on which the record depends. The record includes what its scale anchor
 # measured.
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
+# Entries outside of [timing] that come from the sensor file where the scenario does not state them.
+FROM_SENSOR = ("sensor_note", "renderer")
 
 
 class Scenario(Section):
@@ -59,9 +61,9 @@ class Scenario(Section):
     )
     renderer: str = Field(
         "auto",
-        description="renderer of the images; pyrender; analytic; scene; auto, which is pyrender if "
-        "OpenGL works; module:function; or statistical, which has no images and draws errors of "
-        "sticker centres",
+        description="renderer of the images, by default that of the sensor file; pyrender; "
+        "analytic; scene; auto, which is pyrender if OpenGL works; module:function; or "
+        "statistical, which has no images and draws errors of sticker centres",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     rig: Rig = Rig()
@@ -129,19 +131,19 @@ class Scenario(Section):
                 )
 
     def _complete_from_the_sensor(self) -> None:
-        """Fill in, from the sensor, the timing and the note that the scenario does not state."""
-        whole = (
-            self.timing.model_fields_set.issuperset(IN_FILE)
-            and "sensor_note" in self.model_fields_set
+        """Fill in, from the sensor, what the scenario does not state: timing, note and renderer."""
+        whole = self.timing.model_fields_set.issuperset(IN_FILE) and (
+            self.model_fields_set.issuperset(FROM_SENSOR)
         )
         if whole and not self.sensor_changes:
             return
-        timing, note = completed(self.timing, self.sensor, self.sensor_changes)
+        timing, others = completed(self.timing, self.sensor, self.sensor_changes)
         # Bypass the frozen model, so that these values do not count as set: with another sensor,
         # they come from that sensor.
         self.__dict__["timing"] = timing
-        if "sensor_note" not in self.model_fields_set:
-            self.__dict__["sensor_note"] = note
+        for name, value in zip(FROM_SENSOR, others, strict=True):
+            if name not in self.model_fields_set:
+                self.__dict__[name] = value
 
     def _check_filter(self) -> None:
         nyquist = self.timing.frame_rate_hz / 2

@@ -127,8 +127,10 @@ class Timing(Section):
             )
 
 
-def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[Timing, str]:
-    """Return a timing completed from a sensor, and the note of the sensor's file.
+def completed(
+    stated: Timing, sensor: str, changes: Mapping[str, Any]
+) -> tuple[Timing, tuple[str, str]]:
+    """Return a timing completed from a sensor, and the note and the renderer of the sensor file.
 
     Values from the sensor do not count as set. With another sensor, they come from that sensor.
 
@@ -156,7 +158,8 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
     except ValidationError as error:
         raise ValueError(f"timing of the sensor {sensor!r}: {one_line(error, Timing)}") from error
     # The values are validated already. Only the scenario's own count as set.
-    return Timing.model_construct(_fields_set=set(own), **whole.model_dump()), file.note
+    timing = Timing.model_construct(_fields_set=set(own), **whole.model_dump())
+    return timing, (file.note, file.renderer)
 
 
 def sensor_names() -> list[str]:

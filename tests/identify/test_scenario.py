@@ -385,6 +385,16 @@ def test_resolved_scenario_with_changes_reads_back_equal_and_its_timing_follows_
         changed.with_overrides({"timing.frame_rate_hz": 60.0})
 
 
+def test_the_renderer_of_a_sensor_file_is_used_unless_the_scenario_states_another(tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text('name = "mine"\nbased_on = "ctrack780"\nrenderer = "analytic"\n')
+    scenario = load_scenario("quick", sensor=str(mine))
+    assert scenario.renderer == Setup(scenario).sensor_plan.renderer == "analytic"
+    assert scenario.with_overrides({"renderer": "statistical"}).renderer == "statistical"
+    assert scenario.with_overrides({"sensor": "ctrack780"}).renderer == "auto"
+    assert scenario_from_toml(scenario.to_toml()) == scenario
+
+
 DRIVEN = {"identification.method": "command_driven"}
 
 
