@@ -7,16 +7,27 @@ by the name of their test, so that table and file do not depend on the order of 
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from identify.accuracy import saved
-from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure, percent, test_name
+from identify.accuracy.figure import (
+    CONFIDENCE,
+    PROPERTY,
+    AccuracyError,
+    Figure,
+    percent,
+    test_name,
+    with_unit,
+)
 
 Row = tuple[str, ...]
 UNDECIDED = "undecided"
+# Largest number of values, as a multiple of the present one, that a remedy asks for.
+MOST_TIMES = 100
 FOLDER = ".accuracy"  # folder of the saved figures
 HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit", "margin")
 
@@ -50,12 +61,29 @@ def terminal_table(
     lines = [_aligned(header, widths)]
     for (test, _), group_rows in zip(tests, rows, strict=True):
         lines += [test, *(_aligned(row, widths) for row in group_rows)]
-    if any(figure.undecided for figure in figures):
-        lines.append(
-            f"{UNDECIDED}: passed, because the interval contains the limit; accuracy.sample_until "
-            "draws more values until it is decided"
+    return lines + [_open_question(figure) for figure in figures if figure.undecided]
+
+
+def _open_question(figure: Figure) -> str:
+    """Return a line on an undecided figure, with how many values would decide it."""
+    assert figure.interval is not None
+    assert figure.limit is not None
+    low, high = figure.interval
+    distance = abs(figure.limit - figure.value)
+    # The width of an interval falls with the square root of the number of values.
+    needed = figure.count * ((high - low) / 2 / distance) ** 2 if distance else inf
+    remedy = "so near to the mean, no number of values decides it: state another limit"
+    if needed < MOST_TIMES * figure.count:
+        remedy = (
+            f"about {float(f'{needed:.1e}'):.0f} values or fewer decide it if the mean stays: "
+            "accuracy.sample_until draws them, up to its argument most"
         )
-    return lines
+    interval = with_unit(f"{low:.4g} .. {high:.4g}", figure.unit)
+    return (
+        f"{UNDECIDED}: {figure.name}: the test passed, because the interval {interval} of "
+        f"{figure.count} values contains the limit {with_unit(f'{figure.limit:.4g}', figure.unit)}"
+        f"; {remedy}"
+    )
 
 
 def markdown_table(figures: Sequence[Figure]) -> str:

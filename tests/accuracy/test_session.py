@@ -101,8 +101,12 @@ def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
     assert ends["wide"] == "-9900% undecided"
     assert ends["few seen"] == "-11% undecided"
     assert not [name for name in ("good", "seen", "open", "value") if "undecided" in ends[name]]
+    # By Student's 12.706: 2 (12.706 100 / 198)^2 and 2 (12.706 0.05 / 0.1)^2 values.
     done.stdout.fnmatch_lines(
-        ["undecided: passed, because the interval contains the limit; accuracy.sample_until draws*"]
+        [
+            "undecided: wide: *-1071 .. 1471 of 2 values contains the limit 2; about 82 values or fewer*",
+            "undecided: few seen: *; about 81 values or fewer decide it*sample_until*",
+        ]
     )
 
 

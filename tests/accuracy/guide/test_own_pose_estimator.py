@@ -37,7 +37,9 @@ class BlobEstimator:
             self.find(frame.right, self.expected[1]),
         )
         seen = np.isfinite(left + right).all(axis=1)
-        points = cv2.triangulatePoints(*self.rig.projection_matrices, left[seen].T, right[seen].T)
+        # Triangulation is for lenses without distortion.
+        ideal = self.rig.left.undistort(left[seen])[0], self.rig.right.undistort(right[seen])[0]
+        points = cv2.triangulatePoints(*self.rig.projection_matrices, ideal[0].T, ideal[1].T)
         points, places = (points[:3] / points[3]).T, self.taught.platform_places[seen]
         turn, _ = Rotation.align_vectors(points - points.mean(axis=0), places - places.mean(axis=0))
         camera_from_platform = np.eye(4)
