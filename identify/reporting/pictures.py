@@ -220,12 +220,12 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
         return {}
     bars = (
         f"RMS of the {unseen(data.result).what} on each validation trajectory: bars against the "
-        "truth; diamonds as predicted from the stated uncertainty; dashes against the measurement, "
+        "truth; diamonds as expected from the stated uncertainty; dashes against the measurement, "
         "including its noise."
     )
     text = (
         FIT.format("first validation trajectory")
-        + " Thick: the truth minus the identified model; dotted: its predicted range."
+        + " Thick: the truth minus the identified model; dotted: its expected range."
     )
     return {
         "validation_errors": Picture(lambda: fit.validation_figure(data.result), bars),

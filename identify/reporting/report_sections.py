@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
 from identify.arrays import Array
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE
+from identify.record.from_telemetry import LOGGED_ROWS
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
@@ -59,14 +62,10 @@ def sensor_section(data: RunData) -> Section:
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
     # The result of a real robot has no entry `sensor`, because no truth is known.
     if "sensor" not in data.result:
-        rate_hz = data.scenario.timing.frame_rate_hz
-        due = frames_due(data.experiment["time"].values, rate_hz)
-        said.append(
-            f"The record as it was used has {int(ok.sum())} measured poses at {rate_hz:g} Hz, and "
-            f"{due - int(ok.sum())} frames without a pose: lost, missing in the log, or left out "
-            "when it was read. The truth is not known: the uncertainties below are those that the "
-            "sensor states."
-        )
+        said += [
+            _counted(data.experiment, ok, data.scenario.timing.frame_rate_hz),
+            "The truth is not known: the uncertainties below are those that the sensor states.",
+        ]
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_consistent:
         common_errors = data.result["identification"].get("nuisances")
@@ -90,6 +89,20 @@ def sensor_section(data: RunData) -> Section:
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
+
+
+def _counted(record: xr.Dataset, ok: NDArray[np.bool_], rate_hz: float) -> str:
+    """Return the numbers of rows and poses of a record of one's own. ok (N,): measured rows."""
+    rows = int(record.attrs.get(LOGGED_ROWS, len(ok)))
+    missing = frames_due(record["time"].values, rate_hz) - len(ok)
+    parts = [f"The log has {rows} rows for poses: {int(ok.sum())} with a pose that is used"]
+    if len(ok) > ok.sum():
+        parts.append(f"{len(ok) - int(ok.sum())} whose pose was lost, or left out as a gross error")
+    if rows > len(ok):
+        parts.append(f"{rows - len(ok)} that are left out, before two commands act or in a gap")
+    said = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
+    gaps = f" Beside them, {missing} frames of {rate_hz:g} Hz are missing in the log."
+    return f"{said}.{gaps if missing else ''}"
 
 
 def frames_due(time: Array, rate_hz: float) -> int:
@@ -167,10 +180,16 @@ def validation_section(data: RunData) -> Section:
 def provenance_section(data: RunData) -> Section:
     """List the scenario, versions and times that are needed to repeat the run."""
     designed = "reference_position" in data.experiment
-    changed = tables.settings_table(data.result, data.scenario_toml, designed)
+    # A built-in scenario is no standard for a record of one's own.
+    own = data.truth is None
+    changed = (
+        tables.estimator_table(data.result, data.scenario_toml)
+        if own
+        else tables.settings_table(data.result, data.scenario_toml, designed)
+    )
     made = f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}."
     text = [made, "Every picture is also in the folder figures, as PDF for print and as PNG."]
-    if not changed.rows:
+    if not (changed.rows or own):
         text.append(
             f"No setting differs from those of the built-in scenario: {changed.title.split()[-1]}."
         )

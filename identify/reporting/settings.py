@@ -8,6 +8,8 @@ from identify.scenario import load_scenario, scenario_names
 
 # Built-in scenario of the paper, with which scenarios without a built-in name are compared.
 BUILT_IN_PAPER = "paper"
+# Words in the meaning of a setting that was changed after the record was made.
+SET_ANEW = "when the record was made"
 
 
 class Setting(NamedTuple):
@@ -39,7 +41,7 @@ def changed_settings(
     for key, value in (estimator or {}).items():
         before = ours.get(key) or _Stated(None, theirs[key].meaning if key in theirs else "")
         if value != before.value:
-            when = f"when the record was made: {_shown(before.value)}"
+            when = f"{SET_ANEW}: {_shown(before.value)}"
             ours[key] = _Stated(value, f"{before.meaning}; {when}" if before.meaning else when)
     absent = _Stated(None, "")
     changed = []

@@ -19,7 +19,7 @@ from identify.reporting import paper
 from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals, explanation_goals, unseen
 from identify.reporting.number_format import number, with_deviation
-from identify.reporting.settings import changed_settings
+from identify.reporting.settings import SET_ANEW, changed_settings
 
 AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
@@ -110,8 +110,8 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
             what = "all stages, teaching and compiling included"
             rows.append(("whole run", f"{number(total)} s", "", "", what))
         else:
-            what = f"{', '.join(stages)}; compiling included"
-            rows.append(("stages so far", f"{number(sum(stages.values()))} s", "", "", what))
+            total = f"{number(sum(stages.values()))} s"
+            rows.append((f"time of {', '.join(stages)}", total, "", "", "compiling included"))
     return rows
 
 
@@ -217,27 +217,27 @@ def validation_table(result: dict[str, Any], repeats_paper: bool = False) -> Tab
 
 
 def prediction_table(result: dict[str, Any]) -> Table:
-    """Compare the predicted with the actual deviation of the true robot from the predicted poses.
+    """Compare the expected with the actual deviation of the true robot from the predicted poses.
 
     There are two rows for each validation trajectory.
     """
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         predicted = run.get("predicted", {})
-        rows.append((f"{n}: predicted", *map(number, predicted_row(run)), ""))
+        rows.append((f"{n}: expected", *map(number, predicted_row(run)), ""))
         # Without a prediction, the deviation is that from the identified model.
         actual = rms_row(predicted if "position_rms_um" in predicted else run["true"])
         rows.append(
             (f"{n}: actual", *_rms(actual), number(predicted.get("normalised_squared_error")))
         )
     return Table(
-        "Predicted and actual distance of the true robot from the predicted poses, RMS",
-        ("run", *AXIS_HEADER, "actual²/predicted²"),
+        "Expected and actual distance of the true robot from the predicted poses, RMS",
+        ("run", *AXIS_HEADER, "actual²/expected²"),
         tuple(rows),
         "Poses are predicted by the identified model and the estimated errors common to all "
-        "frames. The predicted distance follows from the uncertainty of both, and from the noise "
+        "frames. The expected distance follows from the uncertainty of both, and from the noise "
         "of the cameras, which moves the robot through the servo. The last column is the squared "
-        "error relative to the prediction: one on average if the prediction is right. All runs "
+        "error relative to its expectation: one on average if the uncertainty is right. All runs "
         "have the same estimated parameters, so their errors are not independent. If cameras and "
         "taught frames count as exact, their errors, which move the whole robot, are not included.",
         folded=True,
@@ -259,6 +259,13 @@ def seconds_table(result: dict[str, Any]) -> Table:
     """Return the time of each stage."""
     rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
     return Table("Time of the stages", ("stage", "seconds"), rows, folded=True)
+
+
+def estimator_table(result: dict[str, Any], recorded: str) -> Table:
+    """Return the settings of the estimator that differ from the recorded scenario (TOML)."""
+    _, changed = changed_settings(recorded, result.get("settings"))
+    rows = tuple((one.key, one.value, one.meaning) for one in changed if SET_ANEW in one.meaning)
+    return Table("What was set anew for the identification", ("key", "value", "meaning"), rows)
 
 
 def settings_table(result: dict[str, Any], recorded: str, designed: bool = True) -> Table:

@@ -85,6 +85,7 @@ def check_loop(
         if rate > 0
         else "no higher frame rate makes the loop stable"
     )
+    text += f"; the scenario runs at {timing.frame_rate_hz:g} Hz (timing.frame_rate_hz)"
     yield Finding(
         "frame rate",
         rate < timing.frame_rate_hz,

@@ -220,7 +220,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
     )
     said = (
         "8 of 8 goals are met",
-        "stages so far",
+        "time of identify",
         "Not identified, 1 of 5: no motion",
         "it ended because tolerance",
     )
@@ -694,7 +694,7 @@ def test_speed_stands_beside_the_goals_and_no_machine_misses_one(result):
     }
     frames, whole = tables.goals_table(result).rows[-2:]
     assert frames[:4] == ("processed stereo frames", "0.5 1/s", "", "")
-    assert whole == ("stages so far", "3020 s", "", "", "record, identify; compiling included")
+    assert whole == ("time of record, identify", "3020 s", "", "", "compiling included")
     assert all(goal.passed for goal in check_goals(result))
     result["seconds"]["total"] = 3500.0
     assert tables.goals_table(result).rows[-1][:2] == ("whole run", "3500 s")

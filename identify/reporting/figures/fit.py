@@ -37,11 +37,11 @@ from identify.reporting.goals import (
 )
 from identify.reporting.number_format import number
 
-# Half width of the predicted band around an error of zero, in standard deviations. It contains 95 %
+# Half width of the expected band around an error of zero, in standard deviations. It contains 95 %
 # of the true errors.
 BAND = 2.0
 
-BAND_NAME = f"predicted ± {BAND:g} standard deviations"
+BAND_NAME = f"expected ± {BAND:g} standard deviations"
 
 # Smallest number of measured poses to draw of a longer run. The errors below have every frame.
 MARKS = 40
@@ -307,7 +307,7 @@ def validation_figure(result: dict[str, Any]) -> Figure:
                 "D",
                 color=INK,
                 fillstyle="none",
-                label="predicted" if labelled else None,
+                label="expected" if labelled else None,
             )
         axes.axhline(
             limits[goal],
