@@ -20,7 +20,7 @@ from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
-# Standard deviations at which the noise distribution is cut off.
+# Number of standard deviations at which the noise distribution is cut off.
 REACH = 6.0
 # Largest number of table entries per grey value. Stronger noise needs fewer.
 TABLE_STEPS = 64
@@ -36,16 +36,16 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
     variance, slope = _analog_variance(mean_grey, noise)
     deviation = np.sqrt(variance)
     reach = int(np.ceil(REACH * deviation.max())) + 1
-    numbers = np.rint(mean_grey)[..., None] + np.arange(-reach, reach + 1)
+    values = np.rint(mean_grey)[..., None] + np.arange(-reach, reach + 1)
     low = np.where(
-        numbers <= 0, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None]
+        values <= 0, -np.inf, (values - 0.5 - mean_grey[..., None]) / deviation[..., None]
     )
     high = np.where(
-        numbers >= noise.white_level,
+        values >= noise.white_level,
         np.inf,
-        (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None],
+        (values + 0.5 - mean_grey[..., None]) / deviation[..., None],
     )
-    possible = (numbers >= 0) & (numbers <= noise.white_level)
+    possible = (values >= 0) & (values <= noise.white_level)
     # in the upper half, the probability is a difference of upper tails, because a difference of
     # numbers close to one would lose all digits
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
@@ -63,10 +63,11 @@ def cramer_rao_bound(
     noise: CameraNoise,
     psf_px: float = 0.0,
 ) -> Array:
-    """Return the smallest covariance (n, 2, 2) px² of an unbiased centre in windows of ``size`` px.
+    """Return the smallest covariances (n, 2, 2) px² of unbiased estimates of n ellipse centres.
 
-    Contrast and ground are grey values. ``centres``, ``shapes``, ``size`` and ``psf_px`` are the
-    parameters of ``disc_image.coverage``. Raises CmmError for a camera without noise.
+    Each ellipse has its own window. Contrast and ground are grey values. ``centres``, ``shapes``,
+    ``size`` and ``psf_px`` are the parameters of ``disc_image.coverage``. Raises CmmError for a
+    camera without noise.
     """
     shares, derivatives = coverage(centres, shapes, size, psf_px)
     information = np.interp(
@@ -79,14 +80,14 @@ def cramer_rao_bound(
     try:
         return np.linalg.inv(fisher)[:, :2, :2]
     except np.linalg.LinAlgError:
-        # A disc of hardly a pixel leaves a part of its shape undetermined.
+        # The image of a disc of hardly a pixel does not determine its whole shape.
         return np.linalg.pinv(fisher, rcond=1e-13, hermitian=True)[:, :2, :2]
 
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
-    """Return mean grey values from ``lowest`` to ``highest``, and the information at each.
+    """Return mean grey values at equal steps, and the information averaged over one grey value.
 
-    The information is averaged over one grey value.
+    The means reach from one grey value below ``lowest`` to at least one above ``highest``.
     """
     least_noise = float(
         np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min())
@@ -103,7 +104,10 @@ def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tup
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
-    """Return the noise variance before rounding, and its derivative with respect to the mean."""
+    """Return the noise variance before rounding, and its derivative with respect to the mean.
+
+    Raises CmmError for a camera without noise.
+    """
     variance = noise.variance(mean_grey) - 1.0 / (12.0 * noise.frames)
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
@@ -116,7 +120,8 @@ def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array
 def _rise(limit: Array, slope: Array, variance: Array) -> Array:
     """Return the standard deviation times the derivative of -ndtr(limit) with respect to the mean.
 
-    The mean changes both the position and the width of the noise distribution.
+    ``limit`` is a distance from the mean in standard deviations. The mean changes both the position
+    and the width of the noise distribution.
     """
     finite = np.where(np.isfinite(limit), limit, 0.0)
     density = np.where(np.isfinite(limit), np.exp(-0.5 * finite**2) / np.sqrt(2.0 * np.pi), 0.0)

@@ -24,7 +24,7 @@ class FitLimits:
     """Limits for accepting the content of a window as one whole sticker.
 
     ``smallest_contrast`` is in grey values. ``largest_misfit`` is the limit of the reduced
-    chi-square if the noise is at least one grey value.
+    chi-square, which ``ellipse_fit.largest_misfits`` raises for weak noise.
     """
 
     smallest_contrast: float = 40.0
@@ -36,7 +36,7 @@ class DetectedCentres:
     """Ellipse centres in n windows.
 
     centres            (n, 2), px of the whole image
-    covariances        (n, 2, 2), effect of pixel noise on the centres to first order, px²
+    covariances        (n, 2, 2), effect of pixel noise on the centres, to first order, px²
     good               (n,), True if a window contains one whole bright spot; the values of other
                        windows are finite but meaningless
     shapes             (n, 2, 2), symmetric matrices A of the ellipses, px; optional
@@ -105,11 +105,11 @@ Detect = Callable[[SpotWindows], DetectedCentres]
 class Detector:
     """Detector of sticker centres.
 
-    ``bias_px`` is the rms error of a centre in sharp noise-free images of stickers of 3.8 px radius
-    that are tilted by 45 degrees, as in the built-in sensors. The error varies with the position
-    within a pixel, so it acts like additional noise. The covariances of ``detect`` do not include
-    it. ``margin_px`` is the width on each side by which windows must be larger than those of the
-    maximum-likelihood fit.
+    ``bias_px`` is the rms error of a centre per axis in sharp noise-free images of stickers of 3.8
+    px radius that are tilted by 45 degrees, as in the built-in sensors. The error varies with the
+    position within a pixel, so it acts like additional noise. The covariances of ``detect`` do not
+    include it. ``margin_px`` is the width on each side by which windows must be larger than those
+    of the maximum-likelihood fit.
     """
 
     name: str
@@ -124,7 +124,7 @@ def find_detector(name: str) -> Detector:
 
     ``module:name`` names a Detector, or a ``Detect`` function with optional attributes ``bias_px``
     and ``margin_px``. Raises UnknownOptionError with the valid names, and CmmError if
-    ``module:name`` cannot be imported or called.
+    ``module:name`` is not allowed to run, or cannot be imported or called.
     """
     return find("detector", name, DETECTORS, Detector, _check_centres)
 
@@ -132,19 +132,19 @@ def find_detector(name: str) -> Detector:
 _WARNED: set[str] = set()  # detectors of users of which a warning was issued in this process
 
 
-def _check_centres(part: str, found: object, spots: SpotWindows) -> None:
+def _check_centres(part: str, result: object, spots: SpotWindows) -> None:
     """Raise CmmError if the result of a user's detector has a wrong type, shape or value.
 
     Warns of a constant offset of the centres.
     """
-    require_kind(found, DetectedCentres, f"{part} must return DetectedCentres")
+    require_kind(result, DetectedCentres, f"{part} must return DetectedCentres")
     count = len(spots.windows)
     for name, shape in (("centres", (count, 2)), ("covariances", (count, 2, 2))):
-        finite_array(getattr(found, name), shape, f"{part} must return finite {name} {shape}")
-    good = np.asarray(getattr(found, "good"))  # noqa: B009
+        finite_array(getattr(result, name), shape, f"{part} must return finite {name} {shape}")
+    good = np.asarray(getattr(result, "good"))  # noqa: B009
     if good.dtype != bool or good.shape != (count,):
         raise CmmError(f"{part} must return good ({count},) of bool, got {good.dtype} {good.shape}")
-    centres = np.asarray(found.centres)[good]  # type: ignore[attr-defined]
+    centres = np.asarray(result.centres)[good]  # type: ignore[attr-defined]
     fault, certain = likely_fault(spots.windows[good], spots.corners[good], centres)
     if fault and not certain and part not in _WARNED:
         _WARNED.add(part)

@@ -13,8 +13,8 @@ over lines of k (k' u + c²) = 0. The noise of a pixel changes the gradients aro
 implicit function theorem, applied to the normal equations, gives the effect on the centre.
 
 If the rim comes near the edge of the window, lines are missing, and the centre is wrong by up to a
-tenth of a pixel. Such a window is not good. EDGE_PX is the smallest distance of the rim from the
-edge.
+tenth of a pixel. A window is therefore good only if the distance of the rim from the edge is at
+least EDGE_PX plus the standard deviation of the point spread.
 
 Gradients of a sharp edge are not exact. In noise-free images of stickers tilted by 45 degrees, the
 error of the centre is about 0.004 px rms at radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. The
@@ -32,18 +32,18 @@ from cmmsim.geometry.pose import Array
 SLOPE = (-0.5, 0.0, 0.5)
 # Smoothing perpendicular to the slope (Scharr): the most isotropic kernel of this size.
 SMOOTHING = (0.1875, 0.625, 0.1875)
-# Smallest distance from the rim to the side of the window, px. Gradients extend 1.5 px from a sharp
+# Smallest distance from a sharp rim to the edge of the window, px. Gradients extend 1.5 px from the
 # rim, and the outermost pixels have no gradient.
 EDGE_PX = 2
-# Reciprocal condition below which the lines do not determine an ellipse.
+# Reciprocal condition number below which the lines do not determine an ellipse.
 SMALLEST_CONDITION = 1e-9
 
 
 def detect_by_dual_conic(spot_windows: SpotWindows) -> DetectedCentres:
     """Return centres by the dual conic operator.
 
-    The point spread only increases the required distance from the window's edge. Smears are
-    ignored.
+    The point spread only increases the required distance of the rim from the window's edge. Smears
+    are ignored.
     """
     if len(spot_windows.windows) == 0:
         return no_centres()
@@ -79,9 +79,9 @@ DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 class _EdgeLines:
     """Lines (a, b, c), each (n, h, h), relative to the centroids and in units of ``unit_px`` (n,).
 
-    ``x`` and ``y`` are the coordinates of the pixels. ``scale`` (n, h, h) is the inverse contrast
-    for lines that count, and 0 for others. A line counts if its pixel lies within the dark ring and
-    has all its neighbours in the window.
+    ``x`` (n, 1, h) and ``y`` (n, h, 1) are the coordinates of the pixels. ``scale`` (n, h, h) is
+    the inverse contrast for lines that count, and 0 for others. A line counts if its pixel lies on
+    the spot or its dark ring, and if all neighbours of the pixel are in the window.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class _EdgeLines:
 
 
 def _edge_lines(spots: BrightSpots) -> _EdgeLines:
-    """Return lines from the gradients of the grey values, which are divided by the contrast."""
+    """Return lines from the gradients of the grey values, divided by the contrast."""
     radius = 2.0 * np.sqrt(np.maximum(0.5 * np.trace(spots.spreads, axis1=1, axis2=2), 0.25))
     ticks = np.arange(spots.windows.shape[1], dtype=float)
     x = (ticks - spots.centroids[:, :1])[:, None, :] / radius[:, None, None]
@@ -114,9 +114,9 @@ def _edge_lines(spots: BrightSpots) -> _EdgeLines:
 def _filtered(
     values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False
 ) -> Array:
-    """Return the correlation of (n, h, h) with a separable kernel, or its adjoint.
+    """Return the correlation of values (n, h, h) with a separable kernel, or its adjoint.
 
-    Values outside the window are zero.
+    Values outside of the windows are taken as zero.
     """
     direction = -1 if adjoint else 1
     across = ndimage.correlate1d(values, along_x[::direction], axis=2, mode="constant")
@@ -134,12 +134,12 @@ def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Arra
     rows = np.linalg.inv(normal)[:, 3:]  # the rows of D and E
     residual = np.einsum("ni,inyx->nyx", dual, basis) + c * c
     total = np.zeros((len(a), 2, *a.shape[1:]))
-    for by_line, c_by, kernels in (
+    for basis_by, c_by, kernels in (
         (np.stack([2.0 * a, b, zero, c - a * x, -b * x]), -x, (SLOPE, SMOOTHING)),
         (np.stack([zero, a, 2.0 * b, -a * y, c - b * y]), -y, (SMOOTHING, SLOPE)),
     ):
-        residual_by = np.einsum("ni,inyx->nyx", dual, by_line) + 2.0 * c * c_by
-        change = -np.einsum("nki,inyx->nkyx", rows, by_line * residual + basis * residual_by)
+        residual_by = np.einsum("ni,inyx->nyx", dual, basis_by) + 2.0 * c * c_by
+        change = -np.einsum("nki,inyx->nkyx", rows, basis_by * residual + basis * residual_by)
         for k in range(2):
             total[:, k] += _filtered(change[:, k] * lines.scale, *kernels, adjoint=True)
     return 0.5 * lines.unit_px[:, None, None, None] * total

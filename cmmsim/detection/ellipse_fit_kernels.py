@@ -27,14 +27,14 @@ from cmmsim.geometry.rim_kernels import cover_window
 class FitSettings(NamedTuple):
     """Settings of a fit.
 
-    ring_reach      pixels within this number of radii of the ellipse are fitted
-    smallest        smallest radius, px
+    ring_reach      factor by which the start ellipse is enlarged; the pixels inside are fitted
+    smallest        smallest semi-axis, px
     largest_step    (9,), largest step of each parameter
     iterations      largest number of steps
-    converged       length below which a step ends the fit, px
+    converged       a fit ends after a step that changes centre and shape by less than this, px
     psf_px          standard deviation of the point spread, or 0
-    smear_step      distance between the positions over which the light of a moving ellipse is
-                    summed, px
+    smear_step      largest distance between the positions over which the light of a moving ellipse
+                    is summed, px
     variances       table of noise variances by mean grey value
     first_grey      grey value at which the table begins
     entries_a_grey  number of table entries per grey value
@@ -69,9 +69,9 @@ def accumulate(
     """Fill the lower triangle of the normal matrix (7, 7), and the right-hand side (7,).
 
     Return the weighted sum of squared residuals. All pixels outside the ellipse have the same mean,
-    and so have all pixels inside. Only the sums of their residuals are needed.
+    and so have all pixels inside. Therefore only sums over their residuals are needed.
     """
-    # for each pixel on the rim: derivatives for the parameters, the residual, and the weight
+    # for each pixel on the rim: the derivatives of its mean, the residual, and the weight
     rows = np.empty((window.size, UNKNOWNS + 2))
     count = 0
     misfit = 0.0
@@ -159,7 +159,7 @@ def add_products(rows: Array, normal: Array, right: Array) -> None:
 
 @compiled
 def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int:
-    """Mark the pixels within ``reach`` radii of the ellipse; return their number."""
+    """Fill the mask (h, w) of pixels in the ellipse enlarged by ``reach``; return their number."""
     m = inverse_shape(shape)
     count = 0
     for row in range(mask.shape[0]):
@@ -175,10 +175,10 @@ def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int
 
 @compiled
 def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
-    """Add a step within its limits to the parameters, and return the largest change, px.
+    """Add a step, limited to ``largest_step``, to the parameters.
 
-    The returned change is that of the centre or shape, before the centre is limited to the window
-    and the radii are limited to their range.
+    The centre is then limited to the window, and the semi-axes to their range. Return the largest
+    change of a parameter of centre or shape, px, before these limits.
     """
     moved = 0.0
     for k in range(len(parameters)):
@@ -278,11 +278,10 @@ def fit_window(
     """Fit one ellipse by Gauss-Newton steps; return the reduced chi-square.
 
     ``parameters`` contain the start values and are replaced by the result. They are seven, or nine
-    if light that rises across the sticker is fitted too. The fit ends when the ellipse moves by
-    less than ``converged`` px. The normal matrix and the misfit are those from before this last
-    step. Fills the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m
-    parameters. ``light`` (7,) is filled with what ``light_across`` finds, or zero for nine
-    parameters.
+    if light that rises across the sticker is fitted too. The ellipse moves by ``smear`` (2,) px
+    during the exposure. The normal matrix and the misfit are those from before the last step. Fills
+    the ellipse's ``shape`` (2, 2) and the ``covariance`` (m, m) of its first m parameters.
+    ``light`` (7,) is filled by ``light_across`` for seven parameters, and with zeros for nine.
     """
     unknowns = len(parameters)
     size = len(window)
@@ -342,10 +341,10 @@ def fit_windows(
 ) -> None:
     """Fit the part of ``size`` px around the bright spot of each window (n, h, h) of floats.
 
-    The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of these
-    parts within their windows, the misfits (n,) and the ``lights`` (n, 7). Also fills the
-    parameters (n, 7) or (n, 9), the shapes (n, 2, 2) and the covariances (n, m, m) of the first m
-    parameters, relative to these corners.
+    The spots move by ``smears`` (n, 2) px during the exposure. Fills the corners (n, 2) of the
+    parts within their windows, the parameters (n, 7) or (n, 9), the shapes (n, 2, 2), the
+    covariances (n, m, m) of the first m parameters, the misfits (n,) and the ``lights`` (n, 7). The
+    centres among the parameters are relative to the corners.
     """
     for k in range(len(windows)):
         spot = moments(windows[k])

@@ -20,9 +20,9 @@ from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 
-# Threshold for the centroid, as a share of the contrast.
+# Threshold for the centroid, as a fraction of the contrast.
 THRESHOLD = 0.1
-# Threshold that separates the spot from its surroundings, as a share of the contrast.
+# Threshold that separates the spot from its surroundings, as a fraction of the contrast.
 CORE_THRESHOLD = 0.4
 
 
@@ -34,7 +34,7 @@ class BrightSpots:
     corners    (n, 2), pixels of the whole image at which the windows begin
     contrast   (n,), grey values
     weights    (n, h, h), weights of the pixels in the centroid
-    within     (n, h, h), True for pixels that count
+    within     (n, h, h), True for the pixels of the spot and its dark ring
     centroids  (n, 2), relative to the window, px
     spreads    (n, 2, 2), second moments of the spot's core, px²
     """
@@ -48,19 +48,19 @@ class BrightSpots:
     spreads: Array
 
 
-def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
+def detect_by_centroid(spot_windows: SpotWindows) -> DetectedCentres:
     """Return grey centroids; the point spread and smears are ignored."""
-    if len(given.windows) == 0:
+    if len(spot_windows.windows) == 0:
         return no_centres()
-    spots = bright_spots(given)
-    x, y = _offsets(spots.centroids, given.fit_size)
+    spots = bright_spots(spot_windows)
+    x, y = _offsets(spots.centroids, spot_windows.fit_size)
     # a pixel's weight has the derivative 1 above the threshold, and 0 below
     influence = (spots.weights > 0.0) / _total(spots.weights)[:, None, None]
     jacobian = np.stack([x * influence, y * influence], axis=1)
-    variance = given.noise.variance(spots.windows)
+    variance = spot_windows.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
-    good = (spots.contrast >= given.limits.smallest_contrast) & whole_inside(
-        spots.centroids, spots.spreads, given.fit_size
+    good = (spots.contrast >= spot_windows.limits.smallest_contrast) & whole_inside(
+        spots.centroids, spots.spreads, spot_windows.fit_size
     )
     return DetectedCentres(spots.centroids + spots.corners, covariances, good)
 
@@ -68,10 +68,10 @@ def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
 GREY_CENTROID = Detector("grey_centroid", detect_by_centroid, 0.009)
 
 
-def bright_spots(given: SpotWindows) -> BrightSpots:
+def bright_spots(spot_windows: SpotWindows) -> BrightSpots:
     """Find the bright spot of each window, and cut out the part of ``fit_size`` px around it."""
-    values = given.windows.astype(float)
-    size = given.fit_size
+    values = spot_windows.windows.astype(float)
+    size = spot_windows.fit_size
     rough = _centroids(_weights(values, CORE_THRESHOLD)[0])
     first = np.clip(np.rint(rough - 0.5 * (size - 1)).astype(int), 0, values.shape[1] - size)
     ticks = np.arange(size)
@@ -84,7 +84,7 @@ def bright_spots(given: SpotWindows) -> BrightSpots:
     within = _within_ring(middles, spreads, size)
     weights = _weights(parts, THRESHOLD)[0] * within
     return BrightSpots(
-        parts, given.corners + first, contrast, weights, within, _centroids(weights), spreads
+        parts, spot_windows.corners + first, contrast, weights, within, _centroids(weights), spreads
     )
 
 
@@ -119,7 +119,7 @@ def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:
 
 
 def _total(weights: Array) -> Array:
-    """Return the sums (n,) of weights (n, h, h), which are never zero."""
+    """Return the sums (n,) of weights (n, h, h), or a tiny number where the sum is zero."""
     return np.maximum(weights.sum(axis=(1, 2)), 1e-9)
 
 
@@ -149,7 +149,7 @@ def _within_ring(centroids: Array, spreads: Array, size: int) -> NDArray[np.bool
     A disc of radius r has the second moment r² / 4.
     """
     x, y = _offsets(centroids, size)
-    # a flat window has no spread, but must have an inverse
+    # the spread of a uniform window is zero, and would have no inverse
     inverse = np.linalg.inv(spreads + 1e-3 * np.eye(2))[..., None, None]
     reach = inverse[:, 0, 0] * x * x + 2.0 * inverse[:, 0, 1] * x * y + inverse[:, 1, 1] * y * y
     return np.asarray(reach < 4.0 * RING_REACH**2)

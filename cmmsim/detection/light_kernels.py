@@ -1,10 +1,11 @@
 """Compiled kernels for stickers that are brighter on one side than on the other.
 
-Light that rises across a sticker multiplies all that the sticker sends to the camera by
-1 + g_x x + g_y y, where x and y are counted from a fixed place in the window, px. Where a blurred
+Light that rises across a sticker multiplies the light of the sticker and its ring by
+1 + g_x x + g_y y, where x and y are distances from a fixed point in the window, px. Where a blurred
 rim crosses a pixel, the mean place of the light that reaches the pixel is not the middle of the
-pixel. By Stein's identity, the share s of a pixel times that mean place is s x - v ds/dx, where v
-is the variance of the point spread and of the pixel together.
+pixel. Let s be the share of light in a pixel at x, and c_x the x coordinate of the centre of the
+ellipse. By Stein's identity, s times the mean place is then s x - v ds/dc_x. Point spread and pixel
+together are taken as a Gaussian with the variance v.
 """
 
 from __future__ import annotations
@@ -21,15 +22,18 @@ if TYPE_CHECKING:
 
 EVEN_UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 LIT_UNKNOWNS = 9  # the same, then g_x and g_y
-PIXEL_VARIANCE = 1.0 / 12.0
+PIXEL_VARIANCE = 1.0 / 12.0  # of a uniform distribution over one pixel, px²
 
 
 @compiled
 def variance_at(mean: float, settings: FitSettings) -> float:
-    """Return the noise variance of a mean grey value, interpolated linearly in the table."""
-    place = (mean - settings.first_grey) * settings.entries_a_grey
-    k = min(max(int(place), 0), len(settings.variances) - 2)
-    return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
+    """Return the noise variance of a mean grey value, interpolated linearly in the table.
+
+    Beyond the ends of the table, it is extrapolated.
+    """
+    entry = (mean - settings.first_grey) * settings.entries_a_grey
+    k = min(max(int(entry), 0), len(settings.variances) - 2)
+    return settings.variances[k] + (entry - k) * (settings.variances[k + 1] - settings.variances[k])
 
 
 @compiled
@@ -37,10 +41,10 @@ def accumulate_lit(
     window: Array, mask: Array, shares: Array, derivatives: Array, parameters: Array, start: Array,
     settings: FitSettings, normal: Array, right: Array,
 ) -> float:  # fmt: skip
-    """Fill the normal matrix (9, 9) and the right-hand side (9,) for light that rises.
+    """Fill the lower triangle of the normal matrix (9, 9), and the right-hand side (9,).
 
-    ``start`` (2,) is the place from which x and y are counted. Return the weighted sum of squared
-    residuals.
+    Return the weighted sum of squared residuals. ``start`` (2,) px is the fixed point in the
+    window, at which the light does not change.
     """
     variance = settings.psf_px * settings.psf_px + PIXEL_VARIANCE
     contrast = parameters[5]
@@ -83,13 +87,11 @@ def light_across(
     window: Array, mask: Array, shares: Array, derivatives: Array, parameters: Array,
     settings: FitSettings, lower: Array, step: Array, light: Array,
 ) -> None:  # fmt: skip
-    """Fill the shift of the centre if rising light were fitted too, and what tells of more blur.
+    """Fill the entries (7,) of ``EllipseFits.lights`` for one window.
 
-    ``light`` (7,) are first the shift x, y and the entries xx, xy, yy of its covariance, px and
-    px². They are exact to first order in the slope of the light. The last two are the right-hand
-    side and the information of half the variance, px², by which the image is blurred more than the
-    model. ``parameters`` (7,) are those of the last normal matrix, whose factor is ``lower``, and
-    ``step`` (7,) is the step that follows from it.
+    The first five are exact to first order in the slope of the light. They are zero if the pixels
+    do not determine the slope. ``parameters`` (7,) are those of the last normal matrix, whose
+    Cholesky factor is ``lower``. ``step`` (7,) is the step that follows from this matrix.
     """
     variance = settings.psf_px * settings.psf_px + PIXEL_VARIANCE
     contrast = parameters[5]
@@ -171,7 +173,8 @@ def light_across(
     g_y = spread_xy * right_x + spread_yy * right_y
     light[0] = -taken[0, 0] * g_x - taken[1, 0] * g_y
     light[1] = -taken[0, 1] * g_x - taken[1, 1] * g_y
-    # The covariance of the shift is T' S T, with the taken parts T of the centre.
+    # The shift is -T' g. T is the part of ``taken`` for slope and centre, and g is the slope. With
+    # the covariance S of g, the covariance of the shift is T' S T.
     for k in range(3):
         a = 0 if k < 2 else 1
         b = 0 if k < 1 else 1

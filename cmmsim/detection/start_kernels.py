@@ -1,4 +1,7 @@
-"""Compiled kernels for the start values of a fit, from ranks and moments of the grey values."""
+"""Compiled kernels for the start values of a fit, from ranks and moments of the grey values.
+
+A further kernel isolates the dots of a calibration board.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,12 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# A pixel above this fraction of the contrast belongs to the bright spot.
+# A pixel brighter than the ground plus this fraction of the contrast belongs to the bright spot.
 CORE_THRESHOLD = 0.4
+# Smallest semi-axis with which a fit starts.
 SMALLEST_START_PX = 1.2
 # Number of histogram bins: one per grey value of 8-bit images.
-RANK_STEPS = 256
+RANK_BINS = 256
 
 
 @compiled
@@ -57,7 +61,7 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
     """Return the values of a window (h, w) with the ranks ``low_rank`` and ``high_rank`` (from 0).
 
     All values must be finite. A histogram with equal bins finds the two bins that contain the
-    results, and only the values in these bins are sorted.
+    results, and only the values in these bins are compared with each other.
     """
     width = window.shape[1]
     smallest = window[0, 0]
@@ -69,23 +73,23 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
             largest = value if value > largest else largest
     if smallest == largest:
         return smallest, largest
-    scale = (RANK_STEPS - 1) / (largest - smallest)
-    counts = np.zeros(RANK_STEPS, np.int32)
-    steps = np.empty(window.shape, np.int32)
+    scale = (RANK_BINS - 1) / (largest - smallest)
+    counts = np.zeros(RANK_BINS, np.int32)
+    bins = np.empty(window.shape, np.int32)
     for row in range(window.shape[0]):
         for column in range(width):
-            steps[row, column] = int((window[row, column] - smallest) * scale)
-            counts[steps[row, column]] += 1
-    low, low_before = step_of_rank(counts, low_rank)
-    high, high_before = step_of_rank(counts, high_rank)
+            bins[row, column] = int((window[row, column] - smallest) * scale)
+            counts[bins[row, column]] += 1
+    low, low_before = bin_of_rank(counts, low_rank)
+    high, high_before = bin_of_rank(counts, high_rank)
     candidates = np.empty((2, window.size + 1))
     count = np.zeros(2, np.int64)
     for row in range(window.shape[0]):
         # to avoid a branch, every value is stored, and the index advances only for a candidate
         for column in range(width):
             candidates[0, count[0]] = candidates[1, count[1]] = window[row, column]
-            count[0] += steps[row, column] == low
-            count[1] += steps[row, column] == high
+            count[0] += bins[row, column] == low
+            count[1] += bins[row, column] == high
     return (
         nth_smallest(candidates[0, : count[0]], low_rank - low_before),
         nth_smallest(candidates[1, : count[1]], high_rank - high_before),
@@ -93,19 +97,23 @@ def two_of_rank(window: Array, low_rank: int, high_rank: int) -> tuple:
 
 
 @compiled
-def step_of_rank(counts: Array, rank: int) -> tuple:
+def bin_of_rank(counts: Array, rank: int) -> tuple:
     """Return the bin that contains the value of a rank, and the number of values in lower bins."""
-    step = 0
+    index = 0
     before = 0
-    while before + counts[step] <= rank:
-        before += counts[step]
-        step += 1
-    return step, before
+    while before + counts[index] <= rank:
+        before += counts[index]
+        index += 1
+    return index, before
 
 
 @compiled
 def moments(window: Array) -> tuple:
-    """Return ground, contrast, centroid x, y and second moments xx, xy, yy of a bright spot."""
+    """Return ground, contrast, centroid x, y and second moments xx, xy, yy of a bright spot.
+
+    Ground and contrast are grey values. The centroid, px, is relative to the first pixel of the
+    window. The second moments, px², are about the centroid.
+    """
     # Ranks are less sensitive to single noisy pixels than the smallest and largest value.
     ground, bright = two_of_rank(window, window.size // 3, window.size - 6)
     contrast = max(bright - ground, 1.0)
@@ -154,7 +162,7 @@ def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) 
 
 @compiled
 def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
-    """Fill the start parameters (7,) from the ``moments`` of a window of ``size`` px.
+    """Fill the first seven parameters from the ``moments`` of a window of ``size`` px.
 
     A uniform ellipse with the matrix A has the second moments A A / 4.
     """
@@ -178,13 +186,13 @@ def isolate_dots(
 ) -> None:
     """Set the pixels of windows (n, h, w) beyond ``reach`` dot radii to the ground.
 
-    The ground is the median of the pixels from ``ground_from`` to ``reach`` dot radii, or 0 if
-    there are none. Centres (n, 2) are relative to the window, px. ``inverses`` (n, 2, 2) map
-    offsets from the centre in px to dot radii.
+    The ground of a window is the median of its pixels from ``ground_from`` to ``reach`` dot radii,
+    or 0 if there are none. Centres (n, 2) are relative to the window, px. ``inverses`` (n, 2, 2)
+    map offsets from the centre in px to dot radii.
     """
     _, height, width = windows.shape
     distances = np.empty((height, width))
-    around = np.empty(height * width)
+    ring = np.empty(height * width)
     for n in range(len(windows)):
         count = 0
         m = inverses[n]
@@ -197,13 +205,13 @@ def isolate_dots(
                 )
                 distances[row, column] = distance
                 if ground_from < distance <= reach:
-                    around[count] = windows[n, row, column]
+                    ring[count] = windows[n, row, column]
                     count += 1
         ground = 0.0
         if count:
-            ground = nth_smallest(around[:count], count // 2)
+            ground = nth_smallest(ring[:count], count // 2)
             if count % 2 == 0:
-                ground = 0.5 * (ground + nth_smallest(around[:count], count // 2 - 1))
+                ground = 0.5 * (ground + nth_smallest(ring[:count], count // 2 - 1))
         for row in range(height):
             for column in range(width):
                 if distances[row, column] > reach:

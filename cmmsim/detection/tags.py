@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from cmmsim.errors import UnknownOptionError
 from cmmsim.geometry.pose import Array
 
-# OpenCV's constants of its dictionaries, by their names without the prefix.
+# OpenCV's constants of its dictionaries, by their names in capitals without the prefix.
 DICTIONARIES: dict[str, int] = {
     name.removeprefix("DICT_").upper(): getattr(cv2.aruco, name)
     for name in dir(cv2.aruco)
@@ -36,10 +36,10 @@ def tag_dictionary(name: str) -> cv2.aruco.Dictionary:
 def find_tags(
     grey: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, refinement: str
 ) -> dict[int, Array]:
-    """Return the corners (4, 2) px of the tags that OpenCV finds, by their numbers.
+    """Return the corners (4, 2) px of the tags that OpenCV finds in an image, by their numbers.
 
-    The corners go round clockwise, beginning at the tag's own first corner. OpenCV's parameters
-    have their defaults, except for ``refinement``, a key of REFINEMENTS.
+    The corners go round clockwise, beginning at the top left corner of the upright tag. OpenCV's
+    parameters have their defaults, except for ``refinement``, a key of REFINEMENTS.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = REFINEMENTS[refinement]

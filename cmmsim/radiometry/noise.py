@@ -15,8 +15,8 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
 BIT_DEPTHS = (8, 10, 12, 14, 16)
-# Number of terms of the series in rounding_excess. Without noise, the series is 1/6, and the terms
-# that are left out add up to 0.002.
+# Number of terms of the series in rounding_excess. Without noise, the sum of the series is 1/6, and
+# the terms that are left out add up to 0.002.
 ROUNDING_TERMS = 50
 # Variance, grey values squared, above which rounding_excess is 1 to within 1e-11.
 NO_SWING = 1.5
@@ -83,7 +83,8 @@ class CameraNoise:
     dark_noise          temporal noise in the dark, e- rms
     full_well           saturation capacity, e-
     black_level         grey value without light
-    enabled             False for no noise; grey values are rounded nevertheless
+    enabled             False for no noise and no fixed pattern; the grey values of an exposure are
+                        rounded nevertheless
     bit_depth           bits of a grey value, one of BIT_DEPTHS; above 8, images are uint16
     prnu                standard deviation of the pixels' sensitivities, relative to their mean
     dsnu                standard deviation of the pixels' offsets, e-
@@ -133,10 +134,10 @@ class CameraNoise:
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Return the variance of a grey value with a given mean, in images with bright stickers.
+        """Return the variances of grey values with the given means.
 
-        Shot noise, dark noise, fixed pattern and rounding contribute to it, but clipping does not.
-        See ``bright`` for such images.
+        Shot noise, dark noise, fixed pattern and rounding contribute to them, but clipping does
+        not. The grey values are those that ``bright`` returns.
         """
         if self.inverted:
             mean_grey = self.white_level - mean_grey
@@ -158,8 +159,8 @@ class CameraNoise:
 
         The values are those of a single exposure. The ratio is nearly 1 if the noise is at least
         one grey value, and up to 3 with less noise. With little noise, the variance of rounded
-        values depends on the mean. It is largest half-way between two integers, because the noise
-        then decides between rounding up and down.
+        values depends on their mean before rounding. It is largest half-way between two integers,
+        because the noise then decides between rounding up and down.
 
         At such a mean, the Fourier series of the rounding error gives the variance of a rounded
         normal variable with the variance s²: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1
@@ -209,7 +210,7 @@ class CameraNoise:
         from cmmsim.radiometry.noise_kernels import expose_pixels
 
         grey = np.empty(radiance.shape, dtype=self.image_type)
-        expose_pixels(*self._lit(radiance, rng, pattern), grey.ravel())
+        expose_pixels(*self._kernel_arguments(radiance, rng, pattern), grey.ravel())
         return grey
 
     def mean_of_exposures(
@@ -236,28 +237,28 @@ class CameraNoise:
         from cmmsim.radiometry.noise_kernels import average_pixels
 
         mean = np.empty(radiance.shape)
-        average_pixels(*self._lit(radiance, rng, pattern), frames, mean.ravel())
+        average_pixels(*self._kernel_arguments(radiance, rng, pattern), frames, mean.ravel())
         return mean
 
-    def _lit(
+    def _kernel_arguments(
         self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
     ) -> tuple[Singles, Singles, Singles, Singles, Singles]:
-        """Return the arguments of the kernels: light, random numbers, parameters and pattern.
+        """Return the arguments of the kernels: radiance, random numbers, parameters and pattern.
 
         The random numbers are standard normal, one per pixel.
         """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
         empty = np.empty(0, dtype=np.float32)
-        differing = (
+        pattern_values = (
             (empty, empty)
             if pattern is None
             else (pattern.sensitivity.ravel(), pattern.offset.ravel())
         )
-        return radiance.ravel(), normal.ravel(), self._kernel_parameters, *differing
+        return radiance.ravel(), normal.ravel(), self._kernel_parameters, *pattern_values
 
     @property
     def _kernel_parameters(self) -> NDArray[np.float32]:
-        """Parameters (6,) for the kernels, see ``noise_kernels.expose_pixels``."""
+        """Parameters (6,) for the kernels; see ``noise_kernels.expose_pixels``."""
         return np.array(
             [
                 self.electrons_at_white,

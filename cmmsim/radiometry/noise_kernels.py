@@ -1,4 +1,4 @@
-"""Compiled functions that draw grey values of one exposure and means of many, see ``noise``."""
+"""Compiled kernels that draw grey values of one exposure, and means of many; see ``noise``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 from cmmsim.compilation import Array, compiled
 
-# Normal noise is neglected beyond this number of standard deviations. It has a probability of 2e-9.
+# Normal noise beyond this number of standard deviations is neglected. Its probability is 2e-9.
 REACH = 6.0
 # From this standard deviation on, in grey values, rounding is taken to add 1/12 to the variance and
-# nothing to the mean; the mean's error is below 1e-9.
+# nothing to the mean. The error of the mean is then below 1e-9.
 SMOOTH_DEVIATION = 1.0
 SQRT_HALF = math.sqrt(0.5)
 
@@ -78,7 +78,7 @@ def electrons_in(k: int, radiance: Array, parameters: Array, sensitivity: Array)
 
 @compiled
 def moments_of_rounded(mean: float, deviation: float, white: float) -> tuple[float, float]:
-    """Return mean and variance of a normal variable after rounding and clipping to 0..white."""
+    """Return mean and variance of a normal variable, rounded and clipped to 0 to ``white``."""
     if deviation == 0.0 or mean - REACH * deviation > white or mean + REACH * deviation < 0.0:
         return min(max(np.rint(mean), 0.0), white), 0.0
     if deviation < SMOOTH_DEVIATION:

@@ -37,7 +37,7 @@ class StereoFrame:
     Raises
     ------
     ShapeError
-        If an image is not an array (height, width) of such grey values.
+        If an image is not an array (height, width) of these types.
 
     Examples
     --------
@@ -99,7 +99,7 @@ class StereoFrame:
         return None
 
     def _repr_png_(self) -> bytes:
-        """Return both images side by side as a PNG of at most SHOWN_WIDTH_PX.
+        """Return both images side by side as a PNG at most SHOWN_WIDTH_PX wide.
 
         If a grey value exceeds 255, both images are darkened by the same factor.
         """
@@ -120,6 +120,7 @@ class StereoFrame:
 
 
 def _in_notebook() -> bool:
+    """Return True in a notebook, where IPython has a kernel."""
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     return shell is not None and hasattr(shell, "kernel")
@@ -176,7 +177,7 @@ class FrameImages:
 
 
 def readable(images: StereoImages | StereoFrame) -> StereoImages:
-    """Return images whose windows can be read; a StereoFrame is wrapped in FrameImages.
+    """Return images from which windows can be read; a StereoFrame is wrapped in FrameImages.
 
     Raises CmmError if ``images`` is neither a StereoFrame nor a result of ``sensor.look``.
     """
