@@ -1,9 +1,9 @@
 """Leaderboard of the detectors: their errors on images of tilted discs, and the Cramer-Rao bound.
 
 The discs are drawn exactly, at known random positions within a pixel, and the camera's noise is
-added. An error is the difference between the detected centre and the centre of the ellipse. The
-eccentricity, the distance from there to the image of the disc's centre, is not part of the error.
-Two methods of OpenCV are compared as well.
+added. An error is the detected centre minus the centre of the drawn ellipse. The eccentricity, the
+distance of this centre from the image of the disc's centre, is not part of the error. Two methods
+of OpenCV are compared as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,7 +37,7 @@ TOGETHER = 100
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
-# Pixels between a disc's rim and the edge of the fitted part of the window.
+# Pixels between a sharp disc's rim and the edge of the fitted part of the window.
 FREE_PX = 3
 RESAMPLES = 1000
 CONFIDENCE = 0.95
@@ -121,17 +121,17 @@ class Scene:
             / self.contrast
         )
 
-    def with_noise(self, share: float) -> "Scene":
-        """Return the scene with light and gain changed such that ``edge_noise`` equals ``share``.
+    def with_noise(self, fraction: float) -> "Scene":
+        """Return the scene with light and gain such that ``edge_noise`` equals ``fraction``.
 
         Raises CmmError if the noise of rounding alone is larger.
         """
         rounding = 1.0 / 12.0
         analog = (self.edge_noise * self.contrast) ** 2 - rounding
-        wanted = (share * self.contrast) ** 2 - rounding
+        wanted = (fraction * self.contrast) ** 2 - rounding
         if wanted <= 0.0:
             raise CmmError(
-                f"noise of {share:.2%} of the contrast is less than the noise of rounding, "
+                f"noise of {fraction:.2%} of the contrast is less than the noise of rounding, "
                 f"{np.sqrt(rounding) / self.contrast:.2%}"
             )
         light = analog / wanted
@@ -162,7 +162,7 @@ def scene_of(file: SensorFile) -> Scene:
 
 
 def working_point(file: SensorFile) -> Condition:
-    """Return the condition under which a sensor file's left camera sees the stickers at home.
+    """Return the condition under which a file's left camera sees the platform's stickers at home.
 
     Radius and tilt are the medians over the stickers that face the camera. The noise is the
     camera's own.
@@ -188,20 +188,20 @@ def working_point(file: SensorFile) -> Condition:
 def random_ellipses(
     condition: Condition, focal_px: float, size: int, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return the ellipses of discs that are tilted towards random directions.
+    """Return centres (count, 2) and shapes (count, 2, 2), px, of the ellipses of random discs.
 
-    The ellipses have random centres (count, 2) within half a pixel of the middle of a window of
-    ``size`` px, and shapes (count, 2, 2), both in px.
+    The discs are tilted towards random directions. In x and in y, the images of their centres lie
+    within half a pixel of the middle of a window of ``size`` px.
     """
     middle = 0.5 * (size - 1)
     camera = PinholeCamera(focal_px, middle, middle, size, size)
-    away = rng.uniform(-0.5, 0.5, (count, 2))
-    side = rng.uniform(0.0, 2.0 * np.pi, count)
+    offsets = rng.uniform(-0.5, 0.5, (count, 2))
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
     sine = np.sin(condition.tilt)
     cosine = np.cos(condition.tilt)
-    normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
+    normals = np.column_stack([sine * np.cos(angle), sine * np.sin(angle), np.full(count, -cosine)])
     # The discs lie at depth 1, because only ratios of lengths matter.
-    disc_centres = np.column_stack([away / focal_px, np.ones(count)])
+    disc_centres = np.column_stack([offsets / focal_px, np.ones(count)])
     return project_discs(
         camera, disc_centres, normals, np.full(count, condition.radius_px / focal_px)
     )
@@ -231,7 +231,7 @@ class Score:
     rms_px                 rms error over the windows with a detected disc; inf if there are none
     ratio                  ``rms_px`` divided by the Cramer-Rao bound of these windows
     ratio_low, ratio_high  ends of the 95 % interval of ``ratio``
-    bias_px                rms error without noise
+    bias_px                rms error without noise and rounding
     lost                   fraction of windows without a detected disc
     """
 
@@ -262,15 +262,15 @@ def compete(
     """Return the scores of all detectors under all conditions, with ``draws`` discs each.
 
     Without ``detectors``, all ``contestants`` compete. ``report(done, total)`` is called after each
-    condition. Raises CmmError for fewer than two draws, and for impossible conditions.
+    condition. Raises CmmError for fewer than two draws, and for noise below that of rounding.
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
     scenes = [scene.with_noise(condition.noise) for condition in conditions]
     scores: list[Score] = []
     chosen = detectors or contestants()
-    for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
-        scores += _round(lit, condition, draws, rng, chosen)
+    for k, (own_scene, condition) in enumerate(zip(scenes, conditions, strict=True)):
+        scores += _round(own_scene, condition, draws, rng, chosen)
         report(k + 1, len(conditions))
     return scores
 
@@ -283,7 +283,7 @@ def _round(
     detectors: Sequence[Detector],
 ) -> list[Score]:
     """Return the scores of all detectors under one condition."""
-    fit_size = 2 * int(np.ceil(condition.radius_px + FREE_PX))
+    fit_size = 2 * int(np.ceil(condition.radius_px + FREE_PX + condition.psf_px))
     centres, shapes = random_ellipses(condition, scene.focal_px, fit_size + 2, draws, rng)
     radiance = draw_discs(scene, centres, shapes, fit_size + 2, condition.psf_px)
     noisy = scene.noise.expose(radiance, rng)
@@ -292,10 +292,10 @@ def _round(
     scores = []
     for detector in detectors:
         # Windows with noise show the whole error, and the same windows without noise the bias.
-        found, without_noise = (
+        with_noise, without_noise = (
             detector.detect(
                 SpotWindows(
-                    w,
+                    windows,
                     np.zeros((draws, 2), dtype=int),
                     scene.noise,
                     fit_size,
@@ -303,10 +303,10 @@ def _round(
                     condition.psf_px,
                 )
             )
-            for w in (noisy, clean)
+            for windows in (noisy, clean)
         )
-        good = found.good
-        squared = 0.5 * ((found.centres - centres)[good] ** 2).sum(axis=1)
+        good = with_noise.good
+        squared = 0.5 * ((with_noise.centres - centres)[good] ** 2).sum(axis=1)
         systematic = (without_noise.centres - centres)[without_noise.good] ** 2
         scores.append(
             Score(
@@ -349,22 +349,22 @@ def _root_mean(squared: Array) -> float:
 
 
 def _by_window(
-    find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows
+    find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], spots: SpotWindows
 ) -> DetectedCentres:
-    """Return the centres that ``find`` returns for each window, given as an 8-bit image.
+    """Return the centres that ``find`` returns for the windows, which it gets as 8-bit images.
 
-    A window for which it returns None is not good. OpenCV states no covariance, so the covariances
+    A window is not good if ``find`` returns None. OpenCV states no covariance, so the covariances
     are zero.
     """
-    grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
+    grey = np.rint(spots.windows * (255.0 / spots.noise.white_level)).astype(np.uint8)
     results = [find(window) for window in grey]
     good = np.array([centre is not None for centre in results], dtype=bool)
     centres = np.array([centre or (0.0, 0.0) for centre in results]).reshape(-1, 2)
-    return DetectedCentres(centres + given.corners, np.zeros((len(results), 2, 2)), good)
+    return DetectedCentres(centres + spots.corners, np.zeros((len(results), 2, 2)), good)
 
 
-def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
-    """Return the centres of the largest bright blobs that ``cv2.SimpleBlobDetector`` finds.
+def detect_by_blobs(spots: SpotWindows) -> DetectedCentres:
+    """Return the centre of the largest bright blob of each window by ``cv2.SimpleBlobDetector``.
 
     The shape filters of this detector are off.
     """
@@ -372,17 +372,17 @@ def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
     settings.blobColor = 255
     settings.minArea = 4.0
-    settings.maxArea = float(given.fit_size**2)
+    settings.maxArea = float(spots.fit_size**2)
     blobs = cv2.SimpleBlobDetector.create(settings)
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
         points = blobs.detect(window)
         return max(points, key=lambda point: point.size).pt if points else None
 
-    return _by_window(find, given)
+    return _by_window(find, spots)
 
 
-def detect_by_contour(given: SpotWindows) -> DetectedCentres:
+def detect_by_contour(spots: SpotWindows) -> DetectedCentres:
     """Return the centres of ``cv2.fitEllipse`` for the longest contours at Otsu's threshold."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
@@ -391,7 +391,7 @@ def detect_by_contour(given: SpotWindows) -> DetectedCentres:
         longest = max(contours, key=len, default=())
         return cv2.fitEllipse(longest)[0] if len(longest) >= 5 else None
 
-    return _by_window(find, given)
+    return _by_window(find, spots)
 
 
 PEERS = (

@@ -9,7 +9,7 @@ import pytest
 
 from cmmsim.allowed_plugins import ALLOWED, DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detection.detector import FitLimits, SpotWindows, find_detector
-from cmmsim.detector_leaderboard import Condition, draw_discs, random_ellipses, scene_of
+from cmmsim.detector_leaderboard import Condition, compete, draw_discs, random_ellipses, scene_of
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.loading import load_sensor
 from tests.cmmsim.sensors import exact, refused, require_true, squared_errors, squares
@@ -174,6 +174,14 @@ def test_lines_of_the_dual_conic_that_the_window_cuts_off_move_no_good_centre(ra
         found = dual_conic.detect(SpotWindows(clean, corners(200), noise, 12 + 2 * margin_px))
         assert np.all(np.abs(found.centres - centres)[found.good] < 5.0 * dual_conic.bias_px)
     assert found.good.all()
+
+
+def test_windows_of_the_leaderboard_have_room_for_blurred_discs():
+    """The dual conic rejects discs whose rims come near the edge, and these do not."""
+    blurred = Condition(3.8, 0.8, 0.02, 1.5)
+    rng = np.random.default_rng(0)
+    (score,) = compete(SCENE, [blurred], 20, rng, [find_detector("dual_conic")])
+    assert score.lost == 0.0
 
 
 class Shifted:
