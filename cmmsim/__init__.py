@@ -5,7 +5,7 @@ Sensor
     Sensor.measure(pose)               -> Measurement: pose (6,) m, rad and its covariance (6, 6)
     Sensor.measure_many(poses)         -> MeasuredPoses of many frames at once
     Sensor.capture(pose)               -> StereoFrame: both whole images
-    Sensor.teach()                     -> Taught, which `load_sensor` takes for the same bodies
+    Sensor.teach()                     -> Taught, for `load_sensor` with the same cameras and bodies
     require_opengl()                   raises OpenGLMissingError if pyrender cannot draw
 
 Images from other sources
@@ -31,8 +31,7 @@ Faults of images
 
 Every exception that a user can cause is a CmmError, except OpenGLMissingError. The packages
 `cmmsim.calibration` and `cmmsim.acceptance` are public as well. Users can write their own detectors
-and renderers: `allow_plugin(module)` allows a module of the user to run. Everything else is
-private.
+and renderers: `allow_plugin(module)` allows a user's module to run. Everything else is private.
 
 Names are imported on first use, because the command `cmmsim` begins in this package and must not
 wait for OpenCV and OpenGL.

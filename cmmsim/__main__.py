@@ -10,11 +10,11 @@ from cmmsim.foreign_identify import foreign_identify
 
 
 def main() -> None:
-    """Run the command. Exit with status 1 and one line if our `identify` is not found."""
+    """Run the command, or exit with status 1 and the line of `foreign_identify`."""
     refusal = foreign_identify()
     if refusal:
         sys.exit(f"error: {refusal}")
-    # The import is by name, because this package must not depend on identify elsewhere.
+    # Imported by its name, because cmmsim must contain no import statement of identify.
     import_module("identify.__main__").main()
 
 

@@ -81,7 +81,7 @@ def is_plugin_name(name: str) -> bool:
 
 
 def import_plugin(option: str, name: str) -> Any:
-    """Import an object of the user by its name ``module:name``.
+    """Import a user's own object by its name ``module:name``, and return it.
 
     ``option`` is the kind of the object in messages, such as "detector". Raises CmmError if the
     module is not allowed to run, cannot be imported, or has no such object.
@@ -101,17 +101,17 @@ def import_plugin(option: str, name: str) -> Any:
     try:
         imported = importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        # A module that exists can itself import another one that is missing.
+        # The missing module can also be one that the user's module imports.
         missing = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(
             f"{error.name}."
         )
         advice = "; the folder of the module must be on PYTHONPATH" if missing else ""
         raise CmmError(f"{option} {name!r} cannot be imported: {error}{advice}") from error
     if not hasattr(imported, attribute):
-        names = ", ".join(one for one in vars(imported) if not one.startswith("_"))
-        place = getattr(imported, "__file__", None)
+        names = ", ".join(own for own in vars(imported) if not own.startswith("_"))
+        file = getattr(imported, "__file__", None)
         raise CmmError(
-            f"{option} {name!r}: the module {place or module} has no {attribute}; it has "
+            f"{option} {name!r}: the module {file or module} has no {attribute}; it has "
             f"{names[:200] or 'nothing'}"
         )
     return getattr(imported, attribute)
@@ -121,9 +121,10 @@ def import_plugin(option: str, name: str) -> Any:
 class PluginFunction:
     """Function of a plugin. Its exceptions are reported with file and line number.
 
-    ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged,
-    and any other exception becomes an ``error_class``. ``check`` is called with ``part``, the
-    result and the arguments. It raises an exception of a known class if the result is wrong.
+    ``part`` is the function's name in messages. Exceptions of the classes ``known`` pass unchanged.
+    Any other exception, and SystemExit, becomes an ``error_class``. ``check`` is called with
+    ``part``, the result and the arguments. It raises an exception of a known class if the result is
+    wrong.
     """
 
     part: str
@@ -144,9 +145,9 @@ class PluginFunction:
         except (Exception, SystemExit) as error:  # the user's function must not end the program
             # The first entry is the call above; the second, if it exists, is in the user's file.
             call = traceback.extract_tb(error.__traceback__)[:2][-1]
-            place = f"{Path(call.filename).name}, line {call.lineno}"
-            said = f"{self.part} raised {type(error).__name__}: {error} ({place})"
-            raise self.error_class(said) from error
+            line = f"{Path(call.filename).name}, line {call.lineno}"
+            message = f"{self.part} raised {type(error).__name__}: {error} ({line})"
+            raise self.error_class(message) from error
 
 
 def require_detector(name: str) -> str:
@@ -180,8 +181,9 @@ def find(
     attribute with the name of a numeric field, such as ``bias_px``, the field gets its value.
     ``check`` checks each result, see `PluginFunction`.
 
-    Raises UnknownOptionError, which lists the valid names, for an unknown name. Raises CmmError for
-    an object that cannot be called, and for a module that is not allowed to run.
+    Raises UnknownOptionError, which lists the valid names, for an unknown name. Raises CmmError if
+    a module is not allowed to run or cannot be imported, if its object is missing or cannot be
+    called, or if a numeric attribute is out of range.
     """
     name = _required(option, name, built_in)
     if name in built_in:
@@ -195,25 +197,32 @@ def find(
     function = getattr(own, function_field.name) if isinstance(own, kind) else own
     if not callable(function):
         raise CmmError(f"{label} is of type {type(function).__name__}, which cannot be called")
-    carried = [field for field in number_fields if hasattr(own, field.name)]
-    values = {field.name: _number(label, own, field) for field in carried}
+    given = [field for field in number_fields if hasattr(own, field.name)]
+    values = {field.name: _number(label, own, field) for field in given}
     return kind(name, PluginFunction(label, function, CmmError, (CmmError,), check), **values)
 
 
 def _number(part: str, owner: Any, field: Any) -> Any:
-    """Return a number that is an attribute of a user's own function, such as ``bias_px``."""
+    """Return a number that is an attribute of a user's own function, such as ``bias_px``.
+
+    Raises CmmError unless it is at least 0 and below 1000.
+    """
     value = getattr(owner, field.name)
     kind = type(field.default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1000:
-        raise CmmError(f"{part} has {field.name} = {value!r}, must be a number from 0 to 1000")
+        raise CmmError(
+            f"{part} has {field.name} = {value!r}, must be a number of at least 0 and below 1000"
+        )
     return kind(value)
 
 
 def _required(option: str, name: str, built_in: Mapping[str, str]) -> str:
+    """Return the name. Raises UnknownOptionError unless it is built in or ``module:name``."""
     if not isinstance(name, str) or not (name in built_in or is_plugin_name(name)):
         raise UnknownOptionError(option, name, built_in, own=True)
     return name
 
 
 def _is_module(name: object) -> bool:
+    """Return True if ``name`` is a possible name of a module, such as "package.module"."""
     return isinstance(name, str) and all(part.isidentifier() for part in name.split("."))

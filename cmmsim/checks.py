@@ -77,7 +77,7 @@ def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> N
 class Section(BaseModel):
     """Section of a TOML file.
 
-    Unknown keys and infinite numbers are refused, and entries cannot be changed.
+    Unknown keys and numbers that are not finite are refused. Entries cannot be changed.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -100,7 +100,7 @@ def read_text(path: str | Path, source: str, error_class: type[CmmError]) -> str
     """Return the text of a file.
 
     ``source`` names the file in messages, such as "board file x". Raises ``error_class`` if the
-    file cannot be read, or has more than `LARGEST` bytes.
+    file cannot be read, has more than `LARGEST` bytes, or is not UTF-8 text.
     """
     try:
         location = Path(path)
@@ -136,30 +136,30 @@ def parsed(text: str, source: str, error_class: type[CmmError]) -> dict[str, Any
 def checked(model: type[M], content: dict[str, Any], source: str, error_class: type[CmmError]) -> M:
     """Return the content of a file as an instance of ``model``.
 
-    Raises ``error_class`` for content that does not match. The message lists what is wrong and, for
-    an unknown key, the valid keys.
+    Raises ``error_class`` for content that does not match. The message lists at most
+    `MOST_COMPLAINTS` problems and, for an unknown key, the valid keys.
     """
     try:
         return model.model_validate(content)
     except ValidationError as error:
         problems = error.errors()
-        said = [_explain(details, model) for details in problems[:MOST_COMPLAINTS]]
-        more = len(problems) - len(said)
-        said += [f"and {more} more"] if more else []
-        raise error_class(f"{source}: {'; '.join(said)}") from error
+        shown = [_explain(details, model) for details in problems[:MOST_COMPLAINTS]]
+        more = len(problems) - len(shown)
+        shown += [f"and {more} more"] if more else []
+        raise error_class(f"{source}: {'; '.join(shown)}") from error
 
 
 @lru_cache(maxsize=8)
 def _parsed(text: str) -> dict[str, Any]:
-    """Parse a TOML text. Raises ValueError, which names the content that is refused.
+    """Parse a TOML text. Raises ValueError, whose message names the content that is refused.
 
     The result is cached, because a study reads the same sensor file for every row. Otherwise,
     parsing would take an eighth of the computing time per row.
     """
-    bare = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
+    pieces = re.split(r"[=,\[\]{}\n]", _TEXTS.sub("_", text))
     # The time that tomllib takes grows with the square of the number of parts of a dotted key, so
     # the parts are counted first.
-    if any(key.count(".") >= DEEPEST for key in bare):
+    if any(piece.count(".") >= DEEPEST for piece in pieces):
         raise ValueError(TOO_DEEP)
     try:
         content = tomllib.loads(text)
@@ -167,13 +167,13 @@ def _parsed(text: str) -> dict[str, Any]:
         raise
     except ValueError:  # int() refuses numbers of some thousand digits
         raise ValueError("an integer beyond 64 bits, or an impossible date") from None
-    if found := _fault(content):
-        raise ValueError(found)
+    if fault := _fault(content):
+        raise ValueError(fault)
     return content
 
 
 def _fault(content: dict[str, Any]) -> str:
-    """Return a text about a value that no file may contain, or an empty text if there is none."""
+    """Return a text that names a value that no file may contain, or an empty text."""
     unvisited: list[tuple[Any, int]] = [(content, 0)]
     while unvisited:
         value, depth = unvisited.pop()
@@ -181,9 +181,9 @@ def _fault(content: dict[str, Any]) -> str:
             return TOO_DEEP
         if isinstance(value, dict):
             unvisited += [(key, depth) for key in value]
-            unvisited += [(one, depth + 1) for one in value.values()]
+            unvisited += [(entry, depth + 1) for entry in value.values()]
         elif isinstance(value, list):
-            unvisited += [(one, depth + 1) for one in value]
+            unvisited += [(entry, depth + 1) for entry in value]
         elif isinstance(value, str) and _UNWANTED.search(value):
             return f"a control character in {value[:60]!r}"
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -208,7 +208,7 @@ def _explain(error: Any, model: type[BaseModel]) -> str:
 
 
 def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:
-    """Return the valid keys of the section of ``model`` to which the keys ``section`` lead."""
+    """Return the valid keys of a section of ``model``. The keys ``section`` lead to it."""
     for part in section:
         if isinstance(part, int):
             continue

@@ -38,23 +38,24 @@ class CompilationWarning(UserWarning):
 def compiled(function: F) -> Dispatcher[F]:
     """Return a kernel that is compiled on its first call, or loaded from the cache.
 
-    The cache is a folder beside the source. If that folder is not writable, the cache is in the
-    user's cache folder. Cached code is not loaded if an untrusted user could have written it.
+    The cache is a folder beside the source, or in the user's cache folder if the former is not
+    writable. NUMBA_CACHE_DIR names another folder. Cached code is not loaded if an untrusted user
+    could have written it.
     """
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     try:
         kernel = njit(cache=True, **options)(function)
     except RuntimeError:  # numba found no folder that it can write to
         return njit(**options)(function)
-    if not hasattr(kernel, "_cache"):
+    if not hasattr(kernel, "_cache"):  # with NUMBA_DISABLE_JIT, the kernel is a Python function
         return kernel
     if not _ours_alone(Path(kernel._cache.cache_path), Path(function.__code__.co_filename).parent):
         return njit(**options)(function)
     kernel._cache.save_overload = partial(
         _save_closed, kernel._cache.save_overload, kernel._cache.cache_path
     )
-    # numba checks only whether the function's own file has changed, but kernels call kernels of
-    # other files. Therefore a digest of all kernels is used instead.
+    # numba compiles anew only if the function's own file has changed, but kernels call kernels of
+    # other files. The stamp of the file is therefore replaced by a digest of all kernels.
     file = kernel._cache._cache_file
     file._source_stamp = _stamp()
     # numba unpickles a cache index only if the version matches. With the digest in the version, it
@@ -109,9 +110,9 @@ def _ours_alone(folder: Path, source: Path) -> bool:
     files = list(folder.glob("*.nb?"))
     # Users who can write into the parent folder can replace the folder, unless the parent has the
     # sticky bit, as /tmp has.
-    above = _is_open(folder.parent) and not folder.parent.stat().st_mode & stat.S_ISVTX
-    owners = {one.lstat().st_uid for one in (folder.parent, folder, *files)}
-    ours = not above and not any(map(_is_open, (folder, *files))) and owners <= trusted
+    open_parent = _is_open(folder.parent) and not folder.parent.stat().st_mode & stat.S_ISVTX
+    owners = {path.lstat().st_uid for path in (folder.parent, folder, *files)}
+    ours = not open_parent and not any(map(_is_open, (folder, *files))) and owners <= trusted
     if not ours:
         warnings.warn(
             f"other users can write into {folder}, so every process compiles kernels anew; delete "

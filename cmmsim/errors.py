@@ -61,8 +61,9 @@ class UnknownBodyError(CmmError):
     """A pose was given for an obstacle that was never registered."""
 
     def __init__(self, name: str, valid_names: Iterable[str]) -> None:
-        names = ", ".join(sorted(valid_names)) or "none registered: call add_bodies first"
-        super().__init__(f"unknown body {name!r}: valid are {names}")
+        names = ", ".join(sorted(valid_names))
+        valid = f"valid are {names}" if names else "none is registered; call add_bodies first"
+        super().__init__(f"unknown body {name!r}: {valid}")
 
 
 class ShapeError(CmmError):
@@ -108,4 +109,4 @@ class PhotographError(CmmError):
 
 
 class AcceptanceError(CmmError):
-    """A volume is too small or not visible, lines break a rule, or an artefact is not measured."""
+    """An acceptance test is not possible; the message states the cause."""

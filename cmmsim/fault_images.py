@@ -1,8 +1,8 @@
 """Images with a fault laid over them: marks painted into their grey values, or both images swapped.
 
-Marks are opaque discs and plates, added light, and whole images of one radiance. They lie over
-grey values that already contain noise. If a mark hides the fraction s of a pixel, the pixel's new
-light is (1 - s) of its old light plus s of the mark's light. Noise is then added such that the
+Marks are opaque discs and plates, added light, and whole images of one radiance. They are painted
+over grey values that already contain noise. If a mark hides the fraction s of a pixel, the pixel's
+new light is (1 - s) of its old light plus s of the mark's light. Noise is then added such that the
 pixel's variance equals the camera's variance at the new mean.
 """
 
@@ -47,8 +47,8 @@ class Mark(Protocol):
 class DiscMark:
     """Opaque ellipse.
 
-    It has a centre (2,) px and a radiance 0 to 1. Its symmetric shape matrix (2, 2) px maps the
-    unit circle to the rim.
+    It has a centre (2,) px of the image, and a radiance 0 to 1. Its symmetric shape matrix (2, 2)
+    px maps the unit circle to the rim relative to the centre.
     """
 
     side: int
@@ -62,17 +62,18 @@ class DiscMark:
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
-        share = coverage((self.centre - corner)[None], self.shape[None], max(shape))[0][
+        hidden = coverage((self.centre - corner)[None], self.shape[None], max(shape))[0][
             0, : shape[0], : shape[1]
         ]
-        return share, share * self.radiance
+        return hidden, hidden * self.radiance
 
 
 @dataclass(frozen=True)
 class PlateMark:
-    """Opaque rectangle whose edges cover pixels in part.
+    """Opaque rectangle with edges that are blurred over one pixel.
 
-    It has a centre (2,) px, half sides (2,) px, an angle in rad and a radiance 0 to 1.
+    It has a centre (2,) px, half sides (2,) px, and a radiance 0 to 1. The first side has an
+    ``angle`` in rad from the x axis towards the y axis.
     """
 
     side: int
@@ -96,8 +97,8 @@ class PlateMark:
                 ((cosine, sine), (-sine, cosine)), self.half, strict=True
             )
         ]
-        share = inside[0] * inside[1]
-        return share, share * self.radiance
+        hidden = inside[0] * inside[1]
+        return hidden, hidden * self.radiance
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class GlintMark:
     """Added light: a Gaussian core, and a straight tail as wide as the core.
 
     centre     (2,), px
-    peak       largest radiance of the core; radiance above 1 saturates
+    peak       radiance of the core at the centre; radiance above 1 can saturate
     core       standard deviation of the core, px
     tail_peak  radiance of the tail at the centre
     tail       distance over which the tail's radiance falls by the factor e, px
@@ -179,8 +180,9 @@ def paint(
     radiance = np.maximum(kept / (noise.gain * noise.electrons_at_white), 0.0) + light[touched]
     new = np.asarray(noise.mean_grey(radiance), dtype=float)
     if noise.enabled:
-        missing = noise.variance(new) - (1.0 - hidden[touched]) ** 2 * noise.variance(part[touched])
-        new = new + np.sqrt(np.maximum(missing, 0.0)) * rng.standard_normal(len(new))
+        contained = (1.0 - hidden[touched]) ** 2 * noise.variance(part[touched])
+        missing = np.maximum(noise.variance(new) - contained, 0.0)
+        new = new + np.sqrt(missing) * rng.standard_normal(len(new))
     part[touched] = new
 
 
@@ -202,9 +204,9 @@ def _offsets(
 class Fault:
     """Fault of a stereo frame.
 
-    If ``swapped`` is True, the left and the right image are exchanged. ``marks`` are then laid over
-    the images. ``obstacles`` are transforms base_from_body (4, 4) of bodies in front of the
-    platform, by their names in ``fault_bodies``.
+    ``kind`` is one of ``FaultGenerator.kinds``. If ``swapped`` is True, the left and the right
+    image are exchanged. ``marks`` are then laid over the images. ``obstacles`` are transforms
+    base_from_body (4, 4) of bodies in front of the platform, by their names in ``fault_bodies``.
 
     Examples
     --------
@@ -233,7 +235,7 @@ class FaultyImages:
     noise : CameraNoise
         Noise of the camera, such as ``sensor.noise``.
     rng : numpy.random.Generator
-        Generator of the marks' noise.
+        Generator of the marks' noise, which is drawn anew at each reading of the images.
 
     Raises
     ------
@@ -289,7 +291,7 @@ class FaultyImages:
         return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
 
     def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Return parts ``images`` (n, h, w) of one image with the marks over them.
+        """Return n parts (n, h, w) of one image with the marks over them.
 
         ``corners`` (n, 2) are the first pixels of the parts, as (x, y).
         """

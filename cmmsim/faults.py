@@ -1,6 +1,6 @@
 """Random faults of stereo images.
 
-They serve to test that a measurement of faulty images is either right or counts as lost.
+They serve to test whether each measurement of faulty images is right, or states that it is lost.
 
     faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
@@ -8,9 +8,9 @@ They serve to test that a measurement of faulty images is either right or counts
     images = cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, rng)
     cmmsim.Tracker(sensor.estimator).measure(images)
 
-A fault changes the grey values of finished images, so the images can come from any source. The
-kinds "obstacles" and "several" also contain bodies, which have to be drawn with the scene. Register
-these bodies once with ``sensor.add_bodies(fault_bodies())``, then call
+A fault changes the grey values of finished images, so the images can come from any source. Faults
+of the kinds "obstacles" and "several" can also contain bodies, which have to be drawn with the
+scene. Register these bodies once with ``sensor.add_bodies(fault_bodies())``, then call
 ``sensor.look(pose, obstacles=fault.obstacles)``.
 """
 
@@ -29,7 +29,7 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
 from cmmsim.measuring.pose_estimator import PoseEstimator, require_estimator
 
-# Sides of the boxes that hide stickers, m.
+# Sides of the boxes that hide stickers, m. The third side of each box is half as long.
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)
 # With probability one half, a fault changes at most this number of stickers.
 FEW = 4
@@ -47,6 +47,7 @@ KINDS = (
     ),
     *("glint", "merging", "swapped", "black", "saturated", "several"),
 )
+# Radiance of discs that look like stickers, and of plates that hide stickers.
 STICKER_RADIANCE = 228.0 / 255.0
 DARK_RADIANCE = 60.0 / 255.0
 SATURATING = 1.5  # radiance above that of white
@@ -153,14 +154,14 @@ class FaultGenerator:
         return drawn if isinstance(drawn, Fault) else Fault(kind, tuple(drawn))
 
     def _outlines(
-        self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0
+        self, pose: Array, stickers: slice = slice(None), offset: Array | float = 0.0
     ) -> tuple[Array, Array]:
         """Return centres (2, n, 2) and shapes (2, n, 2, 2), px, of the ellipses of n stickers.
 
-        The stickers are moved on the platform by ``off`` (3,) m.
+        The stickers are displaced by ``offset`` (3,) m in platform axes.
         """
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
-        places = self._taught.platform_places[stickers] + off
+        places = self._taught.platform_places[stickers] + offset
         normals = self._platform.sticker_normals[stickers]
         return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
@@ -187,7 +188,7 @@ class FaultGenerator:
                 )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
-        """Hide a part of each sticker behind a straight edge. The hidden part is often small."""
+        """Hide parts of stickers behind straight edges. The hidden parts are often small."""
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
@@ -207,10 +208,10 @@ class FaultGenerator:
         for number in rng.choice(len(names), rng.integers(1, len(names) + 1), replace=False):
             sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
             position = apply(pose_to_transform(pose), sticker)
-            middle = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
+            between_cameras = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
             position = (
                 position
-                + rng.uniform(0.02, 0.5) * (middle - position)
+                + rng.uniform(0.02, 0.5) * (between_cameras - position)
                 + rng.uniform(-0.7, 0.7, 3) * BODY_SIZES[number]
             )
             base_from_bodies[names[number]] = pose_to_transform(
@@ -233,17 +234,17 @@ class FaultGenerator:
         centres, shapes = self._outlines(pose)
         for _ in range(rng.integers(1, 31)):
             side = int(rng.integers(2))
-            near = centres[side, rng.integers(centres.shape[1])]
+            sticker = centres[side, rng.integers(centres.shape[1])]
             shape = shapes[side, rng.integers(centres.shape[1])]
-            centre = near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2)
+            centre = sticker + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2)
             yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """Lay discs at points in space near stickers. The discs hide what is behind them."""
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(self._taught.platform_places))
-            off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
-            centres, shapes = self._outlines(pose, slice(k, k + 1), off)
+            offset = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
+            centres, shapes = self._outlines(pose, slice(k, k + 1), offset)
             radiance = _radiance(rng)
             for side in range(2):
                 yield DiscMark(side, centres[side, 0], shapes[side, 0], radiance)
@@ -270,11 +271,11 @@ class FaultGenerator:
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
         for k in self._some(rng):
-            towards = _direction(rng)
-            gap = rng.uniform(0.2, 2.4)
+            direction = _direction(rng)
+            distance = rng.uniform(0.2, 2.4)  # in sticker radii; rims touch at 2
             radiance = _radiance(rng)
             for side in sides:
-                centre = centres[side, k] + gap * shapes[side, k] @ towards
+                centre = centres[side, k] + distance * shapes[side, k] @ direction
                 yield DiscMark(side, centre, shapes[side, k], radiance)
 
     def _swapped(self, pose: Array, rng: np.random.Generator) -> Fault:
@@ -300,7 +301,7 @@ class FaultGenerator:
             self.draw(kind, pose, rng)
             for kind in rng.choice(kinds, rng.integers(2, 4), replace=False)
         ]
-        obstacles = {name: place for part in parts for name, place in part.obstacles.items()}
+        obstacles = {name: move for part in parts for name, move in part.obstacles.items()}
         return Fault(
             "several", tuple(mark for part in parts for mark in part.marks), obstacles=obstacles
         )
@@ -317,5 +318,6 @@ def _radiance(rng: np.random.Generator) -> float:
 
 
 def _direction(rng: np.random.Generator) -> Array:
+    """Return a random unit vector (2,)."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])

@@ -18,26 +18,28 @@ OURS = "IdentifyError"
 def foreign_identify() -> str:
     """Return one line that names the wrong package `identify` and says what to do.
 
-    The line is empty if our `identify` is found.
+    The line is empty if our `identify` is found, and PyPI's is not installed.
     """
     spec = find_spec("identify")
     path = Path(spec.origin) if spec and spec.origin else None
     if path and path.is_file() and OURS in path.read_text(encoding="utf-8", errors="replace"):
-        beside = _installed_beside()
-        if not beside:
+        version = _pypi_version()
+        if not version:
             return ""
-        where = f"identify {beside} of PyPI is installed beside cmmsim, which replaced its files"
+        problem = (
+            f"another package, identify {version} of PyPI, is installed in the same environment"
+        )
     elif path:
-        where = f"another package is imported instead of cmmsim's `identify`: {path.parent}"
+        problem = f"another package is imported instead of cmmsim's `identify`: {path.parent}"
     else:
-        where = "no `identify`"
+        problem = "cmmsim's package `identify` is not found"
     return (
-        f"{where}; install cmmsim into a virtual environment of its own (a PyPI package has the "
+        f"{problem}; install cmmsim into a virtual environment of its own (a PyPI package has the "
         "same name)"
     )
 
 
-def _installed_beside() -> str:
+def _pypi_version() -> str:
     """Return the version of PyPI's package `identify` in this environment, or an empty text."""
     try:
         return metadata.version("identify")
@@ -47,7 +49,7 @@ def _installed_beside() -> str:
 
 @cache
 def warn_of_foreign_identify() -> None:
-    """Warn once if another package is imported as `identify`."""
+    """Warn once, with the line of `foreign_identify`, if it is not empty."""
     warning = foreign_identify()
     if warning:
         warnings.warn(warning, stacklevel=4)

@@ -28,7 +28,7 @@ def sensor_for(name: str | Path) -> Sensor:
     """Return the sensor of a file.
 
     If the file states a covariance of the cameras, the sensor takes it into account. Raises the
-    exceptions of read_sensor_file, and SensorFileError for a covariance that is not valid.
+    same exceptions as read_sensor_file, and SensorFileError for a covariance that is not valid.
     """
     file = read_sensor_file(name)
     if file.rig.covariance is None:
@@ -72,7 +72,7 @@ def teach(
         Built-in name, or path of a TOML sensor file with the cameras, the radius of the stickers,
         and the planes with the rough positions of the stickers.
     colour : {"grey", "red", "green", "blue"}, optional
-        How grey values are computed from colours. Without it, images with colours are refused.
+        Method that computes grey values from colours. Without it, images with colours are refused.
     advance : callable, optional
         Function that is called after each pair.
 
@@ -87,6 +87,8 @@ def teach(
         If images cannot be used; the message names the file.
     TeachingError
         If the stickers are not found, or do not determine the frames.
+    UnknownSensorError, SensorFileError
+        If there is no such sensor, or its file cannot be used.
 
     Examples
     --------
@@ -97,8 +99,8 @@ def teach(
     ...     print(error)
     no folder no/left; give one folder of left and one of right images
     """
-    known = sensor_for(sensor)
-    return known.teach_from(photographs_for(known, left, right, colour), advance)
+    loaded = sensor_for(sensor)
+    return loaded.teach_from(photographs_for(loaded, left, right, colour), advance)
 
 
 def measure(
@@ -128,6 +130,8 @@ def measure(
         If images cannot be used, or are those of the other camera; the message names the file.
     TeachingError
         If ``taught`` cannot be read, or belongs to another sensor.
+    UnknownSensorError, SensorFileError
+        If there is no such sensor, or its file cannot be used.
 
     Examples
     --------
@@ -138,6 +142,6 @@ def measure(
     ...     print(error)
     cannot read no/taught.json: No such file or directory
     """
-    known = taught if isinstance(taught, Taught) else read_taught(taught)
-    measuring = load_sensor(sensor, renderer=RENDERER, taught=known)
-    return measure_pairs(photographs_for(measuring, left, right, colour), measuring.estimator)
+    result = taught if isinstance(taught, Taught) else read_taught(taught)
+    loaded = load_sensor(sensor, renderer=RENDERER, taught=result)
+    return measure_pairs(photographs_for(loaded, left, right, colour), loaded.estimator)

@@ -66,11 +66,11 @@ class Instrument:
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
         find_detector(file.detection.detector)
-        self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
+        self._renderer_name = require_renderer(file.renderer if renderer is None else renderer)
         # A user's own renderer is imported now, so that an exception is reported before work
         # begins.
-        if is_plugin_name(self._asked_renderer):
-            choose_renderer(self._asked_renderer)
+        if is_plugin_name(self._renderer_name):
+            choose_renderer(self._renderer_name)
         if progress is not None and not callable(progress):
             raise CmmError(
                 "progress must be a function of the number of steps done and their total, got "
@@ -86,7 +86,8 @@ class Instrument:
             **{("enabled" if k == "noise" else k): v for k, v in values.items()}
         )
         lens = lens_from_file(file)
-        # An estimator that does not know the lens assumes that all depths are in focus.
+        # An estimator that does not know the lens assumes that all depths are in focus, and that
+        # there is no ghost.
         blur = Optics(lens.psf_px, lens.vignetting)
         self.optics = lens if file.lens.known else blur
         self.platform = marked_body("platform", file.platform)
@@ -95,7 +96,7 @@ class Instrument:
             require_kind(taught, Taught, "taught must be a result of another sensor's teach()")
             require_taught_for(taught, file, len(self.platform.nominal))
         bodies = self.platform, self.base
-        self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
+        self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._renderer_name)
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
         # Teaching from photographs always begins with these values, even if it is repeated.
         self._stated = self.platform, self.rig, self._known
@@ -105,7 +106,7 @@ class Instrument:
 
     def __repr__(self) -> str:
         state = "not yet taught" if self._taught is None else "taught"
-        how = f"method {self.method!r}, renderer {self._asked_renderer!r}"
+        how = f"method {self.method!r}, renderer {self._renderer_name!r}"
         return f"Sensor({self.name!r}, {how}, {state})"
 
     @property
@@ -171,9 +172,9 @@ class Instrument:
         """Estimator that computes poses from images, including images from other sources."""
         common = None
         if self._known is not None or self._geometry.print is not None:
-            known = self._known_rig.covariance
+            covariance = self._known_rig.covariance
             common = partial(
-                self._geometry.pose_covariance, rig_covariance=known, method=self.method
+                self._geometry.pose_covariance, rig_covariance=covariance, method=self.method
             )
         return PoseEstimator(
             self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common
@@ -198,7 +199,7 @@ class Instrument:
 
     @property
     def camera(self) -> VirtualStereoCamera | StatisticalStereoCamera:
-        """Both cameras in front of the true scene, in their state at teaching."""
+        """Both true cameras in front of the true scene, without drift."""
         return self.true_cameras.at_rest
 
     def teach(
@@ -241,8 +242,8 @@ class Instrument:
                 self.camera, self.observer, self.platform, self.base, self._view.sizes.plan()
             )
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
-            found = teacher.teach(self.name, self.home, rng, progress or self._progress)
-            self._taught = replace(found, setup=setup_of(self._file), known=self._known)
+            taught = teacher.teach(self.name, self.home, rng, progress or self._progress)
+            self._taught = replace(taught, setup=setup_of(self._file), known=self._known)
         return self._taught
 
     def teach_from(
@@ -270,8 +271,8 @@ class Instrument:
         for body in (platform, self.base):
             require_corner(body)
         observer = replace(self.observer, rig=rig)
-        found = teach_from(photographs, observer, platform, self.base, self.name, known, advance)
-        return replace(found, taught=replace(found.taught, setup=setup_of(self._file)))
+        result = teach_from(photographs, observer, platform, self.base, self.name, known, advance)
+        return replace(result, taught=replace(result.taught, setup=setup_of(self._file)))
 
     def _take(self, taught: Taught) -> None:
         """Use a result of teaching, with its rig and its stickers, from now on."""
@@ -317,7 +318,8 @@ class Instrument:
             Amounts by parameter name, as ``{"right.cx_px": 0.1}``. The names are listed in
             ``stereo_rig.PARAMETER_NAMES``.
         right_later : float
-            Delay of the right camera's exposure after the left camera's exposure, s.
+            Delay of the right camera's exposure after the left camera's exposure, s. It replaces
+            the delay of an earlier call.
 
         Raises
         ------

@@ -60,6 +60,8 @@ def load_sensor(
         If there is no such method, renderer or detector.
     TeachingError
         If ``taught`` belongs to another sensor.
+    CmmError
+        If another argument has a wrong type, or the seed is negative.
 
     Examples
     --------

@@ -1,6 +1,6 @@
 """Measurement of many frames at once, in blocks and on all cores.
 
-Windows are read, ellipses fitted and stickers triangulated for all exposures of a block together.
+For all exposures of a block together, windows are read, ellipses fitted and stickers triangulated.
 The pose of each exposure is then solved separately.
 """
 
@@ -37,9 +37,9 @@ BLOCK = 32
 class Frames:
     """N frames of a platform at ``poses`` (N, 6), which change at ``rates`` (N, 6).
 
-    Each frame has its own generator of noise in ``rngs``. Stickers are searched near the poses
-    ``near`` (N, 6). ``obstacles`` maps names of bodies that stand still to their base_from_body
-    (4, 4). ``period`` is the time between two frames, s.
+    Units are m, rad and s. Each frame has its own generator of noise in ``rngs``. Stickers are
+    searched near the poses ``near`` (N, 6). ``obstacles`` maps names of bodies that stand still to
+    their base_from_body (4, 4). ``period`` is the time between two frames.
     """
 
     estimator: PoseEstimator
@@ -69,7 +69,7 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
     rngs = frames.rngs
     expected = frames.expected
     half_movement = 0.5 * camera.exposure * rates
-    # The platform is assumed at its expected pose in mid-exposure. Its movement is the true one.
+    # In mid-exposure, the platform is assumed at its expected pose. Its movement is the true one.
     to_expected = expected @ invert(transforms_of(poses))
     at_start = to_expected @ transforms_of(poses - half_movement)
     at_end = to_expected @ transforms_of(poses + half_movement)
@@ -88,24 +88,24 @@ def measure_frames(camera: VirtualStereoCamera, frames: Frames) -> Iterator[Meas
 
 def measure_without_images(camera: StatisticalStereoCamera, frames: Frames) -> list[Measurement]:
     """Measure frames one by one with cameras that give the detected stickers without images."""
-    found = []
+    measured = []
     rows = zip(frames.poses, frames.rates, frames.expected, frames.rngs, strict=True)
     for pose, rate, expected, rng in rows:
         try:
             seen = camera.look(pose, rng, frames.obstacles, pose_rate=rate)
-            found.append(frames.estimator.measure(seen, expected)[0])
+            measured.append(frames.estimator.measure(seen, expected)[0])
         except LostError as error:
-            found.append(lost_measurement(str(error)))
-    return found
+            measured.append(lost_measurement(str(error)))
+    return measured
 
 
 @dataclass(frozen=True)
 class MeasuredExposures:
     """Result of N exposures that were measured together.
 
-    ``found`` contains the poses, and ``solved`` the stickers. ``others`` maps the index of an
-    exposure to its measurement. It contains the lost exposures, and all exposures if the method is
-    not registration.
+    ``found`` contains the poses, and ``solved`` the stickers. ``others`` maps indices of exposures
+    to measurements. It contains the lost exposures, and all exposures if the method is not
+    registration.
     """
 
     estimator: PoseEstimator
@@ -115,9 +115,12 @@ class MeasuredExposures:
 
     def measurements(self) -> list[Measurement]:
         """Return the measurement of each exposure."""
-        return [self.others.get(k) or self._one(k) for k in range(len(self.found.poses))]
+        return [
+            self.others.get(k) or self._by_registration(k) for k in range(len(self.found.poses))
+        ]
 
-    def _one(self, k: int) -> Measurement:
+    def _by_registration(self, k: int) -> Measurement:
+        """Return the measurement of an exposure that is not among ``others``."""
         pose = self.found.poses[k]
         return self.estimator.measurement(pose, self.found.covariances[k], self.solved.of(k))
 
@@ -129,11 +132,12 @@ def measure_exposures(
     exposure_ends: tuple[Array, Array],
     frame_ends: tuple[Array, Array] | None = None,
 ) -> MeasuredExposures:
-    """Measure the platform in each of N exposures near expected camera_from_platform (N,4,4).
+    """Measure the platform in each of N exposures.
 
-    ``exposure_ends`` are the expected camera_from_platform (N,4,4) at the beginning and at the end
-    of the exposures. ``frame_ends`` are those half a frame period before and after the middles of
-    the exposures. The results equal those of ``PoseEstimator.measure`` for each exposure.
+    ``expected`` (N, 4, 4) are first guesses of camera_from_platform. ``exposure_ends`` are the
+    expected camera_from_platform (N, 4, 4) at the beginning and at the end of the exposures.
+    ``frame_ends`` are those half a frame period before and after the middles of the exposures. The
+    results equal those of ``PoseEstimator.measure`` for each exposure.
     """
     places = estimator.taught.platform_places
     normals = estimator.platform.sticker_normals
@@ -144,18 +148,19 @@ def measure_exposures(
     used = np.bincount(exposure_of[solved.used], minlength=len(expected))
     others = {}
     for k in np.flatnonzero(solved.lost | (estimator.method != "registration")):
-        one = estimator.measurement_of(solved, int(k))
-        others[int(k)] = one
-        poses[k] = one.pose
-        covariances[k] = one.covariance
-        used[k] = len(one.target_ids)
+        measured = estimator.measurement_of(solved, int(k))
+        others[int(k)] = measured
+        poses[k] = measured.pose
+        covariances[k] = measured.covariance
+        used[k] = len(measured.target_ids)
     return MeasuredExposures(estimator, MeasuredPoses(poses, covariances, used), solved, others)
 
 
 def on_all_cores(work: Callable[[T], R], parts: Sequence[T], renderer: Renderer) -> Iterator[R]:
     """Yield the results of ``work`` on independent parts, in the order of the parts.
 
-    Several threads are used with the analytic renderer only: OpenGL must be called from one thread.
+    Several threads are used with the analytic renderer only, because OpenGL must be called from one
+    thread.
     """
     threads = threads_at_most() if renderer is ANALYTIC else 1
     if threads == 1 or len(parts) < 2:

@@ -275,7 +275,7 @@ class Sensor(Instrument):
         """Measure the platform in many frames at once, on all cores.
 
         Each frame has its own noise and dropout. The noise has the same covariance as in `measure`,
-        but different random numbers. The rig does not drift.
+        but its random numbers can differ. The rig does not drift.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ class Sensor(Instrument):
         placed = self.true_cameras.placed(obstacles)
         if isinstance(camera, VirtualStereoCamera):
             blocks = measure_frames(camera, self._frames(pose_values, rates, search_poses, placed))
-            measured = MeasuredPoses.of([each.found for each in blocks])
+            measured = MeasuredPoses.of([block.found for block in blocks])
         elif isinstance(tracker := self._new_tracker(), Tracker):
             measured = MeasuredPoses.of_each(
                 measure_without_images(
@@ -355,7 +355,7 @@ class Sensor(Instrument):
 
         Examples
         --------
-        >>> [one.ok for one in sensor.measure_each([sensor.home], [sensor.home])]
+        >>> [measured.ok for measured in sensor.measure_each([sensor.home], [sensor.home])]
         [True]
         """
         pose_values = pose_rows(poses)
@@ -366,21 +366,21 @@ class Sensor(Instrument):
         frames = self._frames(pose_values, 0.0 * pose_values, search_poses, {})
         if isinstance(camera, StatisticalStereoCamera):
             return measure_without_images(camera, frames)
-        return [one for each in measure_frames(camera, frames) for one in each.measurements()]
+        return [m for block in measure_frames(camera, frames) for m in block.measurements()]
 
     def _frames(
-        self, at: Array, rates: Array, around: Array, placed: Mapping[str, Array]
+        self, poses: Array, rates: Array, near: Array, placed: Mapping[str, Array]
     ) -> Frames:
-        """Return the next N frames, at poses ``at`` (N, 6) with rates (N, 6).
+        """Return the next N frames, at poses (N, 6) with rates (N, 6).
 
-        Stickers are searched near the poses ``around`` (N, 6).
+        Stickers are searched near the poses ``near`` (N, 6).
         """
         first = self._frame
-        self._frame += len(at)
-        streams = range(first, first + len(at))
+        self._frame += len(poses)
+        streams = range(first, first + len(poses))
         rngs = [np.random.default_rng([self._run_seed, RUN_STREAM, k]) for k in streams]
         period = 1.0 / self.timing.frame_rate
-        return Frames(self.estimator, at, rates, around, rngs, placed, period)
+        return Frames(self.estimator, poses, rates, near, rngs, placed, period)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         # StatisticalTracker is faster, but it supports registration only. It requires that no

@@ -1,4 +1,4 @@
-"""Stickers at their expected pixels, and the sizes of the windows that hold them."""
+"""Sizes of stickers in the images, and the windows and detection settings that follow from them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class StickerView:
 
     @cached_property
     def sizes(self) -> WindowSizes:
-        """Sizes of windows, which are larger for large or blurred stickers."""
+        """Sizes of the windows around stickers: large or blurred stickers need larger windows."""
         radius = self.file.stickers.radius
         camera_from_base = self.camera_from_base
         at_target = radius_at(self.rig, camera_from_base, np.array(self.file.rig.target), radius)

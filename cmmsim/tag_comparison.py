@@ -1,13 +1,14 @@
 """Poses from square tags (ArUco, AprilTag), compared with poses from the stickers of a sensor.
 
 A tag is drawn on each plane of the platform, as large as fits between the plane's stickers. It has
-the same cameras, grey levels, lens and noise as the stickers. OpenCV finds its corners. Tags and
-stickers are searched in the whole images of each frame, without tracking. The rig and the positions
-of all corners and stickers are known exactly. The errors are therefore those of the images alone.
+the grey levels of the stickers, and is seen by the same cameras with the same lens and noise.
+OpenCV finds its corners. Tags and stickers are searched in the whole images of each frame, without
+tracking. The rig and the positions of all corners and stickers are known exactly. The errors are
+therefore those of the images alone.
 
 Corners are triangulated and fitted rigidly like stickers, with equal weights. OpenCV states no
-covariance of its corners. The covariance of a pose from tags is therefore that of least squares,
-with the variance of a corner's pixels estimated from the residuals of the same frame.
+covariance of its corners. The covariance of a pose from tags is therefore that of least squares.
+The variance of a corner's pixel coordinates is estimated from the residuals of the same frame.
 
 The bias is the error without noise. It varies from pose to pose, so its root mean square is given.
 The scatter is the difference that the noise makes.
@@ -57,9 +58,9 @@ FEWEST_CORNERS = 8
 
 
 class Found(NamedTuple):
-    """Marks found in one frame.
+    """Stickers, or corners of tags, found in one frame, and the pose from them.
 
-    pixels      (2, n, 2), the left and the right image, px
+    pixels      (2, n, 2), px in the left and the right image
     expected    (2, n, 2), exact pixels of the same marks
     pose        (6,), m and rad; NaN if the frame is lost
     covariance  (6, 6), of the pose
@@ -81,12 +82,12 @@ LOST = (np.full(6, np.nan), np.full((6, 6), np.nan))
 class MarkScore:
     """Score of one kind of marks, found by one method.
 
-    points               mean number of stickers or corners in a frame
+    points               mean number of stickers or corners in a frame with noise
     bias_px, scatter_px  rms error of a point per axis without noise, and rms change by noise
     position_*_um        bias and scatter of the position, rms over axes
     angle_*_urad         bias and scatter of the orientation, rms over axes
     normalised_error     rms Mahalanobis distance of a pose, divided by √6; ideally 1
-    lost                 fraction of frames without a pose
+    lost                 fraction of frames with noise that have no pose
     milliseconds         median time from whole images to the pose
     """
 
@@ -283,9 +284,9 @@ def _pose_of(sensor: Sensor, places: Array, pixels: Array) -> tuple[Array, Array
 
 
 def _score(marks: str, method: str, poses: Array, found: Sequence[Sequence[Found]]) -> MarkScore:
-    """Return the score of ``found``, which has two results per pose: without and with noise.
+    """Return the score of one kind of marks.
 
-    ``poses`` (N, 6) are the true poses.
+    ``found`` has two results per pose: without and with noise. ``poses`` (N, 6) are the true poses.
     """
     clean = np.array([pair[0].pose for pair in found]) - poses
     noisy = np.array([pair[1].pose for pair in found]) - poses

@@ -9,9 +9,9 @@ The centres always come from the maximum-likelihood fit, whichever detector the 
 The base is seen at one pose only. If another detector were used here, every measured pose would
 therefore contain the bias of that detector.
 
-The search windows are made for the largest image of a sticker. This is the larger of two images:
-the image at the nearest working distance, assumed to be a fifth shorter than the distance of the
-rig's target, and the largest image that both cameras see at teaching.
+The windows have room for the largest image of a sticker. This is the larger of two images: the
+image at the nearest working distance, which is assumed to be a fifth shorter than the distance of
+the rig's target, and the largest image that both cameras see at teaching.
 """
 
 import warnings
@@ -56,7 +56,7 @@ LARGEST_GAP = 1e-4
 # A warning is given if the rms distance between the two rays of a sticker of the base exceeds this,
 # in standard deviations. It is 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
-# Additional distance that is allowed for errors of the print, in standard deviations.
+# Additional distance that is allowed for errors of the print, in their standard deviations.
 PRINT_REACH = 20.0
 # Phase of each pose coordinate at the start of the path, rad.
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
@@ -97,7 +97,7 @@ class Camera(Protocol):
     def look(
         self, pose: Array, rng: np.random.Generator, *, quality: Quality | None = None
     ) -> StereoImages | StickerExposure:
-        """Take one exposure of the platform at a pose (6,)."""
+        """Take an exposure, or the mean of several, of the platform at a pose (6,)."""
 
     def centre_error_px(self, quality: Quality) -> float:
         """Return the error of a sticker's centre that drawing causes, px rms."""
@@ -173,16 +173,16 @@ class Teacher:
     def _warn_of_parted_rays(self, base: StickerObservation) -> None:
         """Warn if the two rays of the base's stickers are farther apart than noise explains.
 
-        The rays are not tested if errors of the rig or of print are known to separate them, too.
+        There is no test if known errors of the rig or of the print separate the rays as well.
         """
         settings = self.observer.settings
         exact = settings.line_error_px == 0.0 and not settings.allowed.known
         parting = float(np.sqrt(np.mean(base.rays**2)))
         if exact and parting > LARGEST_PARTING:
             warnings.warn(
-                f"taught by {self.base.name}: the two rays of a sticker pass each other at "
-                f"{parting:.1f} times their noise, but at most {LARGEST_PARTING:g} are explained "
-                "by cameras and stickers as stated; poses err by more than is stated",
+                f"teaching: the two rays of a sticker of the {self.base.name} pass each other at "
+                f"{parting:.1f} standard deviations, rms, but with the stated cameras and stickers "
+                f"it is at most {LARGEST_PARTING:g}; poses have larger errors than they state",
                 TeachingWarning,
                 stacklevel=2,
             )
@@ -203,8 +203,8 @@ class Teacher:
     ) -> StickerObservation:
         """Observe all stickers of a body in averaged exposures of the platform at ``pose`` (6,).
 
-        The body is ``expected`` at camera_from_body (4, 4), with stickers at ``places`` (n, 3) in
-        its axes. Raises LostError if a sticker is missing.
+        ``expected`` (4, 4) is the expected camera_from_body, and ``places`` (n, 3) m are the
+        expected positions of the stickers in body axes. Raises LostError if a sticker is missing.
         """
         usual = self.observer.settings
         # Averaged exposures have so little noise that errors of the model dominate the misfit, so
@@ -231,7 +231,7 @@ class Teacher:
         return seen
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
-        """Return a text that names the missing stickers outside of an image, or an empty text."""
+        """Return a text that names missing stickers outside of an image, or an empty text."""
         outside = missing[~np.all(self.observer.rig.project(points[missing])[1], axis=0)]
         return (
             f"; {', '.join(body.sticker_ids[outside])} lie outside of an image"

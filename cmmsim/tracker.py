@@ -80,7 +80,7 @@ class Tracker:
         best = self._tracked(images)
         if best is None or len(best[0].target_ids) < EXPECTED_SHARE * self._seen:
             try:
-                found = self._found(images)
+                searched = self._searched(images)
             except LostError as error:
                 # If two groups of stickers contradict each other, windows that show only one of
                 # them must not decide for this group.
@@ -89,9 +89,9 @@ class Tracker:
                     return lost_measurement(str(error))
             else:
                 best = (
-                    found
+                    searched
                     if best is None
-                    else max(best, found, key=lambda result: len(result[0].target_ids))
+                    else max(best, searched, key=lambda result: len(result[0].target_ids))
                 )
         measurement, measured = best
         self._step_before = None if self._last is None else invert(self._last) @ measured
@@ -115,33 +115,33 @@ class Tracker:
             if self._step_before is not None:
                 predicted = self._predicted()
                 return self._estimator.measure(images, predicted, *self._ends(predicted))
-            found = self._estimator.measure(images, self._last)
-            return self._estimator.measure(images, found[1], *self._ends(found[1]))
+            _, rough = self._estimator.measure(images, self._last)
+            return self._estimator.measure(images, rough, *self._ends(rough))
         except LostError:
             return None
 
-    def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
+    def _searched(self, images: StereoImages) -> tuple[Measurement, Array]:
         """Return the measurement after a search of the whole images."""
-        found = self._estimator.locate(images)
+        rough = self._estimator.locate(images)
         if self._last is None:
-            return self._estimator.measure_anew(images, found)
-        return self._estimator.measure(images, found, *self._ends(found))
+            return self._estimator.measure_anew(images, rough)
+        return self._estimator.measure(images, rough, *self._ends(rough))
 
     def _ends(self, middle: Array) -> tuple[Ends, Ends]:
-        """Return the ends of the exposure, and those of a frame period about its middle.
+        """Return camera_from_platform at both ends of the exposure, and of a frame period.
 
-        The first result is None if the exposure takes no time. Without a previous pose, both are
-        None.
+        Both intervals have the same middle, in which camera_from_platform is ``middle``. The first
+        result is None if the exposure takes no time. Without a previous pose, both are None.
         """
         share = self._estimator.settings.exposed_share
         return self._part_of_frame(middle, share), self._part_of_frame(middle, 1.0)
 
     def _part_of_frame(self, middle: Array, share: float) -> Ends:
-        """Return camera_from_platform (4, 4) at both ends of a fraction of a frame period.
+        """Return camera_from_platform (4, 4) at both ends of the fraction ``share`` of a period.
 
-        ``share`` is this fraction. In its middle, camera_from_platform is ``middle``. The speed is
-        the mean speed since the previous frame. The result is None without a previous frame, or if
-        the fraction is zero.
+        In the middle of this interval, camera_from_platform is ``middle``. The speed is the mean
+        speed since the previous frame. The result is None without a previous pose, or if ``share``
+        is zero.
         """
         if self._last is None or share == 0.0:
             return None

@@ -78,7 +78,7 @@ class TrueCameras:
         self._file = file
         self._noise = noise
         self._optics = optics
-        self._asked_renderer = renderer
+        self._renderer_name = renderer
         self._bodies = bodies
         self.rig, self.camera_from_base = rig_from_file(file.rig)
         self.scene = [
@@ -104,7 +104,7 @@ class TrueCameras:
         self._draw_anew()
 
     def placed(self, obstacles: Mapping[str, Array] | None) -> Mapping[str, Array]:
-        """Return the transforms base_from_body (4, 4) of obstacles after checks.
+        """Check the transforms base_from_body (4, 4) of obstacles, and return them.
 
         Raises the same exceptions as `Sensor.look`.
         """
@@ -120,18 +120,18 @@ class TrueCameras:
         for name in obstacles:
             if name not in self.obstacles:
                 raise UnknownBodyError(name, self.obstacles)
-        plain = [
-            place
-            for place in obstacles.values()
-            if isinstance(place, np.ndarray) and place.shape == (4, 4)
+        arrays = [
+            transform
+            for transform in obstacles.values()
+            if isinstance(transform, np.ndarray) and transform.shape == (4, 4)
         ]
-        if plain and len(plain) == len(obstacles):
-            together = np.array(plain)
+        if arrays and len(arrays) == len(obstacles):
+            together = np.array(arrays)
             if together.dtype == float and all_rigid(together):
                 return dict(zip(obstacles, together, strict=True))
         return {
-            name: checked_transform(place, f"obstacle {name!r}: base_from_body")
-            for name, place in obstacles.items()
+            name: checked_transform(transform, f"obstacle {name!r}: base_from_body")
+            for name, transform in obstacles.items()
         }
 
     def _are_placed(self, bodies: PlacedBodies) -> bool:
@@ -171,7 +171,7 @@ class TrueCameras:
     @cached_property
     def renderer(self) -> Renderer:
         """Renderer in use. It is chosen on first use."""
-        return choose_renderer(self._asked_renderer)
+        return choose_renderer(self._renderer_name)
 
     @cached_property
     def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
@@ -253,7 +253,7 @@ class TrueCameras:
     def _require_in_sight(self, changes: Array, what: str) -> None:
         """Raise CmmError if changes (24,) of the rig move stickers out of an image.
 
-        Only stickers that the image shows with the platform at home are considered.
+        The platform is at home. Stickers that are not in the image before the changes do not count.
         """
         moved = self.rig.moved(changes)
         base_from_bodies = (pose_to_transform(self._file.platform.home), np.eye(4))

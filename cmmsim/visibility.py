@@ -35,7 +35,7 @@ EDGE_PX = DetectionSettings().window_size
 
 @dataclass(frozen=True)
 class SightLines:
-    """Geometry that decides visibility: a platform with nominal sticker positions, and the rig.
+    """Platform with nominal sticker positions, and the rig that sees it.
 
     ``camera_from_base`` is (4, 4).
     """

@@ -149,7 +149,7 @@ def test_beside_the_package_of_pre_commit_the_command_refuses_with_the_reason(tm
     )
     assert command.returncode == 1
     assert command.stderr.startswith(
-        "error: identify 2.6.9 of PyPI is installed beside cmmsim, which replaced its files; "
+        "error: another package, identify 2.6.9 of PyPI, is installed in the same environment; "
         "install cmmsim into a virtual environment of its own"
     )
     assert command.stderr.count("\n") == 1

@@ -129,13 +129,13 @@ def find_detector(name: str) -> Detector:
     return find("detector", name, DETECTORS, Detector, _check_centres)
 
 
-_WARNED: set[str] = set()  # detectors of users of which a warning was issued in this process
+_WARNED: set[str] = set()  # users' detectors that this process has already warned of
 
 
 def _check_centres(part: str, result: object, spots: SpotWindows) -> None:
     """Raise CmmError if the result of a user's detector has a wrong type, shape or value.
 
-    Warns of a constant offset of the centres.
+    Warn once if all centres have the same offset.
     """
     require_kind(result, DetectedCentres, f"{part} must return DetectedCentres")
     count = len(spots.windows)

@@ -133,6 +133,10 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
         ),
         (lambda s: s.measure(s.home, {"crank9": np.eye(4)}), "'crank9'.*crank1"),
         (
+            lambda s: cmmsim.load_sensor("ctrack780").look(s.home, {"link": np.eye(4)}),
+            "unknown body 'link': none is registered; call add_bodies first",
+        ),
+        (
             lambda s: s.measure(s.home, {"crank1": MOVED.T}),
             r"obstacle 'crank1': .*the last row \[0 0 0 1\]",
         ),
