@@ -57,3 +57,11 @@ def likelier_times(times: Array, poses: Array, covariance: Array, rate_hz: float
         return times
     stated, framed = (local_misfit(one, poses, covariance) for one in (times, grid))
     return grid if framed < BETTER * stated else times
+
+
+def missing_rows(time: Array, rate_hz: float) -> int:
+    """Return how many frames between the first and the last of times (N,), s, have no row.
+
+    The number is 0 if the frames were faster than ``rate_hz``.
+    """
+    return max(0, round(float(np.ptp(time)) * rate_hz) + 1 - len(time))

@@ -22,7 +22,7 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.checks import begins_at_rest
-from identify.record.frame_times import GAP, frame_grid, likelier_times, mean_rate
+from identify.record.frame_times import GAP, frame_grid, likelier_times, mean_rate, missing_rows
 from identify.record.lost_frames import repeated_note
 from identify.record.recording import build_record
 from identify.record.smoothness import wrong_poses
@@ -36,7 +36,9 @@ OTHER_RATE = 0.05
 NAMED = 10  # largest number of gross errors whose times a note names
 # Attribute of a record with what was decided when its file was read, as a JSON list.
 NOTES = "notes"
-LOGGED_ROWS = "logged_rows"  # attribute of a record with the number of rows of poses in its log
+# Attributes of a record: number of rows for poses in its log, and of frames without a row there.
+LOGGED_ROWS = "logged_rows"
+MISSING_ROWS = "missing_rows"
 
 
 def record_of(
@@ -55,9 +57,9 @@ def record_of(
         covariances = np.tile(stated, (len(ok), 1, 1))
     _check_clocks(telemetry)
     wrong, notes = _gross(telemetry.poses, covariances)
+    notes += repeated_note(telemetry.poses)
     poses = replace(telemetry.poses, ok=ok & ~wrong, covariance=covariances)
     telemetry = replace(telemetry, poses=poses)
-    notes += repeated_note(poses)
     given: dict[str, Any] = {
         "robot": robot.name,
         "scenario_toml": scenario_toml,
@@ -93,7 +95,8 @@ def record_of(
             **given,
         )
         notes += [f"the commands drive the model: {why}", *more, *held]
-    record.attrs[LOGGED_ROWS] = len(ok)
+    missing = missing_rows(poses.time, timing.frame_rate_hz)
+    record.attrs |= {LOGGED_ROWS: len(ok), MISSING_ROWS: missing}
     if notes:
         record.attrs[NOTES] = json.dumps(notes)
     return record
@@ -155,9 +158,11 @@ def _gross(log: PoseLog, covariances: Array) -> tuple[NDArray[np.bool_], list[st
     shown = ", ".join(f"{time:.3f}" for time in log.time[wrong][:NAMED])
     named = f"t = {shown} s" + (f" and {count - NAMED} more" if count > NAMED else "")
     if count > MOST_GROSS * good:
+        repeated = "".join(f"; {note}" for note in repeated_note(log))
         raise GrossErrors(
             f"{log.rows.source}: {count} of {good} poses are far from the motion of their "
-            f"neighbours, at {named}; at most {MOST_GROSS:.0%} are left out as gross errors",
+            f"neighbours, at {named}; at most {MOST_GROSS:.0%} are left out as gross errors"
+            f"{repeated}",
             log,
             wrong,
         )

@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from identify.arrays import Array
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE
-from identify.record.from_telemetry import LOGGED_ROWS
+from identify.record.frame_times import missing_rows
+from identify.record.from_telemetry import LOGGED_ROWS, MISSING_ROWS
 from identify.reporting import paper, parameter_tables, tables
 from identify.reporting.number_format import number, typographic, with_deviation
 from identify.reporting.run_data import RunData
@@ -63,7 +63,7 @@ def sensor_section(data: RunData) -> Section:
     # The result of a real robot has no entry `sensor`, because no truth is known.
     if "sensor" not in data.result:
         said += [
-            _counted(data.experiment, ok, data.scenario.timing.frame_rate_hz),
+            row_counts(data.experiment, ok, data.scenario.timing.frame_rate_hz),
             "The truth is not known: the uncertainties below are those that the sensor states.",
         ]
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
@@ -91,26 +91,19 @@ def sensor_section(data: RunData) -> Section:
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
 
 
-def _counted(record: xr.Dataset, ok: NDArray[np.bool_], rate_hz: float) -> str:
+def row_counts(record: xr.Dataset, ok: NDArray[np.bool_], rate_hz: float) -> str:
     """Return the numbers of rows and poses of a record of one's own. ok (N,): measured rows."""
     rows = int(record.attrs.get(LOGGED_ROWS, len(ok)))
-    missing = frames_due(record["time"].values, rate_hz) - len(ok)
-    parts = [f"The log has {rows} rows for poses: {int(ok.sum())} with a pose that is used"]
+    missing = int(record.attrs.get(MISSING_ROWS, missing_rows(record["time"].values, rate_hz)))
+    source = "log" if LOGGED_ROWS in record.attrs else "record"
+    parts = [f"The {source} has {rows} rows for poses: {int(ok.sum())} with a pose that is used"]
     if len(ok) > ok.sum():
-        parts.append(f"{len(ok) - int(ok.sum())} whose pose was lost, or left out as a gross error")
+        parts.append(f"{len(ok) - int(ok.sum())} whose pose was lost or a gross error")
     if rows > len(ok):
         parts.append(f"{rows - len(ok)} that are left out, before two commands act or in a gap")
-    said = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
-    gaps = f" Beside them, {missing} frames of {rate_hz:g} Hz are missing in the log."
+    said = ", ".join([*parts[:-1], f"and {parts[-1]}"]) if len(parts) > 1 else parts[0]
+    gaps = f" Beside them, {missing} frames of {rate_hz:g} Hz are missing in it."
     return f"{said}.{gaps if missing else ''}"
-
-
-def frames_due(time: Array, rate_hz: float) -> int:
-    """Return the number of frames between the first and the last time (N,) of a record, s.
-
-    The number is at least N, even if the frames were faster than ``rate_hz``.
-    """
-    return max(len(time), round(float(np.ptp(time)) * rate_hz) + 1)
 
 
 def excitation_section(data: RunData) -> Section:

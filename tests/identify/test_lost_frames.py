@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from identify.errors import RecordError
+from identify.record.from_telemetry import reading_notes
 from identify.record.lost_frames import repeated_note
 from identify.record.own_record import read_own_records
 from identify.record.recording import poses
@@ -90,3 +91,9 @@ def test_zeros_of_a_platform_that_stands_at_zero_are_poses(mapped):
     table.loc[:10, MEASURED] = 0.0
     table.to_csv(mapped, index=False)
     assert telemetry_of(mapped).poses.ok[:5].all()
+
+
+def test_repeated_poses_that_are_left_out_as_gross_errors_are_noted(mine):  # noqa: F811
+    spoil(mine, None)
+    (found,), _ = read_own_records([mine])
+    assert any('lost = "repeated" in [columns' in note for note in reading_notes([found]))

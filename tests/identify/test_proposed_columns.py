@@ -159,6 +159,26 @@ def test_a_proposal_for_a_table_finds_poses_references_and_commands(record, tmp_
     )
 
 
+@pytest.mark.parametrize("form", ["{}_ref", "{}Ref", "desired_{}"])
+def test_desired_poses_are_proposed_by_a_word_before_or_after_their_axis(form, record, tmp_path):  # noqa: F811
+    """Beside a pose of which only the position names the body."""
+    table = as_table(tmp_path, record)
+    turns = {"alpha": "roll", "beta": "pitch", "gamma": "yaw"}
+    axes = {name: name for name in "xyz"} | turns
+    own = {"x": "tcp_x", "y": "tcp_y", "z": "tcp_z"}
+    names = {}
+    for name, axis in axes.items():
+        unit = "m" if name in own else "rad"
+        names[f"measured_{name}_{unit}"] = own.get(name, axis)
+        names[f"reference_{name}_{unit}"] = form.format(axis)
+    pd.read_csv(table).rename(columns=names).to_csv(table, index=False)
+    found = proposed(table, table)
+    assert found["measured"]["position"] == ["tcp_x", "tcp_y", "tcp_z"]
+    assert found["measured"]["orientation"] == ["roll", "pitch", "yaw"]
+    wanted = [form.format(axis) for axis in axes.values()]
+    assert [*found["reference"]["position"], *found["reference"]["orientation"]] == wanted
+
+
 def measured_pairs(recorded, rng):
     """The rows of `cmmsim measure` for the poses of a record, some of which are lost."""
     for k, pose in enumerate(poses(recorded, "measured")):

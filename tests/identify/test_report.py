@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.image import imread
 
 import identify
@@ -19,6 +20,7 @@ from dynamics.kinematics.platform import Chart
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
+from identify.record.frame_times import missing_rows
 from identify.record.model_runs import build_model_run
 from identify.record.recording import read, write
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
@@ -29,7 +31,7 @@ from identify.reporting.goals import check_goals, within_tolerance
 from identify.reporting.number_format import interval, number, rounded, typographic, with_deviation
 from identify.reporting.pictures import pictures
 from identify.reporting.report import render, write_report
-from identify.reporting.report_sections import SECTIONS, frames_due
+from identify.reporting.report_sections import SECTIONS, row_counts
 from identify.reporting.run_data import read_run
 from identify.reporting.verdict import cameras_consistent, key_numbers, verdict
 from identify.scenario import load_scenario
@@ -140,11 +142,19 @@ def test_words_of_the_figures_of_a_run_stand_within_their_files(result):
         assert not edges_with_ink(image), name
 
 
-def test_rows_that_a_log_lacks_count_as_frames_without_a_pose():
+def test_rows_that_a_log_lacks_are_counted_and_the_counts_of_its_rows_add_up():
     """600 frames of 60 Hz, of which the log has 593, and whose clock is slightly slow."""
     time = np.delete(np.arange(600) / 60.001, [50, 51, 180, 333, 334, 335, 480])
-    assert frames_due(time, 60.0) == 600
-    assert frames_due(np.arange(600) / 66.0, 60.0) == 600
+    assert missing_rows(time, 60.0) == 7
+    assert missing_rows(np.arange(600) / 66.0, 60.0) == 0
+    ok = np.ones(590, dtype=bool)
+    ok[[3, 9]] = False
+    record = xr.Dataset(coords={"time": time[3:]})
+    record.attrs = {"logged_rows": 593, "missing_rows": 7}
+    said = row_counts(record, ok, 60.0)
+    rows, used, lost, left, missing, _ = (int(one) for one in re.findall(r"\d+", said))
+    assert (rows, used, lost, left, missing) == (593, 588, 2, 3, 7)
+    assert rows == used + lost + left
 
 
 @pytest.mark.slow

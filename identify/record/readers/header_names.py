@@ -126,8 +126,8 @@ def _pose_words(name: str) -> list[str]:
     """Return the words of a name, with a word for desired poses first: x_ref, xRef and ref_x."""
     words = words_of(name)
     parts = [part for word in words for part in re.findall("[A-Z]?[a-z0-9]+|[A-Z]+", word)]
-    wanted = [part for part in parts if part.lower() in WANTED]
-    return [*wanted, *(part for part in parts if part not in wanted)] if wanted else words
+    wanted = [part.lower() for part in parts if part.lower() in WANTED]
+    return [*wanted, *(part for part in parts if part.lower() not in WANTED)] if wanted else words
 
 
 def _turned(named: Mapping[str, str]) -> tuple[tuple[str, ...], str | None]:

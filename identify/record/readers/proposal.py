@@ -139,6 +139,10 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, ro
         covariance = list(own["covariance"].names)
         if set(covariance) <= set(header.names):
             made.lines += [f"covariance = {_text(covariance)}", 'covariance_of = "angles"']
+    if table == "measured":
+        made.lines.append(
+            '# lost = "zeros"  # or "repeated", where the cells of lost poses are not empty'
+        )
     if header.kind == "Motive":
         made.lines.append(
             '# axes = ["x", "-z", "y"]  # where y is up in the log, as Motive exports by default'
