@@ -20,8 +20,8 @@ or several stickers are slightly misplaced. Each place is then compared with the
 stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
 their noise (squared Birge ratio), up to a limit, and by a factor, because such errors are not
 independent. The covariances are also enlarged for a warp of the whole pattern (``warp_kernels``),
-for errors that stickers share (``shared_error_kernels``), and for a pose from less than half of the
-stickers that were searched.
+for a plane of stickers that has slipped (``slip_kernels``), for errors that stickers share
+(``shared_error_kernels``), and for a pose from less than half of the stickers that were searched.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -65,6 +65,10 @@ SMALLEST_SHARE = 0.01
 WARP_CHANCE = 1e-3
 # Largest squared warp that noise explains, in its units.
 LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
+# Probability that a plane of a good frame counts as slipped. It is as large, for the same reason.
+SLIP_CHANCE = 1e-3
+# Largest squared slip of one of three planes that noise explains, in its units.
+LARGEST_SLIP = float(chdtri(3, SLIP_CHANCE / 3))
 # Errors that are larger than noise are not independent: a pose errs as if each were shared by this
 # number of stickers.
 EXCESS_SHARE = 4.0
@@ -89,7 +93,8 @@ class SolvedFrames:
                       larger than noise
     used              (k,), False for rejected stickers
     starts            (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
-    shared            (f, 6, 6), part of the covariances due to errors that stickers share
+    shared            (f, 6, 6), part of the covariances due to slips and to errors that stickers
+                      share
     verdicts          (f, COLUMNS), reasons why frames are lost
     places            (n, 3), taught places on ``body``
     """
@@ -177,6 +182,7 @@ def solve_frames(
         np.empty((len(of), 3)),
         np.empty((len(of), 3)),
         np.ascontiguousarray(seen.rays),
+        body.plane_index[sticker],
     )
     camera_from_body = np.array(near, dtype=float)
     spreads = np.zeros((frames, 6, 6))
@@ -222,7 +228,7 @@ def solver_limits(
     """Return the compiled solver's limits for frames with at most this number of stickers.
 
     A known error of the rig warps every frame. Its effect on the poses is stated as their common
-    error, so a warp is not tested in that case.
+    error, so warps, slips and delays are not tested in that case.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring.solver_kernels import SolverLimits
@@ -237,9 +243,11 @@ def solver_limits(
         _largest_totals(3 * stickers),
         EXCESS_SHARE,
         _tails(3 * stickers),
-        LARGEST_WARP if settings.line_error_px == 0.0 else np.inf,
+        LARGEST_WARP,
         WARP_SHARE,
+        LARGEST_SLIP,
         FEWEST_RIVALS,
+        settings.line_error_px == 0.0,
     )
 
 

@@ -24,6 +24,7 @@ from cmmsim.geometry.pose_fit_kernels import (
 from cmmsim.geometry.transform_kernels import make_rigid, move_by
 from cmmsim.measuring.outline_kernels import Outlines, outline_misfit
 from cmmsim.measuring.shared_error_kernels import Images, shared_errors
+from cmmsim.measuring.slip_kernels import largest_slip
 from cmmsim.measuring.warp_kernels import SHAPES, warp
 
 MOST_STEPS = 8
@@ -43,9 +44,8 @@ CONTRADICTED = 3
 # OUTLINE  squared misfit of the worse ellipse of this sticker
 # EXCESS   factor on the covariances
 # RIVALS   number of rejected stickers that agree with each other
-# WARP     squared size of the warp in units of its noise
-STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS, RIVALS, WARP = range(9)
-COLUMNS = 9
+STATE, SEEN, LEFT, FIRST, PLACE, OUTLINE, EXCESS, RIVALS = range(8)
+COLUMNS = 8
 
 
 class ObservedStickers(NamedTuple):
@@ -57,6 +57,7 @@ class ObservedStickers(NamedTuple):
     covariances   (n, 3, 3), covariances of the points
     arms, gaps    (n, 3), overwritten; ``pose_fit_kernels`` explains them
     rays          (n,), signed distances of both rays of a sticker, in units of their noise
+    planes        (n,), planes of the body on which the stickers lie, numbered from 0
     """
 
     used: Array
@@ -66,6 +67,7 @@ class ObservedStickers(NamedTuple):
     arms: Array
     gaps: Array
     rays: Array
+    planes: Array
 
 
 class SolverLimits(NamedTuple):
@@ -82,10 +84,12 @@ class SolverLimits(NamedTuple):
     excess_share    factor on the mean square of residuals that are larger than noise
     tails           (d,), factor on the covariance of a pose from few stickers, by the number of
                     degrees of freedom
-    largest_warp    largest squared warp that noise explains; infinite if an error of the rig is
-                    known, which leaves residuals like those of delays
+    largest_warp    largest squared warp that noise explains
     warp_share      factor on the mean square of the warp's shapes, for the covariances
+    largest_slip    largest squared slip of a plane that noise explains
     fewest_rivals   smallest number of rejected stickers that contradict the others
+    exact           True if no error of the rig is known. Such an error leaves residuals like those
+                    of delays, so warps, slips and delays are not tested.
     """
 
     largest_misfit: float
@@ -99,7 +103,9 @@ class SolverLimits(NamedTuple):
     tails: Array
     largest_warp: float
     warp_share: float
+    largest_slip: float
     fewest_rivals: int
+    exact: bool
 
 
 @compiled
@@ -195,8 +201,7 @@ def agree(
 ) -> None:  # fmt: skip
     """Reject stickers one by one until the others agree; see ``solve`` for the parameters.
 
-    At least ``fewest`` stickers must be left. Fills all columns of the ``verdict`` but RIVALS and
-    WARP.
+    At least ``fewest`` stickers must be left. Fills all columns of the ``verdict`` but RIVALS.
     """
     normal = np.empty((6, 6))
     misfits = np.zeros(2)
@@ -248,7 +253,7 @@ def rivals(
         return 0
     others = ObservedStickers(
         rejected.copy(), seen.points, seen.informations, seen.covariances, seen.arms.copy(),
-        seen.gaps.copy(), seen.rays,
+        seen.gaps.copy(), seen.rays, seen.planes,
     )  # fmt: skip
     other = place.copy()
     verdict = np.zeros(COLUMNS)
@@ -299,13 +304,12 @@ def solve(
     ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
     are the taught places. Stickers that contradict the others are marked as not used. The
     covariances of the used stickers are enlarged if residuals are larger than noise. ``shared``
-    (6,6) is the part of the covariance that ``shared_errors`` finds in row ``frame`` of the
-    ``images``. Arms and gaps must belong to ``place`` on entry.
+    (6,6) is the part of the covariance due to a slip, and to what ``shared_errors`` finds in row
+    ``frame`` of the ``images``. Arms and gaps must belong to ``place`` on entry.
     """
     shared[:] = 0.0
     rejected = seen.used.copy()
     verdict[RIVALS] = 0
-    verdict[WARP] = 0.0
     agree(seen, places, outlines, limits, place, covariance, limits.fewest, verdict)
     if verdict[STATE] != MEASURED:
         return
@@ -315,13 +319,20 @@ def solve(
     if verdict[RIVALS] > 0:
         verdict[STATE] = CONTRADICTED
         return
-    verdict[WARP] = warp(seen.used, seen.arms, seen.gaps, seen.informations, seen.rays, covariance)
-    exact = limits.largest_warp < np.inf
+    exact = limits.exact
     shared_errors(seen.used, places, seen.arms, images, frame, place, covariance, exact, shared)
     excess = verdict[EXCESS]
-    # Only the excess over the limit counts, so that good frames that just exceed it lose little.
-    beyond = verdict[WARP] - excess * limits.largest_warp
-    warped = excess + limits.warp_share * max(beyond, 0.0) / SHAPES
+    warped = excess
+    if exact:
+        scene = seen.arms, seen.gaps, seen.informations
+        beyond = warp(seen.used, *scene, seen.rays, covariance) - excess * limits.largest_warp
+        # Only the excess over the limit counts, so that good frames that just exceed it lose
+        # little.
+        warped += limits.warp_share * max(beyond, 0.0) / SHAPES
+        spread = np.empty((6, 6))
+        slip = largest_slip(seen.used, seen.planes, *scene, covariance, spread)
+        if slip > excess * limits.largest_slip:
+            shared += spread
     if excess > 1.0:
         excess *= limits.excess_share
     if 2 * verdict[LEFT] <= searched:
@@ -361,6 +372,7 @@ def solve_frames(
             seen.arms[first:last],
             seen.gaps[first:last],
             seen.rays[first:last],
+            seen.planes[first:last],
         )
         shown = Outlines(
             outlines.shapes[first:last],

@@ -251,9 +251,11 @@ class StatisticalTracker:
         return self._scene
 
     def _frame(self) -> Frame:
-        n = len(self._estimator.platform.sticker_ids)
-        rows = (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (n,)
-        stickers = ObservedStickers(np.empty(n, dtype=bool), *(np.empty(shape) for shape in rows))
+        # a copy, because the kernels would be compiled once more for a read-only array
+        planes = self._estimator.platform.plane_index.copy()
+        n = len(planes)
+        rows = [np.empty(shape) for shape in ((n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (n,))]
+        stickers = ObservedStickers._make([np.empty(n, dtype=bool), *rows, planes])
         pixels = np.empty((n, 2, 2))
         return Frame(stickers, pixels, np.empty((n, 2, 2, 2)), np.empty(n), np.empty(1))
 

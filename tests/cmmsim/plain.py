@@ -12,6 +12,7 @@ FEWEST, LARGEST_MISFIT, LARGEST_EXCESS = 5, chi2.isf(1e-4, 3), 6.0
 FEWEST_RIVALS, WARP_CHANCE, WARP_SHARE, EXCESS_SHARE, TAIL = 3, 1e-3, 8.0, 4.0, 0.999
 LARGEST_DELAY, DELAY_SHARE = 3.0, 2.0
 LARGEST_STRAIN, LARGEST_PARTING = 1e-3, 1e3  # a metre
+SLIP_CHANCE, LARGEST_SLIP = 1e-3, 1e-3  # m
 SMALLEST_SHARE = 0.01  # of a sticker's noise that must show in its residual
 
 
@@ -131,6 +132,31 @@ def warp(transform, places, points, covariances, rays):
     return sum(found) - _decrease(rows[0], residuals)
 
 
+def slip(transform, places, points, covariances, planes):
+    """Squared slip of the plane that slipped most, and the mean square (6, 6) of the pose's error.
+
+    The slip is fitted together with the pose, once as one of the plane and once as one of the rest.
+    """
+    turned = places @ transform[:3, :3].T
+    pose = np.concatenate([np.tile(np.eye(3), (len(places), 1, 1)), -skew(turned)], axis=2)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    gaps = np.einsum("nij,nj->ni", whiten, points - turned - transform[:3, 3]).ravel()
+    known = np.hstack([np.zeros((3, 6)), np.eye(3) / LARGEST_SLIP])
+    found = []
+    for plane in range(3):
+        spread = np.zeros((6, 6))
+        for moved in (planes == plane, planes != plane):
+            columns = np.concatenate([pose, moved[:, None, None] * np.eye(3)], axis=2)
+            rows = np.vstack([(whiten @ columns).reshape(-1, 9), known])
+            every = np.linalg.inv(rows.T @ rows)
+            change = every @ rows[:-3].T @ gaps
+            effect = every[:6, 6:] @ np.linalg.inv(every[6:, 6:])
+            mean_square = every[6:, 6:] + np.outer(change[6:], change[6:])
+            spread += 0.5 * effect @ mean_square @ effect.T
+        found.append((change[6:] @ np.linalg.solve(every[6:, 6:], change[6:]), spread))
+    return max(found, key=lambda one: one[0])
+
+
 def shared_errors(rig, transform, places, pixels, spreads, shifts, ends):
     """Covariance (6, 6) of a pose by errors that pixels (n, 2, 2) share, from whitened rows.
 
@@ -208,7 +234,7 @@ def few_growth(seen, kept, rejected, transform, covariance, places):
     return mean * 6.0 * f.ppf(TAIL, 6, 3 * len(kept) - 6) / chi2.ppf(TAIL, 6)
 
 
-def consistent(seen, rig, radius, places, normals):
+def consistent(seen, rig, radius, places, normals, planes):
     """Stickers that agree: their index, camera_from_body and its covariance; None when lost."""
     scene = seen, rig, radius, places, normals
     found = agreeing(np.arange(len(seen.index)), FEWEST, *scene)
@@ -218,11 +244,13 @@ def consistent(seen, rig, radius, places, normals):
     rejected = np.setdiff1d(np.arange(len(seen.index)), kept)
     if agreeing(rejected, FEWEST_RIVALS, *scene) is not None:
         return None
-    own = places[seen.index[kept]], seen.points[kept], seen.covariances[kept], seen.rays[kept]
-    warped = warp(transform, *own)
+    own = places[seen.index[kept]], seen.points[kept], seen.covariances[kept]
+    warped = warp(transform, *own, seen.rays[kept])
+    size, spread = slip(transform, *own, planes[seen.index[kept]])
+    slipped = size > growth * chi2.isf(SLIP_CHANCE / 3.0, 3)
     factors = [growth * (EXCESS_SHARE if growth > 1.0 else 1.0)]
     if 2 * len(kept) <= len(seen.index):
         factors.append(few_growth(seen, kept, rejected, transform, covariance, places))
     beyond = max(warped - growth * chi2.isf(WARP_CHANCE, 10), 0.0)
     factors.append(growth + WARP_SHARE * beyond / 10.0)
-    return seen.index[kept], transform, max(factors) * covariance
+    return seen.index[kept], transform, max(factors) * covariance + slipped * spread

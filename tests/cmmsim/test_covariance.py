@@ -24,6 +24,7 @@ from cmmsim.geometry.pose import (
     invert,
     pose_covariance,
     pose_to_transform,
+    rigid,
     transform_to_pose,
 )
 from cmmsim.geometry.pose_fit_kernels import residual_covariance, residual_misfit, turn_arm
@@ -199,7 +200,9 @@ def test_the_compiled_solver_finds_what_plain_numpy_finds():
         )
         seen = seen if k % 4 else replace(seen, outlines=None)
         seen = seen if k % 7 else replace(seen, covariances=seen.covariances / 4.0)
-        expected = plain.consistent(seen, RIG, RADIUS, BODY.nominal, BODY.sticker_normals)
+        expected = plain.consistent(
+            *(seen, RIG, RADIUS, BODY.nominal, BODY.sticker_normals, BODY.plane_index)
+        )
         if expected is None:
             with pytest.raises(LostError):
                 solved(seen)
@@ -266,6 +269,25 @@ def test_a_group_that_has_slipped_refuses_the_frame_even_if_it_is_a_third():
     seen = seen_from_home(np.random.default_rng(2), ALL, slipped=4e-4)
     with pytest.raises(LostError, match="12 visible stickers agree on one pose and 6 on another"):
         solved(seen)
+
+
+def test_a_plane_that_slipped_by_a_few_deviations_widens_the_covariance():
+    """Plane C has slipped, or both others have, so the pose of either is as likely to be right."""
+    slip = 1.5e-5  # m, along each axis
+    either = CAMERA_FROM_BODY, CAMERA_FROM_BODY @ rigid(np.eye(3), np.full(3, slip))
+    usual = solved(seen_from_home(np.random.default_rng(0), ALL))[2]
+    found = []
+    for seed in range(20):
+        seen = seen_from_home(np.random.default_rng(seed), ALL, slipped=slip)
+        used, move, covariance = solved(seen)
+        assert len(used.index) >= 16
+        for truth in either:
+            turn = Rotation.from_matrix(move[:3, :3] @ truth[:3, :3].T).as_rotvec()
+            error = np.append(move[:3, 3] - truth[:3, 3], turn)
+            found.append([squares(error, usual), squares(error, covariance)])
+    before, after = (np.sqrt(found) > 6.0).mean(axis=0)
+    assert before > 0.5
+    assert after < 0.1
 
 
 def test_images_that_are_apart_widen_the_covariance_though_each_sticker_agrees():

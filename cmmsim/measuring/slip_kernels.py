@@ -1,0 +1,75 @@
+"""Compiled test for a slip: one plane of stickers has moved against the others.
+
+The stickers of a plane are fixed to one part of the body. If this part slips, its stickers all move
+by the same vector. The pose follows some of them, so most of a small slip is an error of the pose,
+and single stickers hardly contradict the others. The vector is therefore fitted with the pose, for
+one plane after another.
+
+The images do not show whether the plane or the rest of the body has slipped. Both are equally
+likely. The pose that belongs to the rest, and the one that belongs to the plane, follow from the
+vector.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cmmsim.compilation import Array, compiled
+from cmmsim.geometry.matrix_kernels import factorise, invert_factored
+
+# Planes of stickers of a body.
+PLANES = 3
+# Inverse square of the largest slip, m. It keeps the matrices regular if the stickers do not show
+# the slip of a plane. Single stickers show a larger slip.
+KNOWN_SLIP = 1e6
+
+
+@compiled
+def largest_slip(
+    used: Array, planes: Array, arms: Array, gaps: Array, informations: Array, covariance: Array,
+    spread: Array,
+) -> float:  # fmt: skip
+    """Return the largest squared slip of a plane, in units of its noise.
+
+    The used stickers lie on ``planes`` (n,), numbered from 0. Their arms and gaps (n, 3) and
+    inverse covariances ``informations`` (n, 3, 3) are those of ``ObservedStickers``. ``covariance``
+    (6, 6) is that of the fitted pose. Noise alone gives a chi-square number with three degrees of
+    freedom for each plane. ``spread`` (6, 6) is filled with the mean square of the error of the
+    pose that this slip causes.
+    """
+    largest = -1.0
+    inverse = np.empty((3, 3))
+    for plane in range(PLANES):
+        information = KNOWN_SLIP * np.eye(3)
+        pushed = np.zeros((6, 3))
+        right = np.zeros(3)
+        for n in range(len(used)):
+            if not used[n] or planes[n] != plane:
+                continue
+            x, y, z = arms[n]
+            for j in range(3):
+                by_x, by_y, by_z = informations[n, j]
+                information[j] += informations[n, j]
+                right[j] += by_x * gaps[n, 0] + by_y * gaps[n, 1] + by_z * gaps[n, 2]
+                pushed[0, j] += by_x
+                pushed[1, j] += by_y
+                pushed[2, j] += by_z
+                pushed[3, j] += y * by_z - z * by_y
+                pushed[4, j] += z * by_x - x * by_z
+                pushed[5, j] += x * by_y - y * by_x
+        # The pose takes up a part of the slip.
+        taken = covariance @ pushed
+        information -= pushed.T @ taken
+        factorise(information)
+        invert_factored(information, inverse)
+        slip = inverse @ right
+        size = float(right @ slip)
+        if size > largest:
+            largest = size
+            mean_square = inverse + np.outer(slip, slip)
+            spread[:] = 0.5 * (taken @ mean_square @ taken.T)
+            # If the rest has slipped, the pose of the plane is right.
+            for i in range(3):
+                taken[i, i] -= 1.0
+            spread += 0.5 * (taken @ mean_square @ taken.T)
+    return largest
