@@ -326,7 +326,7 @@ class Instrument:
         CmmError
             If a name is not a parameter of the rig.
         ShapeError
-            If an amount is not a finite number.
+            If an amount or the delay is not a finite number.
 
         Examples
         --------

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 import trimesh
 
-from cmmsim.checks import require_kind
+from cmmsim.checks import finite_array, require_kind
 from cmmsim.errors import CmmError, UnknownBodyError
 from cmmsim.files.printed import print_sizes
 from cmmsim.files.rig_and_bodies import MarkedBody, lens_from_file, rig_from_file
@@ -147,8 +147,10 @@ class TrueCameras:
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """Change the true rig; see `Sensor.move_rig`."""
-        self.rig = self.rig.moved(rig_changes(changes))
-        self.right_later = right_later
+        moved = self.rig.moved(rig_changes(changes))
+        wanted = "right_later must be a finite number of seconds"
+        self.right_later = float(finite_array(right_later, (), wanted))
+        self.rig = moved
         self._draw_anew()
 
     def drift(self, changes: Mapping[str, float], frames: int) -> None:

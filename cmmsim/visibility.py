@@ -1,7 +1,7 @@
 """Stickers of the platform that both cameras see at a pose, and the stated accuracy at that pose.
 
-A sticker counts as visible if it lies in both images, at least the width of a detection window away
-from their edges, and neither camera sees it at grazing incidence. Obstacles are not considered.
+A sticker counts as visible if it lies in both images, at least `EDGE_PX` away from their edges, and
+neither camera sees it at grazing incidence. Obstacles are not considered.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from cmmsim.measuring.observation import DetectionSettings, faces_camera
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.sensor import Sensor
 
-# Stickers nearer to an edge of an image do not count as visible.
+# Stickers nearer to an edge of an image do not count as visible. This is the default window's side.
 EDGE_PX = DetectionSettings().window_size
 
 

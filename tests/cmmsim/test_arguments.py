@@ -160,6 +160,10 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
             lambda s: s.move_rig({"left.k1": np.nan}),
             "the change of left.k1 must be a finite number",
         ),
+        (
+            lambda s: s.move_rig({}, np.nan),
+            "right_later must be a finite number of seconds, got nan",
+        ),
         (lambda s: s.common_errors(np.zeros(6), np.zeros(6)), r"poses must be \(N,6\) and finite"),
         (
             lambda s: cmmsim.measure_frame(None, s.estimator),
