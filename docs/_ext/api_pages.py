@@ -6,10 +6,15 @@ import importlib
 import inspect
 
 
+def overview(name: str) -> str:
+    """The docstring of a package, which lists its public names."""
+    return f"```text\n{inspect.getdoc(importlib.import_module(name))}\n```"
+
+
 def package(name: str) -> str:
     """Directives for all of a package's public names, in its order."""
     module = importlib.import_module(name)
-    parts = [f"```{{py:module}} {name}\n```", f"```text\n{inspect.getdoc(module)}\n```"]
+    parts = [f"```{{py:module}} {name}\n```"]
     for public in module.__all__:
         found = getattr(module, public)
         if inspect.ismodule(found):

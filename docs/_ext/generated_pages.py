@@ -1,28 +1,29 @@
-"""Pages that are written from the code before each build, into docs/generated."""
+"""Pages that are written from the code before each build, into docs/generated: the Python
+interface, which Sphinx lays out. Commands and keys of files stand in the pages (`page_blocks.py`).
+"""
 
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import api_pages
-import command_pages
-import settings_pages
 from pydantic import BaseModel
 from sphinx.application import Sphinx
 
 PAGES: dict[str, Callable[[], str]] = {
-    "commands.md": command_pages.commands,
-    "scenario.md": settings_pages.scenario,
-    "sensor.md": settings_pages.sensor,
-    "robot.md": settings_pages.robot,
-    "study.md": settings_pages.study,
-    "record.md": settings_pages.record,
-    "record_rules.md": settings_pages.record_rules,
-    "record_variables.md": settings_pages.record_variables,
     "api_cmmsim.md": lambda: api_pages.package("cmmsim"),
     "api_dynamics.md": lambda: api_pages.package("dynamics"),
     "api_identify.md": lambda: api_pages.package("identify"),
 }
+
+# Directives that only the build can read. A code host hides them, because they stand in a comment.
+FOR_THE_BUILD = re.compile(r"^<!-- for the build\n(.*?)^-->$", re.MULTILINE | re.DOTALL)
+
+
+def with_directives(app: Sphinx, name: str, source: list[str]) -> None:
+    """Take the directives of a page out of their comments."""
+    source[0] = FOR_THE_BUILD.sub(r"\1", source[0])
 
 
 def write_pages(app: Sphinx) -> None:
@@ -50,5 +51,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     their own.
     """
     app.connect("builder-inited", write_pages, priority=100)
+    app.connect("source-read", with_directives)
     app.connect("autodoc-process-signature", without_fields)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,5 +1,5 @@
-"""What stands in the pages as it is kept elsewhere: tables of kept figures, and files that a page
-shows.
+"""What stands in the pages as it is kept elsewhere: tables of kept figures, files that a page
+shows, and commands and keys of files, which the code lists.
 
 Pages are read on code hosts as well, which run no extension. A block between `<!-- begin NAME -->`
 and `<!-- end -->` holds the table of this name, or the file of this path relative to its page.
@@ -14,7 +14,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import api_pages
+import command_pages
 import kept_figures
+import settings_pages
 from answer_figures import Point, picture
 from PIL import Image
 
@@ -188,14 +191,32 @@ TABLES: dict[str, Callable[[Path], str]] = {
     ),
 }
 
+# What the code lists, for the pages of the reference.
+LISTS: dict[str, Callable[[], str]] = {
+    "commands": command_pages.commands,
+    "scenario_keys": settings_pages.scenario,
+    "sensor_keys": settings_pages.sensor,
+    "robot_keys": settings_pages.robot,
+    "study_keys": settings_pages.study,
+    "record_keys": settings_pages.record,
+    "record_rules": settings_pages.record_rules,
+    "record_variables": settings_pages.record_variables,
+    "package_cmmsim": lambda: api_pages.overview("cmmsim"),
+    "package_dynamics": lambda: api_pages.overview("dynamics"),
+    "package_identify": lambda: api_pages.overview("identify"),
+}
+
 
 def renewed(page: Path, text: str) -> str:
     """Text of a page, whose blocks hold what they should."""
 
     def block(found: re.Match[str]) -> str:
         name = found[1]
-        content = TABLES[name](KEPT).strip() if name in TABLES else shown(page.parent / name)
-        return f"<!-- begin {name} -->\n\n{content}\n\n<!-- end -->"
+        if name in TABLES:
+            content = TABLES[name](KEPT)
+        else:
+            content = LISTS[name]() if name in LISTS else shown(page.parent / name)
+        return f"<!-- begin {name} -->\n\n{content.strip()}\n\n<!-- end -->"
 
     return BLOCK.sub(block, text)
 
