@@ -49,7 +49,8 @@ def diagnose(
     Each cause of a catalogue, such as the zero of a joint or the clock of the commands, is judged
     by the share of the misfit that it explains. The best one is fitted beside the parameters, then
     the others are judged again. cmmsim identify does the same if noise does not explain the record,
-    unless the drift watch of the cameras has warned. If no cause is needed, the first line says so.
+    unless the drift watch of the cameras has warned. If no cause is needed, the command says so,
+    and prints the causes only with --add.
     A cause of your own is a function (run, size) that returns the model of the run with this cause,
     see identify.diagnosis.diagnose.
 
@@ -70,13 +71,19 @@ def diagnose(
     allow_named(add)
     context.with_resource(lock_folder(run))
     found = diagnose_run(run, [own_cause(name) for name in add or ()])
-    tell(found.to_dict(), json, quiet, lambda: _say(found))
+    tell(found.to_dict(), json, quiet, lambda: _say(found, ranked=bool(add)))
 
 
-def _say(found: "Diagnosis") -> None:
-    """Print whether a cause is needed, the ranking, and the findings with their remedies."""
+def _say(found: "Diagnosis", ranked: bool) -> None:
+    """Print the findings with their remedies, or that no cause is needed, and the ranking.
+
+    If no cause is needed, the ranking is printed only if ``ranked`` is true.
+    """
     if found.not_needed:
-        typer.echo(f"{found.not_needed}; what follows is not needed")
+        typer.echo(found.not_needed)
+        if not ranked:
+            typer.echo("what each cause would explain: entry diagnosis of result.json, or --json -")
+            return
     rows = [
         (
             one.name,

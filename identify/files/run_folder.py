@@ -230,6 +230,15 @@ def predicted_row(run: dict[str, Any]) -> list[float]:
     return rms_row(run.get("predicted"), "std")
 
 
+def actual_row(run: dict[str, Any]) -> list[float]:
+    """Return the six RMS distances [um, urad] of the true robot from the predicted poses of a run.
+
+    Without predicted poses, the distances are those from the poses of the identified model.
+    """
+    predicted = run.get("predicted", {})
+    return rms_row(predicted if "position_rms_um" in predicted else run["true"])
+
+
 def _text(entry: Mapping[str, Any]) -> str:
     return json.dumps(entry, indent=2, allow_nan=False) + "\n"
 

@@ -47,15 +47,25 @@ MODEL_VARIABLES: Variables = {
 
 # Additional variables of runs of validation trajectories.
 PREDICTED: Variables = {
+    "predicted_position": (
+        ("time", "axis"),
+        "m",
+        "position of the identified model together with the estimated common errors",
+    ),
+    "predicted_orientation": (
+        ("time", "angle"),
+        "rad",
+        "orientation of the identified model together with the estimated common errors",
+    ),
     "std_position": (
         ("time", "axis"),
         "m",
-        "predicted standard deviation of the difference between plant and model, position",
+        "expected standard deviation of the plant about the predicted pose, position",
     ),
     "std_orientation": (
         ("time", "angle"),
         "rad",
-        "predicted standard deviation of the difference between plant and model, orientation",
+        "expected standard deviation of the plant about the predicted pose, orientation",
     ),
 }
 
@@ -64,7 +74,7 @@ def build_model_run(
     time: ArrayLike,
     initial_pose: ArrayLike,
     identified_pose: ArrayLike,
-    std: ArrayLike | None = None,
+    prediction: tuple[ArrayLike, ArrayLike] | None = None,
 ) -> xr.Dataset:
     """Build the dataset of the poses of the initial and the identified model in a run.
 
@@ -72,8 +82,8 @@ def build_model_run(
     initial_pose, identified_pose (N, 6)
                                     Poses of the models, m and rad. Poses of a diverged model that
                                     are not finite become NaN.
-    std (N, 6)                      Predicted standard deviations of the difference between the
-                                    poses of plant and identified model.
+    prediction 2 (N, 6)             Predicted poses of the plant, m and rad, and expected standard
+                                    deviations of the plant about them.
 
     Raises RecordError if a shape is wrong.
     """
@@ -82,7 +92,9 @@ def build_model_run(
         identified_pose, "identified_pose", "identified_position", "identified_orientation"
     )
     variables = MODEL_VARIABLES
-    if std is not None:
+    if prediction is not None:
+        predicted, std = prediction
+        values |= pose_parts(predicted, "predicted", "predicted_position", "predicted_orientation")
         values |= pose_parts(std, "std", "std_position", "std_orientation")
         variables = MODEL_VARIABLES | PREDICTED
     # Poses of a diverged model can be infinite.

@@ -25,6 +25,16 @@ def number(value: float | None, digits: int = 4) -> str:
     return mantissa.replace("-", "−")
 
 
+def significant(value: float | None, digits: int = 3) -> str:
+    """Format a number as `number` does, but with its final zeros, such as "0.460"."""
+    text = number(value, digits)
+    if value is None or not math.isfinite(value) or "×" in text:
+        return text
+    shown = f"{value:.{digits - 1}e}"
+    places = max(0, digits - 1 - int(shown.partition("e")[2]))
+    return f"{float(shown):.{places}f}".replace("-", "−")
+
+
 def with_deviation(value: float, std: float | None) -> str:
     """Format a value to the second digit of its standard deviation, such as "0.1046 ± 0.0011".
 

@@ -4,6 +4,7 @@ Sentences state what fixes the scale, which law the drives have, and why a param
 identified.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -269,9 +270,16 @@ def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
     )
 
 
+MOST_PLACES = 4  # decimal places of an error in per cent
+
+
 def _percent(entry: Entry, size: float) -> str:
     true = rounded(entry["true"], size)
     estimate = entry["estimate"]
     if not true or estimate is None:
         return "-"
-    return f"{100 * (estimate - true) / abs(true):+.2f}".replace("-", "−")
+    percent = 100 / abs(true)
+    # The error is shown to the second digit of its standard deviation.
+    digit = math.floor(math.log10(percent * entry["std"])) if entry.get("std") else -1
+    places = min(max(0, 1 - digit), MOST_PLACES)
+    return f"{percent * (estimate - true):+.{places}f}".replace("-", "−")

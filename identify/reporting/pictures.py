@@ -64,7 +64,8 @@ def pictures(data: RunData) -> dict[str, Picture]:
         **_of_the_sensor(data),
         **_of_the_motion(data),
         "fit_excitation": Picture(
-            lambda: fit.fit_figure(data.excitation_fit), FIT.format("exciting trajectory")
+            lambda: fit.fit_figure(data.excitation_fit),
+            FIT.format("exciting trajectory") + ("" if data.truth is None else f"{THICK}."),
         ),
         **_of_the_diagnosis(data.result),
         "parameters": Picture(
@@ -83,6 +84,8 @@ FIT = (
     "each component, the measured pose minus the identified model in every frame, with the RMS for "
     "the initial and for the identified model."
 )
+
+THICK = " Thick: the truth minus the identified model"
 
 GROUPS = (
     "Parameters in each sum on which the motion depends: one row per sum, one column per "
@@ -202,10 +205,12 @@ def _parameters_caption(identification: dict[str, Any]) -> str:
     entries = identification["parameters"]
     if any(entry["true"] is not None for entry in entries.values()):
         said = "Nineteen of twenty intervals should reach zero."
-        if identification.get("common_scale"):
+        if scale := identification.get("common_scale"):
+            known = sum(bool(entry["identifiable"]) for entry in entries.values())
             said = (
-                "Most intervals share the error of one common factor, so that they reach zero or "
-                "miss it together: over many experiments, nineteen of twenty should reach it."
+                f"{len(scale['shared']) + 1} of the {known} intervals share the error of one "
+                "common factor, so that these reach zero or miss it together: over many "
+                "experiments, nineteen of twenty intervals should reach it."
             )
         return (
             "Error of each identified parameter with its 95 % interval, in per cent of the truth. "
@@ -218,14 +223,22 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     shown = data.validation_fit
     if shown is None:
         return {}
+    errors = ""
+    alone = ""
+    if data.result["identification"].get("nuisance_prior_std"):
+        errors = " and the estimated errors that all frames share"
+        # The headline judges the model alone, unless the sensor states errors of its cameras.
+        if not unseen(data.result).estimated:
+            alone = " Without these errors, the model is off by what the headline says."
     bars = (
-        f"RMS of the {unseen(data.result).what} on each validation trajectory: bars against the "
-        "truth; diamonds as expected from the stated uncertainty; dashes against the measurement, "
-        "including its noise."
+        "Distance of the true robot from the predicted poses on each validation trajectory, RMS: "
+        "bars as it is, diamonds as expected from the stated uncertainty. Poses are predicted by "
+        f"the identified model{errors}.{alone} Dashes: the measured poses minus the identified "
+        "model, with their noise."
     )
     text = (
         FIT.format("first validation trajectory")
-        + " Thick: the truth minus the identified model; dotted: its expected range."
+        + f"{THICK}; dotted: the range in which the truth is expected."
     )
     return {
         "validation_errors": Picture(lambda: fit.validation_figure(data.result), bars),

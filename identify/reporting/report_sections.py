@@ -9,11 +9,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from identify.estimation.identifiability import IDENTIFIABLE_SHARE
+from identify.estimation.identifiability import FRICTION_SHARE, IDENTIFIABLE_SHARE
 from identify.record.frame_times import missing_rows
 from identify.record.from_telemetry import LOGGED_ROWS, MISSING_ROWS
 from identify.reporting import paper, parameter_tables, tables
-from identify.reporting.number_format import number, typographic, with_deviation
+from identify.reporting.number_format import number, significant, typographic, with_deviation
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
@@ -133,12 +133,14 @@ def parameter_section(data: RunData) -> Section:
     text = [
         f"The record identifies {tables.identified_counts(found)}. A quantity is identified if its "
         f"standard deviation is less than {100 * IDENTIFIABLE_SHARE:g} % of that of its initial "
-        "guess, and of the size of that guess.",
+        "guess, and of its size. The size is that of the initial guess or, for a friction with a "
+        f"guess of zero, {100 * FRICTION_SHARE:g} % of the torque or force that the joints hold at "
+        "home.",
         parameter_tables.scale_sentence(found),
         *filter(None, [tables.common_scale_sentence(found)]),
         *filter(None, [parameter_tables.drive_sentence(found)]),
         *_prior_text(found),
-        *_conditioning_text(found.get("conditioning")),
+        *_conditioning_text(found),
     ]
     folds = [
         FoldedText(f"Not identified, {len(names)} of {len(parameters)}: {reason}", ", ".join(names))
@@ -234,15 +236,22 @@ def _prior_text(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
+def _conditioning_text(found: dict[str, Any]) -> list[str]:
+    """State on how many quantities the motion depends, and how many of them the record shows."""
+    conditioning = found.get("conditioning")
     if conditioning is None:
         return []
     directions = conditioning["directions"]
-    unshown = conditioning["unshown"]
+    shown = directions - conditioning["unshown"]
+    sums = len(tables.sums_of(found))
+    single = len(found.get("groups", {})) - sums
+    # One direction of these quantities, that of the common factor, is not among the directions.
+    gains = directions + 1 - sums - single
     return [
-        f"The single parameters, sums and gains that poses can show are {directions} independent "
-        "quantities, up to one factor that is common to all of them. This record determines "
-        f"{directions - unshown} of them better than the initial guess does. A quantity counts as "
+        f"The motion depends on {sums} sums of parameters, on {single} single parameters and on "
+        f"{gains} gains. Poses show these {sums} + {single} + {gains} = {directions + 1} "
+        f"quantities up to one common factor, so that {directions} are independent. This record "
+        f"determines {shown} of them better than the initial guess does. A quantity counts as "
         "identified only if it is also known well enough."
     ]
 
@@ -254,9 +263,9 @@ def _index_text(data: RunData) -> tuple[str, ...]:
         return ()
     text = (
         "The observability index (eq. 39 of the paper; larger is better) is "
-        f"{number(chosen.first_index, 3)} for the first random candidate, "
-        f"{number(chosen.median_index, 3)} for the median, and "
-        f"{number(chosen.observability_index, 3)} for the trajectory that was used."
+        f"{significant(chosen.first_index, 3)} for the first random candidate, "
+        f"{significant(chosen.median_index, 3)} for the median, and "
+        f"{significant(chosen.observability_index, 3)} for the trajectory that was used."
     )
     if data.repeats_paper:
         text += (

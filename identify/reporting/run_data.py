@@ -144,8 +144,10 @@ class RunData:
             return None
         fit = _fit(self.validation[0], self.models[run_name(1)])
         model = self.models[run_name(1)]
-        std = poses(model, "std") if "std_position" in model else None
-        return replace(fit, truth=true_poses(self.validation_truth), std=std)
+        fit = replace(fit, truth=true_poses(self.validation_truth))
+        if "predicted_position" not in model:
+            return fit
+        return replace(fit, predicted=poses(model, "predicted"), std=poses(model, "std"))
 
     @cached_property
     def correlations(self) -> tuple[Array, list[str]]:

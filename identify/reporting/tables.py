@@ -13,12 +13,13 @@ from typing import Any
 import typer
 
 from identify.estimation.common_scale import ENTRY, found_errors
-from identify.files.run_folder import AXES, predicted_row, rms_row
+from identify.files.run_folder import AXES, actual_row, predicted_row, rms_row
 from identify.progress import print_advice, print_table
+from identify.record.stored_common_errors import kind_of
 from identify.reporting import paper
 from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals, explanation_goals, unseen
-from identify.reporting.number_format import number, with_deviation
+from identify.reporting.number_format import number, significant, with_deviation
 from identify.reporting.settings import SET_ANEW, changed_settings
 
 AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
@@ -131,9 +132,8 @@ def common_error_table(result: dict[str, Any]) -> Table:
         for name, before in found.get("nuisance_prior_std", {}).items()
     )
     note = (
-        "True minus known value, in the unit at the end of the name; geometric errors are in m and "
-        "rad. Centres of mass are first moments of all bodies of a kind. A visual servo "
-        "compensates errors of the poses, which the record therefore hardly shows."
+        f"True minus known value, in the unit at the end of the name.{_kinds_noted(found)} A "
+        "visual servo compensates errors of the poses, which the record therefore hardly shows."
         f"{_shares(found)}"
     )
     header = ("error", "prior standard deviation", "estimate ± standard deviation")
@@ -149,6 +149,19 @@ KINDS = {
     "products": "products of inertia",
     "passive_friction": "friction of passive joints",
 }
+
+
+# What names of common errors of a kind do not say.
+NOTES = {
+    "geometry": " Geometric errors are in m and rad.",
+    "centres": " Centres of mass are first moments of all bodies of a kind.",
+}
+
+
+def _kinds_noted(found: dict[str, Any]) -> str:
+    """Explain the names of the kinds of common errors that a result has."""
+    kinds = {kind_of(name) for name in found.get("nuisance_prior_std", {})}
+    return "".join(note for kind, note in NOTES.items() if kind in kinds)
 
 
 def _shares(found: dict[str, Any]) -> str:
@@ -168,21 +181,21 @@ def _shares(found: dict[str, Any]) -> str:
 def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:
     """Compare the model with the measurement on the exciting trajectory.
 
-    The columns are the RMS before and after the identification. With ``repeats_paper``, those of
-    the paper's table 3 follow.
+    The columns are the RMS of the initial and of the identified model. With ``repeats_paper``,
+    those of the paper's table 3 follow.
     """
-    before = _rms(rms_row(result.get("before")))
-    after = _rms(rms_row(result.get("after")))
-    header: tuple[str, ...] = ("component", "before", "after")
-    columns: list[Sequence[str]] = [AXIS_HEADER, before, after]
+    initial = _rms(rms_row(result.get("before")))
+    identified = _rms(rms_row(result.get("after")))
+    header: tuple[str, ...] = ("component", "initial model", "identified model")
+    columns: list[Sequence[str]] = [AXIS_HEADER, initial, identified]
     if repeats_paper:
-        header += ("paper before", "paper after")
+        header += ("paper, initial", "paper, identified")
         columns += [list(map(number, paper.BEFORE)), list(map(number, paper.AFTER))]
     return Table(
         "Model against measurement on the exciting trajectory, RMS",
         header,
         tuple(zip(*columns, strict=True)),
-        "diverged: the loop of the initial model is unstable." if "diverged" in before else "",
+        "diverged: the loop of the initial model is unstable." if "diverged" in initial else "",
     )
 
 
@@ -224,12 +237,9 @@ def prediction_table(result: dict[str, Any]) -> Table:
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         predicted = run.get("predicted", {})
-        rows.append((f"{n}: expected", *map(number, predicted_row(run)), ""))
-        # Without a prediction, the deviation is that from the identified model.
-        actual = rms_row(predicted if "position_rms_um" in predicted else run["true"])
-        rows.append(
-            (f"{n}: actual", *_rms(actual), number(predicted.get("normalised_squared_error")))
-        )
+        rows.append((f"{n}: expected", *map(significant, predicted_row(run)), ""))
+        squared = number(predicted.get("normalised_squared_error"))
+        rows.append((f"{n}: actual", *_rms(actual_row(run)), squared))
     return Table(
         "Expected and actual distance of the true robot from the predicted poses, RMS",
         ("run", *AXIS_HEADER, "actual²/expected²"),
@@ -293,7 +303,7 @@ def versions_table(result: dict[str, Any]) -> Table:
 
 
 def _rms(values: list[float]) -> list[str]:
-    return [number(value) if math.isfinite(value) else "diverged" for value in values]
+    return [significant(value) if math.isfinite(value) else "diverged" for value in values]
 
 
 def sums_of(identification: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -178,7 +178,7 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     text = f"On {len(runs)} validation trajectories, the {found.what} "
     if np.isfinite(identified).all():
         text += (
-            f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
+            f"is off by {_distance(identified, turns)} from the true robot (RMS of the worst axis)"
         )
     else:
         text += "is unstable"

@@ -30,7 +30,9 @@ class Control(Section):
         True, description="whether the drives take torques; otherwise only joint commands"
     )
     torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
-    torque_limit_N: float | None = quantity(None, "N", "the same for actuators that slide", gt=0)
+    torque_limit_N: float | None = quantity(
+        None, "N", "largest force of an actuator that slides", gt=0
+    )
     bandwidth_rad_s: float | None = quantity(
         None,
         "rad/s",
@@ -41,7 +43,9 @@ class Control(Section):
     servo_bandwidth_rad_s: float | None = quantity(
         None, "rad/s", "bandwidth for which `cmmsim check` designs gains of the visual servo", gt=0
     )
-    servo_damping: float = quantity(0.1, "1", "least damping of that design", ge=0, lt=1)
+    servo_damping: float = quantity(
+        0.1, "1", "least damping of the visual servo that `cmmsim check` designs", ge=0, lt=1
+    )
 
     @field_validator("law")
     @classmethod

@@ -76,7 +76,7 @@ class _Side(Section):
         None, "rad/s", "velocity v_s over which the law smoothed smooths the sign", gt=0
     )
     smoothing_velocity_m_s: float | None = quantity(
-        None, "m/s", "the same for actuators that slide", gt=0
+        None, "m/s", "velocity v_s of the law smoothed, for actuators that slide", gt=0
     )
     static_ratio: float | None = quantity(
         None, "1", "ratio of breakaway to Coulomb torque of the law stribeck", ge=1, le=1e3
@@ -85,7 +85,7 @@ class _Side(Section):
         None, "rad/s", "velocity over which the breakaway torque falls to the Coulomb torque", gt=0
     )
     stribeck_velocity_m_s: float | None = quantity(
-        None, "m/s", "the same for actuators that slide", gt=0
+        None, "m/s", "velocity over which the breakaway force falls to the Coulomb force", gt=0
     )
 
     @field_validator("inertia", mode="before")
@@ -148,7 +148,7 @@ class Plant(_Side):
     )
     joint_zero_error_m: float | list[float] = Field(
         0.0,
-        description="the same for actuators that slide, m",
+        description="what each sliding joint reads too little, m, as joint_zero_error_rad",
         json_schema_extra={"unit": "m"},
     )
     friction_offset_N_m: float | list[float] = Field(
@@ -159,7 +159,8 @@ class Plant(_Side):
     )
     friction_offset_N: float | list[float] = Field(
         0.0,
-        description="the same for actuators that slide, N",
+        description="half the difference of the Coulomb friction of each sliding joint in both "
+        "directions, N, as friction_offset_N_m",
         json_schema_extra={"unit": "N"},
     )
     command_scale: float = quantity(
@@ -169,7 +170,7 @@ class Plant(_Side):
         None, "rad", "steps to which the drives round the commands", gt=0, le=0.1
     )
     command_quantum_m: float | None = quantity(
-        None, "m", "the same for actuators that slide", gt=0, le=0.01
+        None, "m", "steps to which sliding drives round the commands", gt=0, le=0.01
     )
     command_limits_rad: list[float] | None = Field(
         None,
@@ -181,7 +182,7 @@ class Plant(_Side):
     )
     command_limits_m: list[float] | None = Field(
         None,
-        description="the same for actuators that slide, m",
+        description="lowest and highest command that the drives of actuators that slide take, m",
         min_length=2,
         max_length=2,
         json_schema_extra={"unit": "m"},
@@ -219,17 +220,21 @@ class Plant(_Side):
         le=1e6,
     )
     joint_stiffness_N_m: float | None = quantity(
-        None, "N/m", "the same for actuators that slide", gt=0, le=1e9
+        None, "N/m", "stiffness of the spring in an elastic joint that slides", gt=0, le=1e9
     )
-    joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
-    joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same for actuators that slide", ge=0)
+    joint_damping_N_m_s_rad: float = quantity(
+        0.05, "N m s/rad", "damping of the spring between motor and driven body", ge=0
+    )
+    joint_damping_N_s_m: float = quantity(
+        50.0, "N s/m", "damping of the spring in an elastic joint that slides", ge=0
+    )
     motor_inertia_kg_m2: float = quantity(
-        3e-4, "kg m2", "part of the driven body's inertia on the motor's side of that spring", gt=0
+        3e-4, "kg m2", "part of the driven body's inertia on the motor's side of the spring", gt=0
     )
     motor_mass_kg: float = quantity(
         0.3,
         "kg",
-        "part of the driven body's mass on the motor's side, for actuators that slide",
+        "part of the driven body's mass on the motor's side of the spring, if it slides",
         gt=0,
     )
 
@@ -295,7 +300,13 @@ class Model(_Side):
         ge=0,
         le=0.1,
     )
-    joint_zero_std_m: float = quantity(0.0, "m", "the same for actuators that slide", ge=0, le=0.1)
+    joint_zero_std_m: float = quantity(
+        0.0,
+        "m",
+        "standard deviation of the zero of each sliding joint, estimated beside the parameters",
+        ge=0,
+        le=0.1,
+    )
     command_scale_std: float = quantity(
         0.0,
         "1",
@@ -312,7 +323,11 @@ class Model(_Side):
         gt=0,
     )
     friction_offset_std_N: float | None = quantity(
-        None, "N", "the same for actuators that slide", gt=0
+        None,
+        "N",
+        "standard deviation of half the difference of the Coulomb friction of each sliding joint "
+        "in both directions, which is estimated beside the parameters",
+        gt=0,
     )
     static_ratio_std: float = quantity(
         0.0, "1", "standard deviation of static_ratio, estimated beside the parameters", ge=0, le=9

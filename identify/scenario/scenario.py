@@ -65,7 +65,11 @@ class Scenario(Section):
         "analytic; scene; auto, which is pyrender if OpenGL works; module:function; or "
         "statistical, which has no images and draws errors of sticker centres",
     )
-    pose_method: Literal["registration", "planes"] = "registration"
+    pose_method: Literal["registration", "planes"] = Field(
+        "registration",
+        description="how a pose follows from the stickers: registration, which fits their taught "
+        "places; or planes, which fits the planes A, B and C of each body",
+    )
     rig: Rig = Rig()
     timing: Timing = Timing()
     servo: Servo = Servo()

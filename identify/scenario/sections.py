@@ -27,7 +27,9 @@ class Excitation(Section):
     travel_margin_rad: float = quantity(
         0.10, "rad", "smallest distance from the travel limit of the joints", ge=0
     )
-    travel_margin_m: float = quantity(0.01, "m", "the same for actuators that slide", ge=0)
+    travel_margin_m: float = quantity(
+        0.01, "m", "smallest distance from the travel limit of actuators that slide", ge=0
+    )
     candidates: int = quantity(
         64,
         "1",
@@ -46,7 +48,9 @@ class Excitation(Section):
         "module:function",
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a joint", gt=0)
-    max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same for actuators that slide", gt=0)
+    max_joint_velocity_m_s: float = quantity(
+        0.2, "m/s", "largest velocity of an actuator that slides", gt=0
+    )
     least_leverage: float = quantity(
         0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1
     )
@@ -134,7 +138,8 @@ class Rig(Section):
     right_later_std_s: float = quantity(
         0.0,
         "s",
-        "standard deviation of that delay, whose expected value is zero",
+        "standard deviation of the delay of the right camera's exposure, whose expected value is "
+        "zero",
         ge=0,
         le=0.1,
     )
@@ -308,15 +313,25 @@ class Geometry(Section):
     encoder_noise_rad: float = quantity(
         1e-5, "rad", "standard deviation of one reading of an encoder", ge=0
     )
-    encoder_noise_m: float = quantity(1e-6, "m", "the same for actuators that slide", ge=0)
+    encoder_noise_m: float = quantity(
+        1e-6, "m", "standard deviation of one reading of an encoder of actuators that slide", ge=0
+    )
     encoder_resolution_rad: float = quantity(
         4.8e-5, "rad", "step of an encoder, here of 17 bits; 0 means no steps", ge=0
     )
-    encoder_resolution_m: float = quantity(1e-6, "m", "the same for actuators that slide", ge=0)
+    encoder_resolution_m: float = quantity(
+        1e-6, "m", "step of an encoder of actuators that slide; 0 means no steps", ge=0
+    )
     encoder_offset_rad: float = quantity(
         0.0, "rad", "standard deviation of the reading of an encoder at zero", ge=0, le=0.05
     )
-    encoder_offset_m: float = quantity(0.0, "m", "the same for actuators that slide", ge=0, le=0.01)
+    encoder_offset_m: float = quantity(
+        0.0,
+        "m",
+        "standard deviation of the reading of an encoder at zero, for actuators that slide",
+        ge=0,
+        le=0.01,
+    )
     unseen: int = quantity(
         200,
         "1",

@@ -87,7 +87,7 @@ def not_needed(result: dict[str, Any], found: Diagnosis) -> str:
         return ""
     return (
         "noise explains the record, and no cause is needed for an excess below "
-        f"{LITTLE:.0%} of it: {found.misfit}"
+        f"{LITTLE:.0%} of it: of the model that the logged commands drive, {found.misfit}"
     )
 
 

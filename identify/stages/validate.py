@@ -95,10 +95,10 @@ def validate(
     learned = result["identification"].get("nuisance_estimates", {})
     predictions = predicted_runs(side, records[1:], models[1], covariance, seed, progress, learned)
     # The exciting run was used for the fit, so there is no prediction for it.
-    deviations = [None, *(prediction.std for prediction in predictions)]
+    expected = [None, *((prediction.poses, prediction.std) for prediction in predictions)]
     of_models = [
-        build_model_run(record["time"].values, initial, identified, std)
-        for record, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
+        build_model_run(record["time"].values, initial, identified, each)
+        for record, (initial, identified), each in zip(records, model_poses, expected, strict=True)
     ]
     model_runs = model_groups(of_models[0], of_models[1:])
     pairs = [(files.experiment, excitation_truth), *((run.record, run.truth) for run in runs)]

@@ -104,7 +104,10 @@ def finished_run(tmp_path_factory):
     write_runs(run.validation, [(record, truth_of(plant))] * 2)
     std = np.full_like(initial, 2e-6)
     excitation = build_model_run(plant.time, initial, identified)
-    unseen = [build_model_run(plant.time, start, identified, std) for start in (diverging, initial)]
+    expected = identified, std
+    unseen = [
+        build_model_run(plant.time, start, identified, expected) for start in (diverging, initial)
+    ]
     write_model_runs(run.model, excitation, unseen)
     write_covariance(run.covariance, LAYOUT, np.diag(np.linspace(1.0, 2.0, len(NAMES))) + 0.1)
     save_result(run.result, make_result())

@@ -11,6 +11,7 @@ from scipy.stats import binom
 
 import identify
 from dynamics.geometry import RobotGeometry
+from identify.commands.diagnosis import _say
 from identify.diagnosis.candidate_fits import shown_sizes
 from identify.diagnosis.catalogue import own_cause
 from identify.diagnosis.cause import Cause, InList, in_each_run
@@ -443,7 +444,7 @@ def test_identify_stores_the_diagnosis_and_warns_and_the_command_repeats_it(run_
     assert "cmmsim geometry finds all zeros" in said
 
 
-def test_residuals_that_are_noise_and_a_warning_of_the_cameras_need_no_cause_in_the_robot():
+def test_residuals_that_are_noise_and_a_warning_of_the_cameras_need_no_cause_in_the_robot(capsys):
     """An excess of 5 % of the noise, as the errors of taught frames make it, and one of 20 %."""
     accused = Finding("zero of joint 4", "zeros", (), 0.4, 36.0, 1, 1e-6, (), ("--set a=1",))
     found = Diagnosis((accused,), (), Misfit(1.05, 1.0, 0.01), Misfit(1.0, 1.0, 0.01), 0.0)
@@ -461,6 +462,11 @@ def test_residuals_that_are_noise_and_a_warning_of_the_cameras_need_no_cause_in_
     assert str(calm).startswith("noise explains the record, and no cause is needed")
     assert "; not needed: zero of joint 4" in str(calm)
     assert with_diagnosis(result, calm)["identification"]["warnings"] == []
+    for ranked in (False, True):
+        _say(calm, ranked)
+        said = capsys.readouterr().out
+        assert said.startswith("noise explains the record")
+        assert ("what each alone explains" in said) == ranked
     missed = replace(found, misfit=Misfit(1.2, 1.0, 0.01))
     assert not_needed(result, missed) == ""
     warned = result | {"drift_watch": {"warning": "stickers are not where they should be"}}

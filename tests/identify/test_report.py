@@ -24,11 +24,18 @@ from identify.record.frame_times import missing_rows
 from identify.record.model_runs import build_model_run
 from identify.record.recording import read, write
 from identify.record.stored_common_errors import CommonErrors, store_common_errors
-from identify.reporting import paper, parameter_tables, tables
+from identify.reporting import paper, parameter_tables, report_sections, tables
 from identify.reporting.figures import estimates, fit, paths, style
 from identify.reporting.figures.fit import Fit
 from identify.reporting.goals import check_goals, within_tolerance
-from identify.reporting.number_format import interval, number, rounded, typographic, with_deviation
+from identify.reporting.number_format import (
+    interval,
+    number,
+    rounded,
+    significant,
+    typographic,
+    with_deviation,
+)
 from identify.reporting.pictures import pictures
 from identify.reporting.report import render, write_report
 from identify.reporting.report_sections import SECTIONS, row_counts
@@ -217,7 +224,7 @@ def test_report_shows_goals_parameters_the_index_and_names_what_is_missed(finish
         replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603))
     )
     chosen = (
-        "0.461 for the first random candidate, 0.46 for the median, and 0.529 for the "
+        "0.461 for the first random candidate, 0.460 for the median, and 0.529 for the "
         "trajectory that was used"
     )
     shown = (
@@ -286,7 +293,7 @@ def test_every_axis_has_a_unit_and_every_panel_its_letter(result):
 def test_no_two_curves_of_a_panel_differ_by_their_colour_alone(result):
     """In print, and for who sees no colours: style of line, width or marker differ too."""
     figures = (
-        fit.fit_figure(Fit(TIME, NOISE, NOISE, NOISE, truth=ZERO, std=ZERO + 1)),
+        fit.fit_figure(Fit(TIME, NOISE, NOISE, NOISE, truth=ZERO, predicted=ZERO, std=ZERO + 1)),
         fit.error_figure(Fit(TIME, NOISE, NOISE, NOISE + 1, truth=ZERO)),
         paths.excitation_figure(TIME, NOISE),
     )
@@ -352,21 +359,22 @@ def test_ellipses_hold_95_percent_of_drawn_errors():
     assert abs(inside.mean() - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 4000)
 
 
-def test_fit_figure_draws_what_it_is_given_and_predicted_deviations_as_a_band_of_two_about_zero():
+def test_fit_figure_draws_what_it_is_given_and_a_band_of_two_about_the_predicted_poses():
     """Error panel of z: measured minus identified is 3 µm everywhere, true minus identified
     1 µm."""
     path = 1e-3 * NOISE
     figure = fit.fit_figure(Fit(TIME, path + 3e-6, path, initial=path + 1e-3, truth=path + 1e-6))
     panel = figure.axes[5]
     np.testing.assert_allclose([line.get_ydata()[0] for line in panel.lines], [3.0, 1.0])
-    assert "997 → 3 µm" in panel.get_title()
+    assert "997 → 3.00 µm" in panel.get_title()
     assert [line.get_color() for line in figure.axes[2].lines] == [
         style.INK,
         style.GREEN,
         style.BLUE,
     ]
-    panel = fit.fit_figure(Fit(TIME, path, path, truth=path, std=ZERO + 2e-6)).axes[5]
-    assert [line.get_ydata()[0] for line in panel.lines[2:]] == pytest.approx([-4.0, 4.0])
+    expected = {"predicted": path + 1e-6, "std": ZERO + 2e-6}
+    panel = fit.fit_figure(Fit(TIME, path, path, truth=path, **expected)).axes[5]
+    assert [line.get_ydata()[0] for line in panel.lines[2:]] == pytest.approx([-3.0, 5.0])
     position, orientation = fit.error_figure(Fit(TIME, path, path + 3e-6, truth=path)).axes
     assert position.lines[-1].get_ydata() == pytest.approx(3 * math.sqrt(3))
     assert orientation.lines[0].get_ydata() == pytest.approx(0.0)
@@ -410,7 +418,7 @@ def test_group_figure_shows_the_share_of_each_member_and_what_is_subtracted():
     ).axes[0]
     added, subtracted = axes.collections[:2]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["m1", "m2"]
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["m1 + … *"]
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["m1 … *"]
     np.testing.assert_allclose(added.get_sizes(), [0.75 * estimates.LARGEST])
     np.testing.assert_allclose(subtracted.get_sizes(), [0.25 * estimates.LARGEST])
     assert subtracted.get_facecolor()[0][:3] == pytest.approx((1.0, 1.0, 1.0))
@@ -540,6 +548,9 @@ def test_the_first_look_has_three_numbers_with_and_without_truth(result):
 def test_numbers_have_the_digits_that_they_deserve_and_what_is_rounding_is_zero():
     assert [number(value) for value in (12345.6, 0.00052349, -2.0e-9, None, math.inf)] == [
         "12350", "0.0005235", "−2 × 10⁻⁹", "-", "-",
+    ]  # fmt: skip
+    assert [significant(value) for value in (0.4603, 11.04, 1132.4, 9.996, -0.0305, 2e-9, None)] == [
+        "0.460", "11.0", "1130", "10.0", "−0.0305", "2 × 10⁻⁹", "-",
     ]  # fmt: skip
     assert with_deviation(0.104632, 0.00112) == "0.1046 ± 0.0011"
     assert with_deviation(-5.231e-6, 3.3e-7) == "(−5.23 ± 0.33) × 10⁻⁶"
@@ -730,15 +741,15 @@ def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_
     result,
 ):
     table = tables.excitation_error_table(result, repeats_paper=True)
-    assert table.rows[0] == ("x [µm]", "diverged", "20", "1260", "408")
-    assert table.rows[5] == ("gamma [µrad]", "diverged", "82", "2800", "725")
-    assert tables.excitation_error_table(result).rows[5] == ("gamma [µrad]", "diverged", "82")
+    assert table.rows[0] == ("x [µm]", "diverged", "20.0", "1260", "408")
+    assert table.rows[5] == ("gamma [µrad]", "diverged", "82.0", "2800", "725")
+    assert tables.excitation_error_table(result).rows[5] == ("gamma [µrad]", "diverged", "82.0")
     validation = tables.validation_table(result, repeats_paper=True)
     assert validation.header[1] == "x [µm]"
-    assert validation.rows[0][:4] == ("1: identified, true", "1", "1.4", "1.8")
+    assert validation.rows[0][:4] == ("1: identified, true", "1.00", "1.40", "1.80")
     assert len(validation.rows) == 2 * 2 + 10
     assert len(tables.validation_table(result).rows) == 2 * 2
-    assert tables.sensor_table(result).rows[0][:4] == ("120", "0", "70", "5")
+    assert tables.sensor_table(result).rows[0][:4] == ("120", "0", "70", "5.00")
     result["validation"][0]["initial_true"] = {
         "position_rms_um": [None] * 3,
         "orientation_rms_urad": [None] * 3,
@@ -757,6 +768,49 @@ def test_tables_show_our_numbers_beside_the_papers_and_none_of_a_parameter_that_
         "0.1030 to 0.1070",
         "+0.96",
     )
+    # Its standard deviation is 14 % of the truth.
+    result["identification"]["parameters"] = {
+        "link4.mass": result["identification"]["parameters"]["joint1.coulomb"]
+        | {"true": 1.31, "estimate": 1.73, "std": 0.19}
+    }
+    assert parameter_tables.parameter_table(result).rows[0][-1] == "+32"
+
+
+def test_bars_and_diamonds_of_a_validation_run_are_of_the_same_poses(result):
+    """The actual distance from the predicted poses, and not that from the model alone."""
+    for run in result["validation"]:
+        run["predicted"] |= {
+            "position_rms_um": [0.5, 0.6, 0.7],
+            "orientation_rms_urad": [3.0, 4.0, 5.0],
+        }
+    panels = fit.validation_figure(result).axes
+    heights = [[bar.get_height() for bar in bars] for axes in panels for bars in axes.containers]
+    assert heights == [[size, size] for size in (0.5, 0.6, 0.7, 3.0, 4.0, 5.0)]
+    diamonds = [list(line.get_ydata()) for line in panels[0].lines if line.get_marker() == "D"]
+    assert diamonds == [[size, size] for size in (1.5, 2.5, 3.5)]
+    assert [row[1] for row in tables.prediction_table(result).rows[:2]] == ["1.50", "0.500"]
+
+
+def test_the_page_says_how_many_quantities_a_motion_shows_and_why_noise_gives_more_than_one(result):
+    """Two sums and one single parameter, with 39 directions beside the common factor."""
+    found = result["identification"]
+    several = {"coefficients": {"link1.mass": 1.0, "link1.Ixx": 2.0}, "identifiable": True}
+    single = {"coefficients": {"joint1.coulomb": 1.0}, "identifiable": True}
+    found["groups"] = {"a": several, "b": several, "c": single}
+    (said,) = report_sections._conditioning_text(found)
+    assert "these 2 + 1 + 37 = 40 quantities up to one common factor, so that 39" in said
+    details = [goal.detail for goal in check_goals(result)]
+    assert any("1.100 ± 0.040, more than 1 as it also moves the robot" in text for text in details)
+    found["expected_noise_ratio"] = 1.0
+    assert not any("more than 1" in goal.detail for goal in check_goals(result))
+
+
+def test_the_note_on_common_errors_explains_only_the_kinds_that_are_there(result):
+    found = result["identification"]
+    for name, centres in (("taught.base.tx_m", False), ("centres.link.mx_kg m", True)):
+        for key in ("nuisances", "nuisance_estimates", "nuisance_prior_std"):
+            found[key] = {name: 1e-6}
+        assert ("Centres of mass" in tables.common_error_table(result).note) == centres
 
 
 def test_a_sum_that_vanishes_but_for_rounding_starts_at_zero(result):

@@ -323,6 +323,15 @@ def test_every_number_has_a_unit():
                 assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
 
 
+def test_every_comment_of_a_listing_can_be_read_alone():
+    """Keys without a value are left out of a listing, so that the key before may be absent."""
+    lines = [line for line in load_scenario("paper").to_toml().splitlines() if " # " in line]
+    assert len(lines) > 60
+    referring = ("the same for", "of that", "side of that")
+    assert [one for one in lines if any(words in one for words in referring)] == []
+    assert any(one.startswith("pose_method") for one in lines)
+
+
 @pytest.mark.parametrize(
     ("section", "key", "name"),
     [("timing", "frame_rate_hz", "Timing"), ("plant", "geometry_error_m", "Plant")],

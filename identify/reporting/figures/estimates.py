@@ -128,7 +128,7 @@ def group_figure(
     # Parameters with an initial guess of zero would have no dot.
     used = [k for k in range(len(columns)) if shares[:, k].any()]
     labels = [
-        f"{name.removesuffix(' +')} + …{' *' if group['identifiable'] else ''}"
+        f"{name.removesuffix(' +')} …{' *' if group['identifiable'] else ''}"
         for name, group in sums.items()
     ]
     figure = Figure(figsize=(WIDTH, 1.3 + 0.185 * len(labels)), layout="constrained")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from identify.arrays import Array
-from identify.files.run_folder import predicted_row, rms_figures, rms_row
+from identify.files.run_folder import actual_row, predicted_row, rms_figures, rms_row
 from identify.reporting.figures.style import (
     BLUE,
     COLUMN,
@@ -33,12 +33,11 @@ from identify.reporting.goals import (
     UNSEEN_ORIENTATION,
     UNSEEN_POSITION,
     check_goals,
-    unseen,
 )
-from identify.reporting.number_format import number
+from identify.reporting.number_format import significant
 
-# Half width of the expected band around an error of zero, in standard deviations. It contains 95 %
-# of the true errors.
+# Half width of the band in which the true errors are expected, in standard deviations. It contains
+# 95 % of them.
 BAND = 2.0
 
 BAND_NAME = f"expected ± {BAND:g} standard deviations"
@@ -80,8 +79,9 @@ class Fit:
         Times (N,), s.
     measured, identified, initial, truth
         Measured poses, poses of the identified and of the initial model, and true poses.
-    std
-        Predicted standard deviation (N, 6) of the true poses about those of the identified model.
+    predicted, std
+        Predicted poses (N, 6), and the expected standard deviation (N, 6) of the true poses about
+        them. Predicted poses also contain the estimated errors that all frames share.
     noise
         Standard deviation (6,) of one measured pose according to the sensor.
     """
@@ -91,6 +91,7 @@ class Fit:
     identified: Array
     initial: Array | None = None
     truth: Array | None = None
+    predicted: Array | None = None
     std: Array | None = None
     noise: Array | None = None
 
@@ -143,7 +144,7 @@ class Fit:
         counted = np.isfinite(self.measured).all(axis=1)
         models = [model for model in (self.initial, self.identified) if model is not None]
         values = [rms_row(rms_figures(self.measured - model, counted))[i] for model in models]
-        shown = [number(value, 3) if np.isfinite(value) else "diverged" for value in values]
+        shown = [significant(value) if np.isfinite(value) else "diverged" for value in values]
         return f"RMS {' → '.join(shown)} {UNITS[i]}"
 
     def distances(self, first: int) -> list[Curve]:
@@ -192,11 +193,10 @@ def fit_figure(fit: Fit) -> Figure:
         above.set_title(f"({'abcdef'[place]}) {COMPONENTS[i]}")
         above.set_ylabel(f"{COMPONENTS[i]} [{'mm' if i < 3 else 'mrad'}]")
         _draw(below, fit.time, fit.error_curves(i))
-        if fit.std is not None:
-            band = BAND * 1e6 * fit.std[:, i]
-            below.plot(
-                fit.time, np.column_stack([-band, band]), color=RED, linestyle=":", linewidth=0.9
-            )
+        if fit.predicted is not None and fit.std is not None:
+            middle = 1e6 * (fit.predicted - fit.identified)[:, i]
+            ends = middle[:, None] + BAND * 1e6 * np.outer(fit.std[:, i], (-1, 1))
+            below.plot(fit.time, ends, color=RED, linestyle=":", linewidth=0.9)
             below.lines[-1].set_label(BAND_NAME)
         below.set_title(fit.rms_text(i), fontsize=7)
         below.set_ylabel(f"error of {COMPONENTS[i]} [{UNITS[i]}]")
@@ -263,18 +263,19 @@ HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, distinct 
 
 
 def validation_figure(result: dict[str, Any]) -> Figure:
-    """Draw the RMS by which the goals of validation are judged, for each validation trajectory.
+    """Draw the actual and the predicted distance of the true robot from the predicted poses.
 
-    The RMS of the model against the measurement, the prediction and the limits are drawn as well.
+    The RMS distances of each validation trajectory have bars and diamonds. The distance of the
+    measured poses from the identified model, and the limits of the goals, are drawn as well.
     """
     validation = result["validation"]
-    found = unseen(result)
     limits = {goal.name: goal.limit for goal in check_goals(result)}
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
     for axes, first, goal in ((panels[0], 0, UNSEEN_POSITION), (panels[1], 3, UNSEEN_ORIENTATION)):
         for i in range(first, first + 3):
+            actual = [actual_row(run)[i] for run in validation]
             measured = [rms_row(run["measured"])[i] for run in validation]
             predicted = [predicted_row(run)[i] for run in validation]
             # Three bars per run, side by side: x, y, z or α, β, γ.
@@ -285,10 +286,10 @@ def validation_figure(result: dict[str, Any]) -> Figure:
             }
             axes.bar(
                 places,
-                found.rows[:, i],
+                actual,
                 0.2,
                 hatch=HATCHES[i % 3],
-                label=f"{COMPONENTS[i]}, against the truth",
+                label=f"{COMPONENTS[i]}, actual",
                 **look,
             )
             # Marks of all three components look the same, and need only one entry in the legend.
@@ -299,7 +300,7 @@ def validation_figure(result: dict[str, Any]) -> Figure:
                 "_",
                 color=INK,
                 markersize=9,
-                label="against the measurement" if labelled else None,
+                label="measured − identified" if labelled else None,
             )
             axes.plot(
                 places,
@@ -314,7 +315,7 @@ def validation_figure(result: dict[str, Any]) -> Figure:
             color=GREY,
             linestyle="--",
             linewidth=0.9,
-            label=f"limit {limits[goal]:.3g} {UNITS[first]}",
+            label=f"limit of the goal, {limits[goal]:.3g} {UNITS[first]}",
         )
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -213,8 +213,8 @@ def ellipse_figure(
                     label="true pose, enlarged equally",
                 )
             axes.set_aspect("equal", adjustable="datalim")
-            axes.set_xlabel(f"{COMPONENTS[columns[0]]} [{unit}]")
-            axes.set_ylabel(f"{COMPONENTS[columns[1]]} [{unit}]")
+            axes.set_xlabel(f"{COMPONENTS[columns[0]]} from the start [{unit}]")
+            axes.set_ylabel(f"{COMPONENTS[columns[1]]} from the start [{unit}]")
         row[0].set_title(f"{name}, ellipses × {factor:g}")
         _scale_bar(row[0], factor, round_down(2e3 * largest), fine)
     for axes in (axes for axes in grid.ravel() if not axes.lines):
@@ -258,8 +258,9 @@ def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
     """Draw a bar of a length in the fine unit, enlarged by `factor`, on axes in the coarse unit."""
     look: dict[str, Any] = {
         "frameon": True,
-        "sep": 3,
-        "borderpad": 0.3,
+        "pad": 0.5,
+        "sep": 4,
+        "borderpad": 0.4,
         "color": BLUE,
         "label_top": True,
     }
