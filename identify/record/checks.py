@@ -285,7 +285,7 @@ def _check_reach(robot: Robot, poses: Array, times: Array, what: str) -> None:
         try:
             robot.check_reach(poses[row], f"{what} at {moment(times, row)},")
         except UnreachablePoseError as error:
-            raise EstimationError(f"{error}{_unit_hint(poses, reached)}") from None
+            raise EstimationError(f"{error}{_hint(poses, row, reached)}") from None
 
 
 def begins_at_rest(rates: Array) -> bool:
@@ -334,7 +334,7 @@ def _check_measured(
             f"{measured[frame, worst]:.6g} and the reference "
             f"{reference.poses[frame, worst]:.6g}, {100 * found[frame, worst]:.0f} % of "
             f"its travel apart: {rest}the two poses are in different coordinate frames or units"
-            f"{_unit_hint(measured, near)}"
+            f"{_hint(measured, frame, near)}"
         )
 
 
@@ -363,8 +363,10 @@ def _check_commands(robot: Robot, poses: Array, logged: Array, times: Array, wha
         )
 
 
-def _unit_hint(poses: Array, fits: Callable[[Array], bool]) -> str:
-    """Return a hint about the units in which poses (N, 6) would fit, or an empty string."""
+def _hint(poses: Array, row: int, fits: Callable[[Array], bool]) -> str:
+    """Return a hint about a row of poses (N, 6): a lost frame, or the units in which all fit."""
+    if not poses[row].any():
+        return "; zeros are likely a lost frame, which needs measured_ok = 0"
     for units, (position, angle) in OTHER_UNITS.items():
         if fits(poses * np.repeat([position, angle], 3)):
             return f"; in {units} it would fit, and records are in m and rad"

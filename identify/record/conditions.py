@@ -138,9 +138,10 @@ def logged_latencies(record: xr.Dataset, timing: Timing) -> Array | None:
     in_frames = latencies * timing.frame_rate_hz
     if (in_frames > MAX_DELAY_FRAMES).any():
         first = int(np.argmax(in_frames > MAX_DELAY_FRAMES))
+        time = float(record["time"].values[first])
         raise EstimationError(
-            f"the command of frame {first} acted {latencies[first]:.4g} s after it, "
-            f"{in_frames[first]:.1f} frames of {timing.frame_rate_hz:g} Hz; at most "
+            f"the command of frame {first} (t = {time:.6g} s) acted {latencies[first]:.4g} s after "
+            f"it, {in_frames[first]:.1f} frames of {timing.frame_rate_hz:g} Hz; at most "
             f"{MAX_DELAY_FRAMES} frames are possible"
         )
     return None if np.abs(latencies - timing.latency_s).max() <= SAME_S else latencies

@@ -196,6 +196,7 @@ def test_a_lost_frame_may_have_written_nothing_and_a_time_that_cannot_be_is_name
             check_record(record.assign(command_time=("time", wrong)), "mine")
     ages = record.assign(command_time=("time", record["time"].values + 1.5))
     with pytest.raises(
-        EstimationError, match=r"frame 0 acted 1.5 s after it, 90.0 frames of 60 Hz; at most 60"
+        EstimationError,
+        match=r"frame 0 .t = 0 s. acted 1.5 s after it, 90.0 frames of 60 Hz; at most 60",
     ):
         problem_of([ages], SHORT)

@@ -312,6 +312,15 @@ def late(record):
     return begun.assign_coords(time=begun["time"] - begun["time"][0])
 
 
+def zeros(record):
+    """A record with a lost frame that is stored as zeros, which counts as measured."""
+    kinds = ("measured_position", "measured_orientation")
+    changed = {name: record[name].values.copy() for name in kinds}
+    for values in changed.values():
+        values[40] = 0.0
+    return with_values(record, **changed)
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -323,6 +332,10 @@ def late(record):
         (
             in_units(1e3, 180 / np.pi),
             r"cannot reach the reference .* in mm and degrees it would fit",
+        ),
+        (
+            zeros,
+            r"at t = 0.6666667 s after the first pose the measured z is 0 .* which needs measured_ok = 0",
         ),
         (
             late,
