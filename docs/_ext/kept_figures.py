@@ -3,6 +3,7 @@ the pages.
 """
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from identify.studies.study_file import STUDIES, load_study
 
 LAWS = "test_rows_of_a_study_follow_its_laws"
 WORST = "unseen_position_um_"
+SMALLEST = 0.001  # figures below it are only said to be below it
 ESTIMATED = {
     "groups_percent": "error of groups, %",
     "gains_percent": "error of gains, %",
@@ -58,8 +60,20 @@ def excitation_errors(folder: Path) -> str:
 
 
 def accuracy(folder: Path) -> str:
-    """This project's own accuracy figures."""
-    return str(markdown_table(read_saved(folder / "accuracy.json").figures))
+    """This project's own accuracy figures, in the units and words of the pages."""
+    text = str(markdown_table(read_saved(folder / "accuracy.json").figures))
+    words = {
+        "95% interval": "95 % interval",
+        "| um |": "| µm |",
+        "| urad |": "| µrad |",
+        " [planes]": ", by planes",
+        " [registration]": ", by registration",
+        "starting model on unseen motion": "initial model and ideal sensor, further motions",
+        "identified model on unseen motion": "identified model and ideal sensor, further motions",
+    }
+    for old, new in words.items():
+        text = text.replace(old, new)
+    return re.sub(r"(\d)% \|", r"\1 % |", text)
 
 
 def sensor_speed(folder: Path) -> str:
@@ -75,7 +89,6 @@ def sensor_speed(folder: Path) -> str:
         for name, title in titles.items()
     ]
     others = {
-        "images_in_the_loop": "`pyrender`, in the loop of a run",
         "images_together": "`analytic`, many at once, on all cores",
         "without_images": "`statistical`, many at once, on all cores",
     }
@@ -96,10 +109,10 @@ def dynamics_speed(folder: Path) -> str:
         ("forward dynamics against Pinocchio's "
          "`constraintDynamics`", "forward_dynamics_over_pinocchio", _faster),
         ("forward dynamics against MuJoCo's `mj_step`", "forward_dynamics_over_mj_step", _faster),
-        ("closed loop with exact stick-slip friction, 60 Hz frames", "times_real_time",
-         lambda value: f"{value:.0f} times real time"),
-        ("all 67 sensitivities of a run", "sensitivities_plain_runs", lambda value: f"{value:.1f} "
-                                                                                    "plain runs"),
+        ("simulating a closed loop without images: exact stick-slip friction, 60 Hz frames",
+         "times_real_time", lambda value: f"{value:.0f} times as fast as real time"),
+        ("the same run with its derivatives by all 67 parameters", "sensitivities_plain_runs",
+         lambda value: f"takes {value:.1f} times as long"),
         ("a batch of runs on two cores", "two_cores_gain", lambda value: f"{value:.2f} times "
                                                                          "as fast as on one"),
         ("compiling a robot, at first use", "robot_compilation_s", lambda value: f"{value:.0f} s"),
@@ -119,7 +132,9 @@ def robots(folder: Path) -> str:
         (
             f"`{name}`",
             f"{found[WORST + name]:.2f}",
-            f"{found[f'unseen_orientation_urad_{name}']:.1f}",
+            f"{urad:.1f}"
+            if (urad := found[f"unseen_orientation_urad_{name}"])
+            else "does not turn",
         )
         for name in names
     ]
@@ -239,7 +254,15 @@ def _text(figure: Middle | None) -> str:
     if figure is None:
         return "none"
     middle, band = figure
-    return f"{middle:.3g}" if band is None else f"{middle:.3g} ({band[0]:.3g} to {band[1]:.3g})"
+    if 0 < middle < SMALLEST:
+        return f"below {SMALLEST}"
+    low, high = (middle, middle) if band is None else band
+    shown = [_three_digits(value) for value in (middle, low, high)]
+    return shown[0] if len(set(shown)) == 1 else f"{shown[0]} ({shown[1]} to {shown[2]})"
+
+
+def _three_digits(value: float) -> str:
+    return f"{float(f'{value:.3g}'):.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def _kept_rows(folder: Path, contents: dict[str, dict[str, Any]]) -> str:

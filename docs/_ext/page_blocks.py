@@ -112,10 +112,10 @@ ANSWERS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
         {"sensor.camera.dark_noise": "dark noise, electrons"},
         {
             "pose_noise_um": "noise of a position, µm",
-            "coulomb_std_percent": "Coulomb friction, %",
-            "viscous_std_percent": "viscous friction, %",
-            "gains_std_percent": "joint gains, %",
-            "group_std_percent": "groups of masses and inertias, %",
+            "coulomb_std_percent": "std. deviation of Coulomb friction, %",
+            "viscous_std_percent": "std. deviation of viscous friction, %",
+            "gains_std_percent": "std. deviation of joint gains, %",
+            "group_std_percent": "std. deviation of groups of masses and inertias, %",
         },
     ),
     "excitation_methods": (
