@@ -166,7 +166,17 @@ def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
     latest = max(entry["date"] for entry in entries)
     reached = min(entry["figures"].get("starts_reaching_the_optimum", 25) for entry in entries)
     faster, _ = figures_of_each(kept("speeds"), "forward_dynamics_over_lcaba")
+    known = [entry["identifiable"] for entry in noise["parameters"].values()]
+    singles = sum(len(group["coefficients"]) == 1 for group in noise["groups"].values())
+    groups = len(noise["groups"])
+    of_all = f"{len(known)} parameters. The motion shows {sum(known)} of them"
+    counted = f"has {groups}: {groups - singles} sums of several parameters, and its {singles}"
     wanted = {
+        "tutorials/first_run": [of_all],
+        "explanation/method": [
+            counted,
+            f"so that {noise['conditioning']['directions']} independent quantities remain",
+        ],
         "explanation/results": [
             f"variance is {noise['noise_ratio']:.3f} times that which the sensor states",
             f"the identified model give {noise['expected_noise_ratio']:.3f} on average",
