@@ -122,7 +122,7 @@ class MeasuredExposures:
     def _by_registration(self, k: int) -> Measurement:
         """Return the measurement of an exposure that is not among ``others``."""
         pose = self.found.poses[k]
-        return self.estimator.measurement(pose, self.found.covariances[k], self.solved.of(k))
+        return self.estimator.measurement(pose, self.found.covariances[k], self.solved.used_in(k))
 
 
 def measure_exposures(

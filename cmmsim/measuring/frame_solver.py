@@ -5,8 +5,9 @@ one first, in two cases:
 
 - The place of a sticker differs from the place that the other stickers predict. This test is data
   snooping. The residual is compared with its own covariance S - J C J'. S is the covariance of the
-  sticker's noise, C the covariance of the pose, and J the derivative of the sticker's place by the
-  pose. S - J C J' is smaller than S, because each sticker pulls the pose towards itself.
+  sticker's noise, C the covariance of the pose, and J the derivative of the sticker's place with
+  respect to the pose. S - J C J' is smaller than S, because each sticker pulls the pose towards
+  itself.
 - The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
   sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
@@ -16,12 +17,13 @@ on another pose, a group of stickers has moved. The images do not show which gro
 frame is lost.
 
 All residuals can be larger than noise, for example if a camera has drifted since its calibration,
-or several stickers are slightly misplaced. Each place is then compared with the size of the other
-stickers' residuals. All covariances are multiplied by the mean square of the residuals in units of
-their noise (squared Birge ratio), up to a limit, and by a factor, because such errors are not
-independent. The covariances are also enlarged for a warp of the whole pattern (``warp_kernels``),
-for a plane of stickers that has slipped (``slip_kernels``), for errors that stickers share
-(``shared_error_kernels``), and for a pose from less than half of the stickers that were searched.
+or several stickers are slightly misplaced. The squared residual of each sticker is then divided by
+the mean square of the other stickers' residuals, in units of their noise. All covariances are
+multiplied by the mean square of all residuals (squared Birge ratio), and by a factor, because such
+errors are not independent. If the mean square exceeds a limit, more stickers are rejected. The
+covariances are also enlarged for a warp of the whole pattern (``warp_kernels``), for a plane of
+stickers that has slipped (``slip_kernels``), for errors that stickers share
+(``shared_error_kernels``), and for a pose from at most half of the stickers that were searched.
 
 The computation is compiled, in ``solver_kernels``.
 """
@@ -58,26 +60,27 @@ LARGEST_EXCESS = 6.0
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Smallest number of stickers that must remain.
 FEWEST = 5
-# Smallest share of a sticker's noise that must appear in its residual; below, it is not tested.
+# Smallest ratio of the variance of a residual to that of the sticker's noise. Directions with a
+# smaller ratio are not tested, because the sticker alone determines the pose along them.
 SMALLEST_SHARE = 0.01
 # Probability that a good frame counts as warped. It is larger than that of other tests, because
 # a warp that is just not noticed moves the pose by up to ten deviations.
 WARP_CHANCE = 1e-3
-# Largest squared warp that noise explains, in its units.
+# Largest squared size of a warp that noise explains, in units of the noise.
 LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
 # Probability that a plane of a good frame counts as slipped. It is as large, for the same reason.
 SLIP_CHANCE = 1e-3
-# Largest squared slip of one of three planes that noise explains, in its units.
+# Largest squared slip of one of three planes that noise explains, in units of the noise.
 LARGEST_SLIP = float(chdtri(3, SLIP_CHANCE / 3))
-# Errors that are larger than noise are not independent: a pose errs as if each were shared by this
-# number of stickers.
+# Errors that are larger than noise are not independent: a pose errs as if this number of stickers
+# had the same error.
 EXCESS_SHARE = 4.0
-# Probability of the quantile that ``_tails`` makes right for a pose from few stickers.
+# Probability of the quantile of a pose's squared error for which ``_tails`` is exact.
 TAIL = 0.999
 # The excess of the mean square of the warp's shapes over its limit, times this number, is added to
 # the factor on the covariance. A pose errs in six shapes that are as smooth as those of a warp.
 WARP_SHARE = 8.0
-# Rejected stickers that agree with each other are as likely to be right as the others.
+# Fewest rejected stickers that make a frame lost if they agree with each other on another pose.
 FEWEST_RIVALS = 3
 # rad: a fit ends after a step with a smaller rotation.
 STEP_TOLERANCE = 1e-8
@@ -89,14 +92,16 @@ class SolvedFrames:
 
     camera_from_body  (f, 4, 4)
     covariances       (f, 6, 6), of the small errors [dt, dphi] of camera_from_body
-    stickers          the k stickers of all frames, with enlarged covariances if residuals are
-                      larger than noise
+    stickers          the k stickers of all frames; covariances of the used ones are enlarged if
+                      residuals are larger than noise
     used              (k,), False for rejected stickers
     starts            (f + 1,); frame j has the stickers ``starts[j]`` to ``starts[j + 1]``
     shared            (f, 6, 6), part of the covariances due to slips and to errors that stickers
                       share
-    verdicts          (f, COLUMNS), reasons why frames are lost
-    places            (n, 3), taught places on ``body``
+    verdicts          (f, COLUMNS), states of the frames, with the columns of ``solver_kernels``
+    places            (n, 3), taught places of the stickers on ``body``, m
+
+    Poses and covariances of lost frames are meaningless.
     """
 
     camera_from_body: Array
@@ -114,18 +119,18 @@ class SolvedFrames:
         """Frames (f,) without a pose."""
         return self.verdicts[:, 0] != 0
 
-    def of(self, frame: int) -> StickerObservation:
+    def used_in(self, frame: int) -> StickerObservation:
         """Return the stickers from which the pose of a frame was computed.
 
         The ``index`` of the result refers to the body's stickers.
         """
-        own = np.zeros(len(self.used), dtype=bool)
-        own[self.starts[frame] : self.starts[frame + 1]] = True
-        seen = self.stickers.selected(own & self.used)
+        in_frame = np.zeros(len(self.used), dtype=bool)
+        in_frame[self.starts[frame] : self.starts[frame + 1]] = True
+        seen = self.stickers.selected(in_frame & self.used)
         return replace(seen, index=seen.index % len(self.places))
 
     def error(self, frame: int) -> LostError:
-        """Return the error that tells why a frame is lost."""
+        """Return the error that states why a frame is lost."""
         # Imported late, because importing numba takes time.
         from cmmsim.measuring.solver_kernels import RIVALS
 
@@ -142,62 +147,65 @@ class SolvedFrames:
         if verdict[FIRST] >= 0:
             row = self.starts[frame] + int(verdict[FIRST])
             first = str(self.body.sticker_ids[self.stickers.index[row] % len(self.places)])
-        reason = lost_reason(verdict, first, self.places[self.of(frame).index])
+        reason = lost_reason(verdict, first, self.places[self.used_in(frame).index])
         seen = int(self.starts[frame + 1] - self.starts[frame])
-        detected = self.stickers.detected
-        if seen >= FEWEST or detected is None or self.stickers.searched is None:
+        searched = 0 if self.stickers.searched is None else self.stickers.searched[frame]
+        if seen >= FEWEST or searched == 0 or self.stickers.detected is None:
             return reason
-        found = int(detected[frame])
+        detected = int(self.stickers.detected[frame])
         apart = ""
-        if found > seen:
-            apart = f"; in {found - seen} of these the rays miss each other by more than is stated"
+        if detected > seen:
+            apart = (
+                f"; the rays of {detected - seen} of these miss each other by more than is stated"
+            )
         return (
-            f"{reason}: of {self.stickers.searched[frame]} that were searched, the detector found "
-            f"{found} in both images{apart}"
+            f"{reason}: of {searched} that were searched, the detector found {detected} in both "
+            f"images{apart}"
         )
 
 
 def solve_frames(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
 ) -> SolvedFrames:
-    """Solve f frames near camera_from_body ``near`` (f,4,4), with stickers taught at ``places``.
+    """Return the poses of a body in f frames.
 
-    In ``seen``, sticker k of frame j has the index j n + k, as in ``Observer.read``. There are n
-    places.
+    ``near`` (f, 4, 4) are first guesses of camera_from_body, and ``places`` (n, 3) the taught
+    places of the body's stickers, m. In ``seen``, sticker k of frame j has the index j n + k, as in
+    ``Observer.read``.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring import solver_kernels as kernels
 
     frames = len(near)
-    of, sticker = np.divmod(seen.index, len(places))
-    starts = np.searchsorted(of, np.arange(frames + 1)).astype(int)
+    frame_of, sticker = np.divmod(seen.index, len(places))
+    starts = np.searchsorted(frame_of, np.arange(frames + 1)).astype(int)
     searched = np.diff(starts) if seen.searched is None else seen.searched
-    used = np.ones(len(of), dtype=bool)
+    used = np.ones(len(frame_of), dtype=bool)
     covariances = np.array(seen.covariances)
-    rows = kernels.ObservedStickers(
+    stickers = kernels.ObservedStickers(
         used,
         np.ascontiguousarray(seen.points),
         np.linalg.inv(covariances),
         covariances,
-        np.empty((len(of), 3)),
-        np.empty((len(of), 3)),
+        np.empty((len(frame_of), 3)),
+        np.empty((len(frame_of), 3)),
         np.ascontiguousarray(seen.rays),
         body.plane_index[sticker],
     )
     camera_from_body = np.array(near, dtype=float)
-    spreads = np.zeros((frames, 6, 6))
+    pose_covariances = np.zeros((frames, 6, 6))
     shared = np.zeros((frames, 6, 6))
     verdicts = np.zeros((frames, kernels.COLUMNS))
     outlines = _outlines(seen, observer, body.sticker_normals[sticker])
     limits = solver_limits(len(places), observer.settings)
     taught = np.ascontiguousarray(places[sticker])
     kernels.solve_frames(
-        *(rows, taught, outlines, limits, starts, searched),
-        *(_images(seen, observer, frames), camera_from_body, spreads, shared, verdicts),
+        *(stickers, taught, outlines, limits, starts, searched),
+        *(_images(seen, observer, frames), camera_from_body, pose_covariances, shared, verdicts),
     )
     return SolvedFrames(
         camera_from_body,
-        spreads,
+        pose_covariances,
         replace(seen, covariances=covariances),
         used,
         starts,
@@ -211,10 +219,10 @@ def solve_frames(
 def solve_frame(
     seen: StickerObservation, near: Array, observer: Observer, body: MarkedBody, places: Array
 ) -> SolvedFrames:
-    """Return the solution of one frame, as ``solve_frames`` does of several.
+    """Return the pose of a body in one frame, as ``solve_frames`` does for several.
 
     ``near`` (4, 4) is a first guess of camera_from_body. Raises LostError if the frame is lost, for
-    example since too few stickers agree.
+    example because too few stickers agree.
     """
     solved = solve_frames(seen, near[None], observer, body, places)
     if solved.lost[0]:
@@ -227,8 +235,9 @@ def solver_limits(
 ) -> SolverLimits:
     """Return the compiled solver's limits for frames with at most this number of stickers.
 
-    A known error of the rig warps every frame. Its effect on the poses is stated as their common
-    error, so warps, slips and delays are not tested in that case.
+    ``step_tolerance`` is in rad. If the stated errors of the rig are not zero, they warp every
+    frame, and their effect is part of the poses' common errors. Warps, slips and delays are then
+    not tested.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring.solver_kernels import SolverLimits
@@ -254,8 +263,8 @@ def solver_limits(
 def lost_reason(verdict: Array, first: str, left: Array) -> str:
     """Return the reason why a frame is lost.
 
-    ``first`` names the sticker that was rejected first. ``left`` (n, 3) are the taught places of
-    the stickers that were not rejected.
+    ``verdict`` has the columns of ``solver_kernels``. ``first`` is the name of the sticker that was
+    rejected first. ``left`` (n, 3) are the taught places of the stickers that were not rejected.
     """
     # Imported late, because importing numba takes time.
     from cmmsim.measuring import solver_kernels as kernels
@@ -277,10 +286,16 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
     place = verdict[kernels.PLACE]
     outline = verdict[kernels.OUTLINE]
     misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} of its outline"
+    cause = f"with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
+    if max(place, outline) <= LARGEST_MISFIT:
+        cause = (
+            f"because the mean square of all residuals exceeds {LARGEST_EXCESS:g} times that of "
+            "noise"
+        )
     return (
         f"{seen} visible stickers contradict each other, {count} are left after {seen - count} "
         f"were rejected; at least {FEWEST} and more than the rejected ones are needed; the first "
-        f"rejected one is {first} with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
+        f"rejected one is {first}, {cause}"
     )
 
 
@@ -295,14 +310,14 @@ def _largest_totals(freedom: int) -> Array:
 
 @lru_cache(maxsize=16)
 def _tails(freedom: int) -> Array:
-    """Return factors on a covariance whose scale is estimated.
+    """Return factors on a pose's covariance whose scale is estimated from residuals.
 
-    They are for 0 to ``freedom`` degrees of freedom of the scale. The pose has Student's
-    distribution. Its squared error has the same quantile TAIL as that of a normal distribution with
-    the enlarged covariance.
+    They are for residuals with 0 to ``freedom`` degrees of freedom. The pose then has Student's
+    distribution. With the factor, a normal distribution has the same quantile TAIL of the squared
+    error.
     """
-    known = np.maximum(np.arange(freedom + 1), 1)
-    return np.asarray(6.0 * fdtri(6, known, TAIL) / chdtri(6, 1.0 - TAIL))
+    freedoms = np.maximum(np.arange(freedom + 1), 1)
+    return np.asarray(6.0 * fdtri(6, freedoms, TAIL) / chdtri(6, 1.0 - TAIL))
 
 
 def no_outlines(rig: StereoRig) -> Outlines:
@@ -333,14 +348,14 @@ def _images(seen: StickerObservation, observer: Observer, frames: int) -> Images
 
 def _outlines(seen: StickerObservation, observer: Observer, normals: Array) -> Outlines:
     """Return the compiled solver's input with the ellipses of stickers with normals (k, 3)."""
-    known = no_outlines(observer.rig)
+    inputs = no_outlines(observer.rig)
     if seen.outlines is None:
-        return known
+        return inputs
     rows = [0, 0, 0, 1, 1, 2]
     columns = [0, 1, 2, 1, 2, 2]
     entries = seen.outlines.shapes[..., [0, 0, 1], [0, 1, 1]]
     inverse = np.linalg.inv(seen.outlines.covariances)[..., rows, columns]
-    return known._replace(
+    return inputs._replace(
         shapes=np.ascontiguousarray(entries.swapaxes(0, 1)),
         informations=np.ascontiguousarray(inverse.swapaxes(0, 1)),
         normals=np.ascontiguousarray(normals),

@@ -1,10 +1,11 @@
 """Search of whole images without a prior pose: bright spots, their pairs, and the known layout.
 
 Ellipses are fitted to bright spots that are small enough for a window. A spot of the left image and
-a spot of the right image form a pair if they lie on each other's epipolar lines. Each pair is a
-point in space, and false pairs occur. The known layout of the stickers is searched in this cloud of
-points. Three stickers match three points that have the same mutual distances. Each match proposes a
-pose. The best pose is the one at which most stickers of the layout have a point close by.
+a spot of the right image form a pair if the right one lies on the epipolar line of the left one.
+Each pair is a point in space, and false pairs occur. The known layout of the stickers is searched
+in this cloud of points. Three stickers match three points that have the same mutual distances. Each
+match proposes a pose. The best pose is the one at which most stickers of the layout have a point
+close by.
 """
 
 from collections.abc import Iterator
@@ -27,23 +28,24 @@ from cmmsim.measuring.observation import Observer, StickerExposure
 from cmmsim.radiometry.noise import GreyImage, cut_windows
 from cmmsim.radiometry.stereo_images import StereoImages
 
+# Smallest area of a bright spot, in pixels.
 SMALLEST_AREA_PX = 8
-# Largest area of a bright spot, as a share of a square with the largest allowed side.
+# Largest area of a bright spot, as a fraction of a square with the largest allowed side.
 LARGEST_SHARE = 25 / 36
-# Share of the pixels of an image that count as the brightest.
+# Fraction of the pixels of an image that count as the brightest.
 BRIGHT_SHARE = 1e-4
-# Share of the pixels that count as the darkest.
+# Fraction of the pixels that count as the darkest.
 DARK_SHARE = 1e-3
-# Smallest step from the ground to the brightest pixels, as a share of the largest grey value.
+# Smallest step from the ground to the brightest pixels, as a fraction of the largest grey value.
 SMALLEST_STEP = 40.0 / 255.0
 SMALLEST_WINDOW_PX = 24
 # Margin of windows for the error of a bright spot's rough centre.
 ROOM_PX = 8
 # Fewest recognised stickers of a platform with taught places.
 FEWEST_TAUGHT = 4
+# Allowed distance from epipolar lines if the rig is exact.
 LINE_TOLERANCE_PX = 0.5
-# Allowed distance from epipolar lines due to errors of the rig, in standard deviations of this
-# distance.
+# Further distance that errors of the rig may cause, in its standard deviations.
 LINE_STDS = 4.0
 # Smallest depth, and largest distance of a point from the left camera, m.
 NEAREST = 0.3
@@ -52,9 +54,9 @@ FURTHEST = 6.0
 SMALLEST_TRIANGLE = 0.002
 # Largest number of triangles that are tried together.
 MOST_TOGETHER = 64
-# Share of the layout's stickers whose recognition ends the search.
+# Fraction of the layout's stickers whose recognition ends the search.
 ENOUGH = 0.8
-# Blurs that are tried where a lens has depths out of focus, px.
+# Additional point spreads with which spots are fitted if they can be out of focus, px.
 DEFOCUSED_PX = (0.2, 0.4, 0.6, 0.9)
 
 
@@ -69,20 +71,20 @@ def bright_ellipses(
     settings = observer.settings
     size = max(SMALLEST_WINDOW_PX, settings.window_size + ROOM_PX)
     limits = replace(settings.limits, largest_misfit=np.inf)
-    found = []
+    both = []
     for image in (noise.bright(frame.left), noise.bright(frame.right)):
         image = _without_ghost(image, observer)
         corners = np.rint(find_blobs(image, noise.white_level, size) - 0.5 * (size - 1)).astype(int)
         windows = cut_windows(image, corners, size)
         spots = windows, corners, noise, settings.fit_size, limits
         fits = fit_ellipses(*spots, psf_px=settings.optics.psf_px)
-        # Spots out of focus are fitted with the point spread that agrees best.
-        for blur in DEFOCUSED_PX if settings.optics.aperture > 0.0 else ():
-            others = fit_ellipses(*spots, psf_px=float(np.hypot(settings.optics.psf_px, blur)))
+        # Each spot keeps the fit with the point spread that agrees best.
+        for defocus in DEFOCUSED_PX if settings.optics.aperture > 0.0 else ():
+            others = fit_ellipses(*spots, psf_px=float(np.hypot(settings.optics.psf_px, defocus)))
             better = others.misfits < fits.misfits
             fits = fits.with_others(np.flatnonzero(better), others, better)
-        found.append(fits)
-    return found[0], found[1]
+        both.append(fits)
+    return both[0], both[1]
 
 
 def _without_ghost(image: GreyImage, observer: Observer) -> GreyImage:
@@ -100,10 +102,10 @@ def _without_ghost(image: GreyImage, observer: Observer) -> GreyImage:
 def candidate_points(
     ellipses: tuple[EllipseFits, EllipseFits], observer: Observer, limits: FitLimits
 ) -> Array:
-    """Return points (m, 3) in the camera frame that are possible stickers.
+    """Return points (m, 3) m in the camera frame that are possible stickers.
 
     They are triangulated from pairs of ellipses within ``limits``; some pairs are false. Raises
-    LostError if an image has no bright spots.
+    LostError if an image has no such ellipses.
     """
     left, right = (fits.centres[fits.within(limits, observer.upright).good] for fits in ellipses)
     if not len(left) or not len(right):
@@ -111,12 +113,12 @@ def candidate_points(
             f"{len(left)} bright spots in the left image and {len(right)} in the right, at least "
             f"{FEWEST_TAUGHT} are needed in each"
         )
-    ideal = []
+    ideal_pixels = []
     for camera, centres in zip(observer.rig.cameras, (left, right), strict=True):
-        pixels, found = camera.undistort(centres)
-        ideal.append(pixels[found])
+        pixels, exists = camera.undistort(centres)
+        ideal_pixels.append(pixels[exists])
     off_line = LINE_TOLERANCE_PX + LINE_STDS * observer.settings.line_error_px
-    return candidate_pairs(observer.rig.ideal, ideal[0], ideal[1], off_line)[1]
+    return candidate_pairs(observer.rig.ideal, ideal_pixels[0], ideal_pixels[1], off_line)[1]
 
 
 def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
@@ -161,8 +163,9 @@ def candidate_pairs(
     """Return pairs (m, 2) of spots in both images that are possibly one point, and these points.
 
     The pairs are indices of ``left`` (k, 2) and ``right`` (l, 2), which are in ideal px. The points
-    are (m, 3). The spots of a pair are at most ``off_line`` px from each other's epipolar lines. A
-    spot can belong to several pairs: the known layout decides later which pair is true.
+    are (m, 3), m in the camera frame. The right spot of a pair is less than ``off_line`` px from
+    the epipolar line of the left one. A spot can belong to several pairs: the known layout decides
+    later which pair is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
@@ -177,20 +180,20 @@ def find_layout(
 
     The layout (n, 3) m is in body axes and the points (m, 3) m in the camera frame. Each place in
     the layout can be off by ``tolerance`` m. The results are camera_from_body (4, 4), the indices
-    of the found stickers (k,) and of their points (k,). Raises LostError if fewer than ``fewest``
-    stickers are found, or if two different poses explain the points about equally well. ``name`` is
-    the body's name in messages.
+    of the recognised stickers (k,) and of their points (k,). Raises LostError if fewer than
+    ``fewest`` stickers are recognised, or if two different poses explain the points about equally
+    well. ``name`` is the body's name in messages.
     """
-    gaps = np.linalg.norm(points[:, None] - points[None], axis=2)
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
     tree = cKDTree(points)
     best: Array | None = None
     count = rival = 0
     for triples in _blocks(_triangles(layout)):
-        proposer, poses, counts = _proposed(layout, triples, points, gaps, tree, tolerance)
-        ended = len(triples)
+        proposer, poses, counts = _proposed(layout, triples, points, distances, tree, tolerance)
+        last = len(triples)
         # Poses with smaller counts replace neither the best pose nor the rival.
         for k in np.flatnonzero(counts > min(count, rival)).tolist():
-            if proposer[k] > ended:
+            if proposer[k] > last:
                 break
             if best is not None and not _same(best, poses[k], layout, tolerance):
                 rival = max(rival, min(count, int(counts[k])))
@@ -199,7 +202,7 @@ def find_layout(
                 count = int(counts[k])
             if count >= ENOUGH * len(layout):
                 # Other poses from the same triangle can still be rivals.
-                ended = min(ended, proposer[k])
+                last = min(last, proposer[k])
         if count >= ENOUGH * len(layout):
             break
     if best is None or count < fewest:
@@ -235,14 +238,17 @@ def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
         first += size
 
 
-def _congruent(gaps: Array, corners: Array, tolerance: float) -> NDArray[np.int_]:
+def _congruent(distances: Array, corners: Array, tolerance: float) -> NDArray[np.int_]:
     """Return all ordered triples (c, 3) of points with the same mutual distances as three corners.
 
-    The corners are (3, 3). ``gaps`` (m, m) are the mutual distances of the points.
+    The corners are (3, 3). ``distances`` (m, m) are those of the points. Distances within
+    ``tolerance`` m of each other count as the same.
     """
     d01, d02, d12 = (np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
-    first, second = np.nonzero(np.abs(gaps - d01) < tolerance)
-    fits = (np.abs(gaps[first] - d02) < tolerance) & (np.abs(gaps[second] - d12) < tolerance)
+    first, second = np.nonzero(np.abs(distances - d01) < tolerance)
+    fits = (np.abs(distances[first] - d02) < tolerance) & (
+        np.abs(distances[second] - d12) < tolerance
+    )
     pair, third = np.nonzero(fits)
     return np.column_stack([first[pair], second[pair], third])
 
@@ -251,7 +257,7 @@ def _proposed(
     layout: Array,
     triples: NDArray[np.int_],
     points: Array,
-    gaps: Array,
+    distances: Array,
     tree: cKDTree,
     tolerance: float,
 ) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
@@ -264,7 +270,7 @@ def _proposed(
     omitted.
     """
     # Both ends of a side can be off by the tolerance.
-    corners = [_congruent(gaps, layout[triple], 2.0 * tolerance) for triple in triples]
+    corners = [_congruent(distances, layout[triple], 2.0 * tolerance) for triple in triples]
     proposer = np.repeat(np.arange(len(triples)), [len(c) for c in corners])
     start = rigid_starts(
         layout[triples[proposer]], points[np.concatenate(corners)], np.ones((len(proposer), 3))
@@ -286,14 +292,14 @@ def _nearest(poses: Array, layout: Array, tree: cKDTree, tolerance: float) -> ND
     nearest[nearest == tree.n] = -1
     candidate, sticker = np.nonzero(nearest >= 0)
     point = tree.data[nearest[candidate, sticker]]
-    rivals = np.linalg.norm(places[candidate] - point[:, None], axis=2).argmin(axis=1)
-    lost = rivals != sticker
-    nearest[candidate[lost], sticker[lost]] = -1
+    nearest_sticker = np.linalg.norm(places[candidate] - point[:, None], axis=2).argmin(axis=1)
+    taken = nearest_sticker != sticker
+    nearest[candidate[taken], sticker[taken]] = -1
     return np.asarray(nearest)
 
 
 def _same(first: Array, second: Array, layout: Array, tolerance: float) -> bool:
-    """Tell whether two poses put the layout in about the same place."""
+    """Return True if two poses differ by less than four tolerances at each sticker."""
     return bool(
         np.linalg.norm(apply(first, layout) - apply(second, layout), axis=1).max() < 4.0 * tolerance
     )

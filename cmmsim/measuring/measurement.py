@@ -27,9 +27,9 @@ class Measurement:
 
     The error of a pose has two parts, which are stated separately. The noise is new in every frame.
     The common part comes from errors of the known rig and of the taught frames. It is the same in
-    every frame, so a mean over frames does not reduce it. The mean of N frames has the covariance
-    covariance / N + common_covariance. ``Sensor.common_errors`` relates the common parts of
-    different poses.
+    every frame, so a mean over frames does not reduce it. The mean of N frames at one pose has the
+    covariance covariance / N + common_covariance. ``Sensor.common_errors`` relates the common parts
+    of different poses.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Measurement:
     points, point_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
         Places of the stickers in the camera frame, m, and their covariances.
     left_pixels, right_pixels : ndarray, shape (n, 2)
-        Sticker centres in the distorted images.
+        Sticker centres in the distorted images, px, corrected for eccentricity.
     target_ids : ndarray of str, shape (n,)
         Names of the stickers, such as "A1".
     ok : bool
@@ -164,19 +164,19 @@ class MeasuredPoses:
         return cls(*(np.concatenate(values) for values in zip(*every, strict=True)))
 
     @classmethod
-    def of_each(cls, found: Sequence[Measurement]) -> MeasuredPoses:
+    def of_each(cls, measurements: Sequence[Measurement]) -> MeasuredPoses:
         """Collect the poses of single frames."""
         return cls(
-            np.array([one.pose for one in found]).reshape(-1, 6),
-            np.array([one.covariance for one in found]).reshape(-1, 6, 6),
-            np.array([len(one.target_ids) for one in found], dtype=int),
+            np.array([frame.pose for frame in measurements]).reshape(-1, 6),
+            np.array([frame.covariance for frame in measurements]).reshape(-1, 6, 6),
+            np.array([len(frame.target_ids) for frame in measurements], dtype=int),
         )
 
     def without(self, dropped: NDArray[np.bool_]) -> MeasuredPoses:
         """Return the same frames, except that the frames marked in ``dropped`` (N,) are lost."""
-        gone = dropped[:, None]
+        lost = dropped[:, None]
         return MeasuredPoses(
-            np.where(gone, np.nan, self.poses),
-            np.where(gone[:, None], np.nan, self.covariances),
+            np.where(lost, np.nan, self.poses),
+            np.where(lost[:, None], np.nan, self.covariances),
             np.where(dropped, 0, self.stickers),
         )

@@ -39,15 +39,15 @@ class DetectionSettings:
     radius           radius of a sticker, m
     limits           limits for accepting a fit
     largest_ray_gap  largest squared distance between the two rays of a sticker, in units of the
-                     distance's variance; 25 means five sigma
-    centre_error_px  rms of systematic errors of a centre; the squares of this error and of the
-                     detector's bias are added to the variances of a centre
+                     distance's variance; 25 means five standard deviations
+    centre_error_px  rms of systematic errors of a centre, px; its square is added to the variances
+                     of a centre, and so is the square of the detector's bias
     detector         name of the detector
-    optics           point spread and vignetting of the lenses
+    optics           point spread, vignetting, defocus and ghost of the lenses
     exposed_share    ratio of exposure time to frame period
     row_share        ratio of the time between two rows of pixels to the frame period
-    line_error_px    standard deviation of an image's distance from its epipolar line that errors of
-                     the rig cause; it increases the allowed distance between two rays
+    line_error_px    standard deviation of a centre's distance from its epipolar line that errors of
+                     the rig cause, px; it increases the allowed distance between two rays
     dark             True for dark stickers in bright rings
     allowed          allowance for print that is not perfect
     """
@@ -69,13 +69,13 @@ class DetectionSettings:
 
 @runtime_checkable
 class StickerExposure(Protocol):
-    """Exposure without images. It returns the results that fits of ellipses would have."""
+    """Exposure without images, which returns simulated results of the fits of ellipses."""
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """Detect stickers in 2k windows of ``size`` px with first pixels ``corners`` (2, k, 2)."""
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
-        """Return the ellipses in the left and in the right image."""
+        """Return all ellipses in the left and in the right image."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Observer:
 
     @property
     def upright(self) -> CameraNoise:
-        """Noise of the grey values in which stickers are bright."""
+        """Noise of the camera, with grey values inverted if stickers are dark."""
         return replace(self.noise, inverted=True) if self.settings.dark else self.noise
 
     @property
@@ -107,12 +107,13 @@ class Observer:
     ) -> StickerObservation:
         """Observe stickers of a body near an expected pose camera_from_body (4, 4).
 
-        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. ``exposure_ends``
-        are the expected camera_from_body at the beginning and at the end of the exposure, or None.
-        ``frame_ends`` are those half a frame period before and after the middle of the frame.
+        The stickers have ``places`` (n, 3) m and ``normals`` (n, 3) in body axes. ``exposure_ends``
+        are the expected camera_from_body at the beginning and at the end of the exposure.
+        ``frame_ends`` are those half a frame period before and after the middle of the exposure.
+        Both are None if the movement is not known.
         """
-        read = self.read(images, camera_from_body, places, normals)
-        return read.observed(exposure_ends, frame_ends)
+        windows = self.read(images, camera_from_body, places, normals)
+        return windows.observed(exposure_ends, frame_ends)
 
     def read(
         self,
@@ -123,40 +124,47 @@ class Observer:
     ) -> StickerWindows:
         """Read the windows around stickers of a body near an expected pose camera_from_body (4, 4).
 
-        The stickers have ``places`` (n, 3) and ``normals`` (n, 3) in body axes. For many exposures,
-        camera_from_body is (N, 4, 4), and sticker k of exposure j has the index j n + k.
+        The stickers have ``places`` (n, 3) m and ``normals`` (n, 3) in body axes. Those that both
+        cameras should see are read. For many exposures, camera_from_body is (N, 4, 4), and sticker
+        k of exposure j has the index j n + k.
         """
         moves = [move @ camera_from_body for move in self.rig.from_camera]
         centres = [apply_each(move, places).reshape(-1, 3) for move in moves]
-        turned = [(normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves]
-        pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
-        facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
+        turned_normals = [
+            (normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves
+        ]
+        pixels, in_image = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
+        facing = np.stack(
+            [faces_camera(c, t) for c, t in zip(centres, turned_normals, strict=True)]
+        )
         # Triangulation needs two rays, so both cameras must see a sticker.
-        index = np.flatnonzero(np.all(valid & facing, axis=0))
+        index = np.flatnonzero(np.all(in_image & facing, axis=0))
         exposures = index // len(places)
         size = self.settings.window_size + 2 * self.detector.margin_px
         corners = np.rint(pixels[:, index] - 0.5 * (size - 1)).astype(int)
         windows: Windows = np.zeros((2, len(index), 0, 0))
         offsets = np.zeros((2, 0, 2))
-        found = None
+        detected = None
         if len(index):
             if isinstance(images, StickerExposure):
-                found = images.detected(corners, size, self)
+                detected = images.detected(corners, size, self)
             elif isinstance(images, ManyExposures):
-                many = images
-                windows = self._as_lit(lambda at: many.windows_of(exposures, at, size), corners)
+                exposures_together = images
+                windows = self._as_lit(
+                    lambda at: exposures_together.windows_of(exposures, at, size), corners
+                )
             else:
-                one = images
-                windows = self._as_lit(lambda at: one.windows(at, size), corners)
+                exposure = images
+                windows = self._as_lit(lambda at: exposure.windows(at, size), corners)
             windows = self.upright.bright(windows)
             offsets = np.stack(
                 [
                     centre_offset(camera, c[index], t[index], self.settings.radius)
-                    for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
+                    for camera, c, t in zip(self.rig.cameras, centres, turned_normals, strict=True)
                 ]
             )
         body = camera_from_body, places[index % len(places)], normals[index % len(places)]
-        return StickerWindows(self, index, exposures, *body, corners, windows, offsets, found)
+        return StickerWindows(self, index, exposures, *body, corners, windows, offsets, detected)
 
     def _as_lit(
         self, read: Callable[[NDArray[np.int_]], Windows], corners: NDArray[np.int_]
@@ -175,10 +183,11 @@ class Observer:
         return self.evenly_lit(windows, corners)
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
-        """Return windows (2, n, size, size) whose vignetting is everywhere as in their middles.
+        """Return windows (2, n, size, size) with the vignetting of their middles at all pixels.
 
         Vignetting would move the centre of a sticker because it varies across the sticker. The
-        correction changes the noise by a few per mille only.
+        correction changes the noise by a few per mille only. ``corners`` (2, n, 2) are the first
+        pixels of the windows.
         """
         optics = self.settings.optics
         black = self.noise.black_level
@@ -186,18 +195,20 @@ class Observer:
             return windows
         size = windows.shape[-1]
         middle = corners + 0.5 * (windows.shape[-1] - 1)
-        share = np.stack(
+        relative_light = np.stack(
             [
-                optics.window_illumination(camera, at, size)
-                / optics.illumination(camera, centre)[:, None, None]
-                for camera, at, centre in zip(self.rig.cameras, corners, middle, strict=True)
+                optics.window_illumination(camera, image_corners, size)
+                / optics.illumination(camera, image_middles)[:, None, None]
+                for camera, image_corners, image_middles in zip(
+                    self.rig.cameras, corners, middle, strict=True
+                )
             ]
         )
-        return black + (windows - black) / share
+        return black + (windows - black) / relative_light
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
-    """Tell for each sticker (n,) whether it faces the camera, and not at grazing incidence.
+    """Return a mask (n,) of the stickers that face the camera, and not at grazing incidence.
 
     The stickers have centres (n, 3) m and normals (n, 3) in camera axes.
     """

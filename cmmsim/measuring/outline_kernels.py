@@ -17,8 +17,9 @@ class Outlines(NamedTuple):
     """Ellipses of stickers in both images. All arrays are empty if no ellipses are known.
 
     ``shapes`` (n, 2, 3) are the entries xx, xy, yy of the ellipses' matrices, px. ``informations``
-    (n, 2, 6) are the entries of the inverse covariances of these entries. ``normals`` (n, 3) are
-    the stickers' normals in body axes, and ``radius`` is the stickers' radius, m.
+    (n, 2, 6) are the entries 00, 01, 02, 11, 12, 22 of their inverse covariances, px^-2.
+    ``normals`` (n, 3) are the stickers' normals in body axes, and ``radius`` is the stickers'
+    radius, m.
     """
 
     shapes: Array
@@ -29,10 +30,11 @@ class Outlines(NamedTuple):
 
 
 @compiled
-def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: Array) -> float:
+def outline_misfit(outlines: Outlines, n: int, side: int, transform: Array, taught: Array) -> float:
     """Return the squared misfit of the ellipse of sticker ``n`` in image ``side``.
 
-    The misfit is the difference from the ellipse of an unhidden sticker at ``taught`` (3,).
+    The misfit is the difference from the ellipse of an unhidden sticker, in units of its noise. The
+    sticker is taught at ``taught`` (3,) on a body at ``transform`` (4, 4), camera_from_body.
     """
     camera = outlines.cameras.intrinsics[side]
     move = outlines.cameras.extrinsics[side]
@@ -40,9 +42,9 @@ def outline_misfit(outlines: Outlines, n: int, side: int, place: Array, taught: 
     centre = np.empty(3)
     turned = np.empty(3)
     normal = np.empty(3)
-    transform_point(place, taught, 1.0, point)
+    transform_point(transform, taught, 1.0, point)
     transform_point(move, point, 1.0, centre)
-    transform_point(place, outlines.normals[n], 0.0, turned)
+    transform_point(transform, outlines.normals[n], 0.0, turned)
     transform_point(move, turned, 0.0, normal)
     x, y, xx, xy, yy = disc_ellipse(centre, normal, outlines.radius, camera)
     _, _, a, b, c, d = project(camera, x, y, 1.0)

@@ -2,7 +2,7 @@
 
 The pose in camera axes and its covariance come from ``frame_solver``, or from ``by_planes``. They
 are then transformed to the base frame. ``geometry.pose_fit_kernels`` computes the covariance due to
-noise, and ``solver_kernels`` enlarges it where residuals show more.
+noise, and ``solver_kernels`` enlarges it if the residuals are larger than noise.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Solution = tuple[Array, Array, StickerObservation]
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
     """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by a rigid fit.
 
-    The body's stickers were taught at ``places`` (n, 3). Raises LostError unless at least three
+    The body's stickers were taught at ``places`` (n, 3), m. Raises LostError unless at least three
     stickers are seen that do not lie on one line.
     """
     result = register(places[observation.index], observation.points, observation.covariances)
@@ -52,8 +52,9 @@ def by_registration(observation: StickerObservation, places: Array) -> Solution:
 def by_planes(observation: StickerObservation, body: MarkedBody, rough_normals: Array) -> Solution:
     """Return camera_from_body (4, 4), its covariance (6, 6) and the stickers used, by three planes.
 
-    ``rough_normals`` (3, 3) are those of planes A, B, C in the camera frame. Raises LostError,
-    which names the plane, if a plane has too few stickers.
+    The rows of ``rough_normals`` (3, 3) are the normals of planes A, B, C in the camera frame.
+    Raises LostError, which names the plane, if the stickers on a plane are too few or lie on one
+    line.
     """
     frame, covariance = frame_of_points(
         observation.points,
@@ -72,7 +73,7 @@ def by_planes(observation: StickerObservation, body: MarkedBody, rough_normals: 
 def frames_by_planes(
     body: MarkedBody, points: Array, covariances: Array, rough_normals: Array
 ) -> Array:
-    """Return camera_from_body (..., 4, 4) as ``by_planes`` does, for many frames.
+    """Return camera_from_body (..., 4, 4) for many frames, as ``by_planes`` does for one.
 
     All n stickers must be seen, at points (..., n, 3) with covariances (..., n, 3, 3).
     ``rough_normals`` is (..., 3, 3).
@@ -88,9 +89,9 @@ def _planes_from(body: MarkedBody) -> Array:
 
 
 def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
-    """Return the covariance (6, 6) of [dt, dphi] for another origin of a rigid frame.
+    """Return the covariance (6, 6) of a frame's small error [dt, dphi] for another origin.
 
-    ``origin`` (3,) is in the frame's own axes.
+    ``frame`` (4, 4) is the transform of the frame, and ``origin`` (3,) is in its axes.
     """
     lever = np.eye(6)
     lever[:3, 3:] = -skew(frame[:3, :3] @ origin)
@@ -154,24 +155,24 @@ class PoseEstimator(Observer):
         """Return a rough camera_from_platform (4, 4) from whole images, without a prior pose.
 
         If stickers are missing and the exposure time is not zero, streaks are searched as well.
-        Raises LostError.
+        Raises the LostError of ``candidate_points`` and ``find_layout``.
         """
         ellipses = bright_ellipses(images, self)
         limits = self.settings.limits
         if self.settings.exposed_share == 0.0:
-            return self._found(ellipses, limits)[0]
-        streaks = replace(limits, largest_misfit=np.inf)
+            return self._located(ellipses, limits)[0]
+        with_streaks = replace(limits, largest_misfit=np.inf)
         try:
-            found, count = self._found(ellipses, limits)
+            transform, count = self._located(ellipses, limits)
         except LostError:
-            return self._found(ellipses, streaks)[0]
+            return self._located(ellipses, with_streaks)[0]
         if count >= ENOUGH * len(self.taught.platform_places):
-            return found
+            return transform
         try:
-            longer, more = self._found(ellipses, streaks)
+            other, other_count = self._located(ellipses, with_streaks)
         except LostError:
-            return found
-        return longer if more > count else found
+            return transform
+        return other if other_count > count else transform
 
     def measure(
         self,
@@ -183,11 +184,11 @@ class PoseEstimator(Observer):
         """Return the measurement, and the measured camera_from_platform (4, 4).
 
         ``expected`` is a first guess of camera_from_platform. ``exposure_ends`` are the expected
-        transforms at the beginning and at the end of the exposure, and ``frame_ends`` half a frame
-        period before and after its middle, for rows that are not exposed at once. Without
-        ``exposure_ends`` and without point spread, the error of the pose exceeds its covariance if
-        stickers move by more than half a pixel; use ``measure_anew`` in this case. Raises
-        LostError.
+        transforms at the beginning and at the end of the exposure. ``frame_ends`` are those half a
+        frame period before and after its middle, for rows or cameras that are not exposed at the
+        same time. Without ``exposure_ends`` and without point spread, the error of the pose exceeds
+        its covariance if images of stickers move by more than half a pixel during the exposure; use
+        ``measure_anew`` in this case. Raises LostError.
         """
         return self.measured(
             self.observe(images, expected, *self._stickers, exposure_ends, frame_ends), expected
@@ -196,9 +197,9 @@ class PoseEstimator(Observer):
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """Measure as ``measure`` does, and estimate the movement from this frame alone.
 
-        Streaks show the movement during the exposure. Rows that are not exposed at once show the
-        movement between their exposures. Raises LostError, which states the length of streaks if
-        there are any.
+        Streaks show the movement during the exposure. Rows that are exposed one after another show
+        the movement between their exposures. Raises LostError, which states the length of streaks
+        if there are any.
         """
         settings = self.settings
         if settings.exposed_share == 0.0 and settings.row_share == 0.0:
@@ -210,8 +211,9 @@ class PoseEstimator(Observer):
         frame_ends, factor = frame_ends_of(read) if settings.row_share > 0.0 else (None, 1.0)
         try:
             exposure_ends = None if streaks is None else streaks.exposure_ends
-            found, move = self.measured(read.observed(exposure_ends, frame_ends), expected)
-            return replace(found, covariance=factor * found.covariance), move
+            seen = read.observed(exposure_ends, frame_ends)
+            measurement, transform = self.measured(seen, expected)
+            return replace(measurement, covariance=factor * measurement.covariance), transform
         except LostError as error:
             if streaks is None:
                 raise
@@ -222,7 +224,7 @@ class PoseEstimator(Observer):
         """Taught places (n,3), m, and normals (n,3) of the stickers, in platform axes."""
         return self.taught.platform_places, self.platform.sticker_normals
 
-    def _found(
+    def _located(
         self, ellipses: tuple[EllipseFits, EllipseFits], limits: FitLimits
     ) -> tuple[Array, int]:
         """Return a rough camera_from_platform (4, 4), and the number of recognised stickers.
@@ -230,10 +232,10 @@ class PoseEstimator(Observer):
         Raises LostError.
         """
         points = candidate_points(ellipses, self, limits)
-        place, stickers, _ = find_layout(
+        transform, stickers, _ = find_layout(
             self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform"
         )
-        return place, len(stickers)
+        return transform, len(stickers)
 
     def measured(self, seen: StickerObservation, near: Array) -> tuple[Measurement, Array]:
         """Return the measurement from observed stickers, and the measured camera_from_platform.
@@ -253,32 +255,39 @@ class PoseEstimator(Observer):
             return lost_measurement(str(error))
 
     def _measured(self, solved: SolvedFrames, frame: int) -> tuple[Measurement, Array]:
-        used = solved.of(frame)
-        move = solved.camera_from_body[frame]
+        """Return the measurement of a solved frame, and its camera_from_platform (4, 4).
+
+        Raises the LostError of ``by_planes``.
+        """
+        used = solved.used_in(frame)
+        transform = solved.camera_from_body[frame]
         covariance = solved.covariances[frame]
         if self.method == "planes":
-            rough_normals = self.platform.normals @ move[:3, :3].T
-            move, covariance, used = by_planes(used, self.platform, rough_normals)
-            # The stickers' covariances do not contain what the stickers share.
+            rough_normals = self.platform.normals @ transform[:3, :3].T
+            transform, covariance, used = by_planes(used, self.platform, rough_normals)
+            # The stickers' covariances do not include the errors that stickers share.
             covariance = covariance + solved.shared[frame]
-        pose, spread = self.in_base(move, covariance)
-        return self.measurement(pose, spread, used), move
+        pose, spread = self.in_base(transform, covariance)
+        return self.measurement(pose, spread, used), transform
 
     def in_base(self, camera_from_platform: Array, covariances: Array) -> tuple[Array, Array]:
         """Return poses (..., 6) of the platform in the base frame and covariances (..., 6, 6).
 
-        ``camera_from_platform`` is (..., 4, 4). ``covariances`` (..., 6, 6) are the
-        covariances of their small errors [dt, dphi].
+        ``camera_from_platform`` is (..., 4, 4), and ``covariances`` (..., 6, 6) are those of its
+        small errors [dt, dphi].
         """
         base_from_camera = self.taught.base_from_camera
         base_from_platform = base_from_camera @ camera_from_platform
-        spread = pose_covariance(
+        pose_covariances = pose_covariance(
             base_from_platform, compose_covariance(base_from_camera, covariances)
         )
-        return poses_of(base_from_platform), spread
+        return poses_of(base_from_platform), pose_covariances
 
     def measurement(self, pose: Array, covariance: Array, used: StickerObservation) -> Measurement:
-        """Return the measurement with a pose (6,) in the base frame and the stickers used."""
+        """Return the measurement with a pose (6,) in the base frame and the stickers used.
+
+        ``covariance`` (6, 6) is that of the pose's noise.
+        """
         return Measurement(
             pose,
             covariance,
@@ -321,7 +330,8 @@ def measure_frame(
     Raises
     ------
     ShapeError
-        If the images have another size or bit depth than the estimator's cameras.
+        If the images have another size or bit depth than the estimator's cameras, or if
+        ``expected`` is not (4, 4) and finite.
     CmmError
         If ``frame`` is not a StereoFrame, or ``estimator`` is not a PoseEstimator.
 

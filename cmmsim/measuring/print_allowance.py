@@ -20,19 +20,20 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.radiometry.noise import CameraNoise
 
-# Probability that light that rises across the stickers is fitted in a frame with even light. With
-# this probability, noise moves the pose by more than LARGEST_LIGHT (squared, in units of noise).
+# Probability that light that rises across the stickers is fitted in a frame with even light. It is
+# fitted if it would move the pose by more than noise does with this probability.
 LIGHT_CHANCE = 1e-4
+# Largest squared movement of the pose in units of its noise.
 LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))
 # Errors of a centre, px, for an unevenness of 1, and for an outline that is off by 1 px. Errors
-# that change with the place in a pixel are smaller with a point spread.
+# that change with the place of the centre within a pixel are smaller with a point spread.
 CONSTANT = (0.04, 0.08)
 CHANGING = (0.12, 0.10)
 CHANGING_BLURRED = (0.04, 0.03)
 # Errors of the entries of an ellipse's matrix, px, for an unevenness of 1, an outline that is off
 # by 1 px, and a rim of 1 px.
 SHAPE = (0.5, 0.8, 0.7)
-# Ratio of the largest misfit that print causes to the mean one.
+# Ratio of the largest increase of a misfit by print to the mean increase.
 MISFIT_SPREAD = 4.0
 
 
@@ -43,9 +44,9 @@ class PrintAllowance:
     constant_px     rms of errors of a centre that are the same in all frames, px
     changing_px     rms of errors of a centre that change from frame to frame, px
     outline_px      rms of errors of the entries of an ellipse's matrix, px
-    largest_misfit  largest accepted reduced chi-square
-    largest_light   squared movement of the pose, in units of noise; light that rises across the
-                    stickers is fitted if it would move the pose by more than this
+    largest_misfit  largest accepted reduced chi-square of a fit
+    largest_light   light that rises across the stickers is fitted if it would move the pose by more
+                    than this (squared movement in units of the pose's noise)
     known           True if print is not perfect, and its sizes are known
     """
 
@@ -57,46 +58,51 @@ class PrintAllowance:
     known: bool = False
 
     def constant_covariances(self, rig: StereoRig, points: Array) -> Array:
-        """Return the covariances (n, 3, 3) of points (n, 3) due to constant errors of centres."""
+        """Return the covariances (n, 3, 3) of points (n, 3) due to constant errors of centres.
+
+        The points are in the camera frame, m.
+        """
         slopes = rig.derivatives(points)[0].reshape(2, len(points), 2, 3)
-        known = np.einsum("cnki,cnkj->nij", slopes, slopes)
-        return np.asarray(self.constant_px**2 * np.linalg.inv(known))
+        information = np.einsum("cnki,cnkj->nij", slopes, slopes)
+        return np.asarray(self.constant_px**2 * np.linalg.inv(information))
 
 
 def centre_errors_px(file: SensorFile, radius_px: float) -> tuple[float, float]:
-    """Return the rms of constant and of changing errors of centres by print, px.
+    """Return the rms of constant and of changing errors of centres due to print, px.
 
-    ``radius_px`` is the radius of a sticker in the image. The errors are those of a fit that allows
-    for light that rises across the sticker.
+    ``radius_px`` is the radius of a sticker in the image. Light that rises across the sticker is
+    assumed to be fitted.
     """
     sizes = print_sizes(file)
-    both = np.array([sizes.unevenness, sizes.outline * radius_px])
+    errors = np.array([sizes.unevenness, sizes.outline * radius_px])
     changing = CHANGING_BLURRED if file.lens.psf_px > 0.0 else CHANGING
-    return float(np.linalg.norm(CONSTANT * both)), float(np.linalg.norm(changing * both))
+    return float(np.linalg.norm(CONSTANT * errors)), float(np.linalg.norm(changing * errors))
 
 
 def print_allowance(
     file: SensorFile, noise: CameraNoise, radius_px: float, fit_size: int
 ) -> PrintAllowance:
-    """Return the allowance of an estimator that knows the sizes of its stickers' print.
+    """Return the allowance of an estimator for the print that a sensor file states.
 
     ``radius_px`` is the radius of a sticker in the image, and ``fit_size`` the side of the fitted
-    part of a window, px. Uneven print is fitted like light that rises across a sticker.
+    part of a window, px. If print is perfect or its sizes are not known, nothing is allowed for.
+    With uneven print or outlines, light that rises across stickers is always fitted, because its
+    effect is similar.
     """
     if file.print.is_perfect or not file.print.known:
         return PrintAllowance()
     sizes = print_sizes(file)
-    both = np.array([sizes.unevenness, sizes.outline * radius_px])
+    errors = np.array([sizes.unevenness, sizes.outline * radius_px])
     rim = sizes.thickness * sizes.rim * radius_px
     bright = float(noise.mean_grey(np.array(file.stickers.sticker_level / 255.0)))
-    share = np.pi * radius_px**2 / fit_size**2
-    # Squared differences from the model on the sticker, and at its rim of one pixel width.
-    misfit = share * (both[0] ** 2 + 2.0 / radius_px * (both[1] ** 2 + rim**2))
+    area_fraction = np.pi * radius_px**2 / fit_size**2
+    # Squared differences from the model on the sticker, and on its rim of one pixel width.
+    misfit = area_fraction * (errors[0] ** 2 + 2.0 / radius_px * (errors[1] ** 2 + rim**2))
     misfit *= (bright - noise.black_level) ** 2 / float(noise.variance(np.array(bright)))
     return PrintAllowance(
         *centre_errors_px(file, radius_px),
-        float(np.linalg.norm(np.multiply(SHAPE, [*both, rim]))),
+        float(np.linalg.norm(np.multiply(SHAPE, [*errors, rim]))),
         FitLimits.largest_misfit + MISFIT_SPREAD * misfit,
-        0.0 if both.any() else LARGEST_LIGHT,
+        0.0 if errors.any() else LARGEST_LIGHT,
         known=True,
     )

@@ -1,16 +1,16 @@
-"""Compiled covariance of a pose for errors that the stickers of an image share.
+"""Compiled covariance of a pose due to errors that the stickers of an image share.
 
-Noise does not tell such errors from a movement of the body, but they leave other traces:
+Such errors look like a movement of the body in part, but they also leave other traces:
 
 - If the right camera exposes later than the left one, or rows of pixels one after another, stickers
-  of a moving body are displaced along their movement. The displacement is known but for one number,
-  the delay. A part of it looks like a movement of the body. The rest remains in the residuals and
-  determines the delay.
+  of a moving body are displaced along their movement. Only one number is unknown, the delay. A part
+  of the displacement looks like a movement of the body. The rest remains in the residuals, from
+  which the delay is estimated.
 - If a lens blurs more than it is known to, its point spread can lean to one side. All centres in
-  the image then shift by the same vector. The blur tells the size of this vector.
+  the image then shift by the same vector. The size of this vector is estimated from the blur.
 
-A delay that noise does not explain, and a blur beyond that of the known lens, become standard
-deviations of these errors. Only the part beyond a limit counts, so clean frames lose little.
+The standard deviation of each error is proportional to the part of the estimated delay or blur that
+exceeds a limit. Noise rarely exceeds the limit, so clean frames lose little.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from cmmsim.geometry.transform_kernels import transform_point
 DELAYS = 2
 # Common shifts of both images, along x and y.
 SHIFTS = 4
-# Inverse square of the largest delay, in frame periods. Rows count as delayed by their distance
-# from the middle row, in heights of the image.
+# Inverse variance of a delay before the fit, in frame periods^-2. It keeps the variance finite if
+# the stickers do not determine a delay. The row delay is that over the whole height of the image.
 KNOWN_DELAY = 1.0
-# Largest delay that noise explains, in its standard deviations. What it is beyond this, times the
-# share, is the standard deviation of the delay. A movement along the line between the cameras
-# leaves up to four times less in the residuals than in the pose. A limit of 2.5 would notice more
-# of it, but doubles the variance of clean frames that move along this line.
+# Largest delay that noise explains, in its standard deviations. The excess over it, times
+# DELAY_SHARE, becomes the standard deviation of the delay. For a body that moves along the line
+# between the cameras, a delay changes the residuals up to four times less than the pose. A limit of
+# 2.5 would detect smaller delays, but doubles the variance of clean frames that move this way.
 LARGEST_DELAY = 3.0
 DELAY_SHARE = 2.0
 
@@ -58,14 +58,14 @@ class Images(NamedTuple):
 
 @compiled
 def shared_errors(
-    used: Array, places: Array, arms: Array, images: Images, frame: int, place: Array,
+    used: Array, places: Array, arms: Array, images: Images, frame: int, transform: Array,
     covariance: Array, exact: bool, spread: Array,
 ) -> None:  # fmt: skip
     """Add the covariance of a pose due to shared errors to ``spread`` (6, 6).
 
-    ``images`` have the used stickers with taught ``places`` and ``arms`` (n, 3), and ``frame`` is
-    the row of their shifts and ends. ``place`` (4, 4) is the fitted pose, and ``covariance`` (6, 6)
-    that of its noise. Delays are tested only if the rig is known exactly.
+    ``transform`` (4, 4) is the fitted camera_from_body, and ``covariance`` (6, 6) that of its
+    noise. The n stickers have taught ``places`` and ``arms`` (n, 3). ``frame`` is the row of the
+    frame in the shifts and ends of ``images``. Delays are tested only if the rig is ``exact``.
     """
     first = images.ends[frame, 0]
     last = images.ends[frame, 1]
@@ -77,20 +77,20 @@ def shared_errors(
     if not (moving or images.shifts[frame, 0] > 0.0 or images.shifts[frame, 1] > 0.0):
         return
     cameras = images.cameras
-    pushes = np.zeros((SHIFTS + DELAYS, 6))
-    known = np.zeros(DELAYS)
-    right = np.zeros(DELAYS)
+    cross_informations = np.zeros((SHIFTS + DELAYS, 6))
+    delay_informations = np.zeros(DELAYS)
+    delay_sums = np.zeros(DELAYS)
     point = np.empty(3)
     before = np.empty(3)
     after = np.empty(3)
     slope = np.empty((2, 6))
-    pushed = np.empty((6, 2))
+    weighted_slopes = np.empty((6, 2))
     weight = np.empty((2, 2))
     moved = np.zeros(2)
     for n in range(len(used)):
         if not used[n]:
             continue
-        transform_point(place, places[n], 1.0, point)
+        transform_point(transform, places[n], 1.0, point)
         if moving:
             transform_point(first, places[n], 1.0, before)
             transform_point(last, places[n], 1.0, after)
@@ -98,10 +98,10 @@ def shared_errors(
             camera = cameras.intrinsics[side]
             move = cameras.extrinsics[side]
             u, v = pose_slopes(camera, move, point, arms[n], slope)
-            weigh(slope, images.spreads[n, side], weight, pushed)
+            weigh(slope, images.spreads[n, side], weight, weighted_slopes)
             for i in range(6):
                 for j in range(2):
-                    pushes[2 * side + j, i] += pushed[i, j]
+                    cross_informations[2 * side + j, i] += weighted_slopes[i, j]
             if not moving:
                 continue
             x, y, z = transformed(move, before)
@@ -115,32 +115,32 @@ def shared_errors(
             along = 0.0
             length = 0.0
             for j in range(2):
-                by = weight[0, j] * moved[0] + weight[1, j] * moved[1]
-                along += by * (off_y if j else off_x)
-                length += by * moved[j]
-            late = v / cameras.size[side, 1] - 0.5
+                weighted = weight[0, j] * moved[0] + weight[1, j] * moved[1]
+                along += weighted * (off_y if j else off_x)
+                length += weighted * moved[j]
+            row_delay = v / cameras.size[side, 1] - 0.5
             for k in range(DELAYS):
-                delay = late if k else float(side)
-                right[k] += delay * along
-                known[k] += delay * delay * length
+                delay = row_delay if k else float(side)
+                delay_sums[k] += delay * along
+                delay_informations[k] += delay * delay * length
                 for i in range(6):
-                    pushes[SHIFTS + k, i] += delay * (
-                        pushed[i, 0] * moved[0] + pushed[i, 1] * moved[1]
+                    cross_informations[SHIFTS + k, i] += delay * (
+                        weighted_slopes[i, 0] * moved[0] + weighted_slopes[i, 1] * moved[1]
                     )
     for k in range(SHIFTS + DELAYS):
-        change = covariance @ pushes[k]
-        size = 0.0
+        change = covariance @ cross_informations[k]
+        std = 0.0
         if k < SHIFTS:
-            size = images.shifts[frame, k // 2]
+            std = images.shifts[frame, k // 2]
         elif moving:
-            # A part of the displacement is taken up by the pose.
-            information = known[k - SHIFTS] + KNOWN_DELAY
+            # The fitted pose absorbs a part of the displacement.
+            information = delay_informations[k - SHIFTS] + KNOWN_DELAY
             for i in range(6):
-                information -= pushes[k, i] * change[i]
+                information -= cross_informations[k, i] * change[i]
             deviation = 1.0 / np.sqrt(information)
-            beyond = abs(right[k - SHIFTS]) * deviation - LARGEST_DELAY
-            size = DELAY_SHARE * deviation * max(beyond, 0.0)
-        if size > 0.0:
+            beyond = abs(delay_sums[k - SHIFTS]) * deviation - LARGEST_DELAY
+            std = DELAY_SHARE * deviation * max(beyond, 0.0)
+        if std > 0.0:
             for i in range(6):
                 for j in range(6):
-                    spread[i, j] += size * size * change[i] * change[j]
+                    spread[i, j] += std * std * change[i] * change[j]

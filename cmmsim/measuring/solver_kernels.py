@@ -29,7 +29,7 @@ from cmmsim.measuring.warp_kernels import SHAPES, warp
 
 MOST_STEPS = 8
 
-# States of a frame.
+# States of a frame. All but MEASURED mean that the frame is lost.
 MEASURED = 0
 TOO_FEW = 1
 ON_A_LINE = 2
@@ -39,7 +39,7 @@ CONTRADICTED = 3
 # STATE    state of the frame
 # SEEN     number of stickers seen
 # LEFT     number of stickers that were not rejected
-# FIRST    sticker that was rejected first, or -1
+# FIRST    index in the frame of the sticker that was rejected first, or -1
 # PLACE    squared misfit of the place of this sticker
 # OUTLINE  squared misfit of the worse ellipse of this sticker
 # EXCESS   factor on the covariances
@@ -55,8 +55,8 @@ class ObservedStickers(NamedTuple):
     points        (n, 3), in the camera frame, m
     informations  (n, 3, 3), inverse covariances of the points
     covariances   (n, 3, 3), covariances of the points
-    arms, gaps    (n, 3), overwritten; ``pose_fit_kernels`` explains them
-    rays          (n,), signed distances of both rays of a sticker, in units of their noise
+    arms, gaps    (n, 3), m, overwritten; ``pose_fit_kernels`` explains them
+    rays          (n,), signed distance between the two rays of a sticker, in standard deviations
     planes        (n,), planes of the body on which the stickers lie, numbered from 0
     """
 
@@ -71,12 +71,12 @@ class ObservedStickers(NamedTuple):
 
 
 class SolverLimits(NamedTuple):
-    """Limits for the stickers of a frame.
+    """Limits and factors of the solver.
 
-    largest_misfit  squared misfit of one sticker
-    largest_excess  mean square of all residuals
+    largest_misfit  largest accepted squared misfit of one sticker
+    largest_excess  largest accepted mean square of all residuals, in units of their noise
     fewest          smallest number of stickers
-    smallest_share  smallest share of a sticker's noise that must appear in its residual
+    smallest_share  smallest ratio of a residual's variance to the noise in a tested direction
     smallest_width  smallest extent of the stickers across a line through them, m
     step_tolerance  rotation below which a step ends a fit, rad
     totals          (d,), largest sums of squared residuals that noise explains, by the number of
@@ -85,11 +85,11 @@ class SolverLimits(NamedTuple):
     tails           (d,), factor on the covariance of a pose from few stickers, by the number of
                     degrees of freedom
     largest_warp    largest squared warp that noise explains
-    warp_share      factor on the mean square of the warp's shapes, for the covariances
+    warp_share      factor on the excess of the mean square of the warp's shapes over its limit
     largest_slip    largest squared slip of a plane that noise explains
     fewest_rivals   smallest number of rejected stickers that contradict the others
-    exact           True if no error of the rig is known. Such an error leaves residuals like those
-                    of delays, so warps, slips and delays are not tested.
+    exact           True if the rig has no stated errors. Such errors leave residuals like those of
+                    delays, so warps, slips and delays are then not tested.
     """
 
     largest_misfit: float
@@ -113,15 +113,15 @@ def fit(
     seen: ObservedStickers,
     places: Array,
     step_tolerance: float,
-    place: Array,
+    transform: Array,
     covariance: Array,
     normal: Array,
 ) -> float:
-    """Fit ``place`` (4,4) to the used stickers and return the sum of their squared residuals.
+    """Fit a transform (4, 4) to the used stickers; return the sum of their squared residuals.
 
-    ``place`` is changed, and its ``covariance`` (6,6) is filled. On entry, the arms and gaps of the
-    stickers must belong to ``place``. At the end, they belong to the new ``place``. ``normal``
-    (6,6) is working memory.
+    ``transform`` is camera_from_body. It is changed, and its ``covariance`` (6, 6) is filled.
+    ``places`` (n, 3) are the taught places. On entry, the arms and gaps of all stickers must belong
+    to ``transform``. At the end, they belong to the new one. ``normal`` (6, 6) is overwritten.
     """
     change = np.empty(6)
     total = 0.0
@@ -133,7 +133,7 @@ def fit(
             if seen.used[n]:
                 total += add_point(seen.arms[n], seen.informations[n], seen.gaps[n], normal, change)
         total -= solve_step(normal, change, covariance)
-        move_by(place, change)
+        move_by(transform, change)
         if max(abs(change[3]), abs(change[4]), abs(change[5])) < step_tolerance:
             for n in range(len(seen.used)):
                 arm = seen.arms[n]
@@ -144,13 +144,13 @@ def fit(
                 gap[2] -= change[2] + change[3] * arm[1] - change[4] * arm[0]
             break
         for n in range(len(seen.used)):
-            turn_arm(place, places[n], seen.points[n], seen.arms[n], seen.gaps[n])
+            turn_arm(transform, places[n], seen.points[n], seen.arms[n], seen.gaps[n])
     return total
 
 
 @compiled
 def excess_of(total: float, freedom: int, totals: Array) -> float:
-    """Return the mean square of residuals if noise does not explain it, else 1."""
+    """Return the mean square of residuals if noise does not explain it, otherwise 1."""
     if freedom < 1:
         return 1.0
     return total / freedom if total > totals[freedom] else 1.0
@@ -158,26 +158,26 @@ def excess_of(total: float, freedom: int, totals: Array) -> float:
 
 @compiled
 def worst_sticker(
-    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    covariance: Array, total: float, freedom: int, misfits: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits,
+    transform: Array, covariance: Array, total: float, freedom: int, misfits: Array,
 ) -> int:  # fmt: skip
-    """Return the used sticker with the largest misfit, and fill ``misfits`` (2,).
+    """Return the used sticker with the largest misfit, or -1 if all misfits are NaN.
 
-    ``misfits`` are the squared misfits of this sticker's place and of its worse ellipse. The misfit
-    of the place is in units of noise, or of the other stickers' residuals if those are larger than
-    noise.
+    ``misfits`` (2,) is filled with the squared misfits of this sticker's place and of its worse
+    ellipse. The misfit of the place is in units of noise, or of the other stickers' residuals if
+    those are larger than noise. All squared residuals together are ``total``.
     """
     worst = -1
     largest = -1.0
     half = np.empty((3, 6))
-    left = np.empty(6)
+    entries = np.empty(6)
     inverse = np.empty(6)
     for n in range(len(seen.used)):
         if not seen.used[n]:
             continue
-        residual_covariance(seen.arms[n], seen.covariances[n], covariance, half, left)
+        residual_covariance(seen.arms[n], seen.covariances[n], covariance, half, entries)
         misfit = residual_misfit(
-            seen.gaps[n], seen.covariances[n], left, limits.smallest_share, inverse
+            seen.gaps[n], seen.covariances[n], entries, limits.smallest_share, inverse
         )
         # The squared residuals of the other stickers are the total minus this sticker's part, with
         # three degrees of freedom less.
@@ -185,7 +185,7 @@ def worst_sticker(
         outline = 0.0
         if len(outlines.shapes):
             for side in range(2):
-                outline = max(outline, outline_misfit(outlines, n, side, place, places[n]))
+                outline = max(outline, outline_misfit(outlines, n, side, transform, places[n]))
         if max(misfit, outline) > largest:
             worst = n
             largest = max(misfit, outline)
@@ -196,16 +196,16 @@ def worst_sticker(
 
 @compiled
 def agree(
-    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    covariance: Array, fewest: int, verdict: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits,
+    transform: Array, covariance: Array, fewest: int, verdict: Array,
 ) -> None:  # fmt: skip
     """Reject stickers one by one until the others agree; see ``solve`` for the parameters.
 
-    At least ``fewest`` stickers must be left. Fills all columns of the ``verdict`` but RIVALS.
+    At least ``fewest`` stickers must be left. Writes to all columns of ``verdict`` but RIVALS.
     """
     normal = np.empty((6, 6))
     misfits = np.zeros(2)
-    left_out = 0
+    rejected = 0
     verdict[FIRST] = -1
     verdict[SEEN] = np.sum(seen.used)
     # Only one sticker is rejected at a time, because a wrong sticker makes good stickers look
@@ -213,19 +213,18 @@ def agree(
     while True:
         count = np.sum(seen.used)
         verdict[LEFT] = count
-        if count < fewest or count <= left_out:
+        if count < fewest or count <= rejected:
             verdict[STATE] = TOO_FEW
             return
         if lie_on_a_line(seen.used, places, limits.smallest_width):
             verdict[STATE] = ON_A_LINE
             return
         freedom = 3 * count - 6
-        total = fit(seen, places, limits.step_tolerance, place, covariance, normal)
+        total = fit(seen, places, limits.step_tolerance, transform, covariance, normal)
         verdict[EXCESS] = excess_of(total, freedom, limits.totals)
         worst = worst_sticker(
-            seen, places, outlines, limits, place, covariance, total, freedom, misfits
+            seen, places, outlines, limits, transform, covariance, total, freedom, misfits
         )
-        # Without a worst sticker, all misfits are NaN.
         if worst < 0:
             verdict[STATE] = TOO_FEW
             return
@@ -235,27 +234,27 @@ def agree(
         ):
             verdict[STATE] = MEASURED
             return
-        if left_out == 0:
+        if rejected == 0:
             verdict[FIRST] = worst
             verdict[PLACE] = misfits[0]
             verdict[OUTLINE] = misfits[1]
         seen.used[worst] = False
-        left_out += 1
+        rejected += 1
 
 
 @compiled
 def rivals(
-    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    rejected: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits,
+    transform: Array, rejected: Array,
 ) -> int:  # fmt: skip
-    """Return the number of rejected stickers (n,) that agree with each other on another pose."""
+    """Return the number of ``rejected`` (n,) stickers that agree on another pose, or 0."""
     if np.sum(rejected) < limits.fewest_rivals:
         return 0
     others = ObservedStickers(
         rejected.copy(), seen.points, seen.informations, seen.covariances, seen.arms.copy(),
         seen.gaps.copy(), seen.rays, seen.planes,
     )  # fmt: skip
-    other = place.copy()
+    other = transform.copy()
     verdict = np.zeros(COLUMNS)
     for n in range(len(rejected)):
         turn_arm(other, places[n], seen.points[n], others.arms[n], others.gaps[n])
@@ -269,11 +268,12 @@ def few_excess(
 ) -> float:
     """Return the factor on the covariance of a pose from few stickers.
 
-    It is the mean square of the residuals of all stickers that were seen, even of the ``rejected``
-    (n,) ones, times ``limits.tails``, because the pose has a wider distribution than a normal one.
+    It is the mean square of the residuals of all stickers that were seen, and at least 1. The
+    squared residuals of ``rejected`` (n,) stickers count up to the limit for one sticker. The
+    factor contains ``limits.tails``, because the pose has a wider distribution than a normal one.
     """
     half = np.empty((3, 6))
-    left = np.empty(6)
+    entries = np.empty(6)
     inverse = np.empty(6)
     total = 0.0
     used = 0
@@ -286,8 +286,9 @@ def few_excess(
                     total += seen.gaps[n, i] * seen.informations[n, i, j] * seen.gaps[n, j]
         elif rejected[n]:
             gone += 1
-            residual_covariance(seen.arms[n], seen.covariances[n], -covariance, half, left)
-            misfit = residual_misfit(seen.gaps[n], seen.covariances[n], left, 0.0, inverse)
+            # The pose is independent of a rejected sticker, so their covariances are added.
+            residual_covariance(seen.arms[n], seen.covariances[n], -covariance, half, entries)
+            misfit = residual_misfit(seen.gaps[n], seen.covariances[n], entries, 0.0, inverse)
             total += min(misfit, limits.largest_misfit)
     mean = max(total / (3 * (used + gone) - 6), 1.0)
     return mean * limits.tails[3 * used - 6]
@@ -295,39 +296,39 @@ def few_excess(
 
 @compiled
 def solve(
-    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits, place: Array,
-    covariance: Array, searched: int, images: Images, frame: int, shared: Array, verdict: Array,
+    seen: ObservedStickers, places: Array, outlines: Outlines, limits: SolverLimits,
+    transform: Array, covariance: Array, searched: int, images: Images, frame: int, shared: Array,
+    verdict: Array,
 ) -> None:  # fmt: skip
-    """Solve one frame, in which ``searched`` is the number of stickers that were searched.
+    """Compute the pose of a body in one frame.
 
-    ``place`` (4,4) is a first guess of camera_from_body on entry, and the result at the end. Its
-    ``covariance`` (6,6) and the ``verdict`` (COLUMNS,) of the frame are filled. ``places`` (n,3)
-    are the taught places. Stickers that contradict the others are marked as not used. The
-    covariances of the used stickers are enlarged if residuals are larger than noise. ``shared``
-    (6,6) is the part of the covariance due to a slip, and to what ``shared_errors`` finds in row
-    ``frame`` of the ``images``. Arms and gaps must belong to ``place`` on entry.
+    ``transform`` (4, 4) is a first guess of camera_from_body on entry, and the result at the end.
+    Its ``covariance`` (6, 6) and the ``verdict`` (COLUMNS,) are filled. ``places`` (n, 3) are the
+    taught places, and ``searched`` is the number of stickers that were searched. Stickers that
+    contradict the others are marked as not used. Covariances of the others are enlarged if
+    residuals are larger than noise. ``shared`` (6, 6) is filled with the part of the covariance due
+    to a slip and ``shared_errors``. Arms and gaps must belong to ``transform`` on entry.
     """
     shared[:] = 0.0
     rejected = seen.used.copy()
     verdict[RIVALS] = 0
-    agree(seen, places, outlines, limits, place, covariance, limits.fewest, verdict)
+    agree(seen, places, outlines, limits, transform, covariance, limits.fewest, verdict)
     if verdict[STATE] != MEASURED:
         return
     for n in range(len(rejected)):
         rejected[n] = rejected[n] and not seen.used[n]
-    verdict[RIVALS] = rivals(seen, places, outlines, limits, place, rejected)
+    verdict[RIVALS] = rivals(seen, places, outlines, limits, transform, rejected)
     if verdict[RIVALS] > 0:
         verdict[STATE] = CONTRADICTED
         return
     exact = limits.exact
-    shared_errors(seen.used, places, seen.arms, images, frame, place, covariance, exact, shared)
+    shared_errors(seen.used, places, seen.arms, images, frame, transform, covariance, exact, shared)
     excess = verdict[EXCESS]
     warped = excess
     if exact:
         scene = seen.arms, seen.gaps, seen.informations
         beyond = warp(seen.used, *scene, seen.rays, covariance) - excess * limits.largest_warp
-        # Only the excess over the limit counts, so that good frames that just exceed it lose
-        # little.
+        # Only the excess over the limit counts, so good frames that just exceed it lose little.
         warped += limits.warp_share * max(beyond, 0.0) / SHAPES
         spread = np.empty((6, 6))
         slip = largest_slip(seen.used, seen.planes, *scene, covariance, spread)
@@ -356,10 +357,10 @@ def solve_frames(
 ) -> None:  # fmt: skip
     """Call ``solve`` for several frames.
 
-    Frame j has the stickers ``starts[j]`` to ``starts[j + 1]``, and ``searched`` (f,) is the number
-    of stickers that were searched in each. ``camera_from_body`` (f,4,4) contains first guesses on
-    entry, and the results at the end. Their ``covariances`` and ``shared`` (f,6,6) and ``verdicts``
-    (f, COLUMNS) are filled.
+    Frame j has the stickers ``starts[j]:starts[j + 1]``, and ``searched`` (f,) is the number of
+    stickers that were searched in each. ``places`` (k, 3) has one row per observed sticker.
+    ``camera_from_body`` (f, 4, 4) contains first guesses on entry, and the results at the end. The
+    ``covariances`` and ``shared`` (f, 6, 6) and ``verdicts`` (f, COLUMNS) are filled.
     """
     for f in range(len(camera_from_body)):
         first = starts[f]
@@ -374,7 +375,7 @@ def solve_frames(
             seen.rays[first:last],
             seen.planes[first:last],
         )
-        shown = Outlines(
+        own_outlines = Outlines(
             outlines.shapes[first:last],
             outlines.informations[first:last],
             outlines.normals[first:last],
@@ -382,7 +383,7 @@ def solve_frames(
             outlines.cameras,
         )
         taught = places[first:last]
-        parts = Images(
+        own_images = Images(
             images.pixels[first:last],
             images.spreads[first:last],
             images.shifts,
@@ -394,6 +395,6 @@ def solve_frames(
         for n in range(last - first):
             turn_arm(camera_from_body[f], taught[n], own.points[n], own.arms[n], own.gaps[n])
         solve(
-            own, taught, shown, limits, camera_from_body[f], covariances[f], searched[f], parts, f,
-            shared[f], verdicts[f],
+            own, taught, own_outlines, limits, camera_from_body[f], covariances[f], searched[f],
+            own_images, f, shared[f], verdicts[f],
         )  # fmt: skip

@@ -1,6 +1,6 @@
-"""Windows around the stickers of a body, and the stickers that are found in them.
+"""Windows around the stickers of a body, and the stickers that are detected in them.
 
-Centres are detected in the windows, and both images' centres are triangulated.
+Centres are detected in the windows of both images, and triangulated.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 # A smear is the movement of a sticker's image during the exposure. The longest smear that can be
 # measured is about the size of a sticker.
 LONGEST_SMEAR_PX = 8.0
-# Point spreads of stickers out of focus are rounded to multiples of this, which a fit can model.
+# Point spreads of stickers out of focus are rounded to multiples of this. Stickers with the same
+# point spread are fitted together.
 SPREAD_STEP_PX = 0.01
-# A lens is known to half this variance of its point spread, px². Noise explains a further blur by
-# this number of its standard deviations.
+# Half the variance of a point spread, px², is known to within KNOWN_BLUR. Noise explains a further
+# difference of LARGEST_BLUR of its standard deviations.
 KNOWN_BLUR = 0.002
 LARGEST_BLUR = 3.0
-# Standard deviation of a shift along one axis that all centres share, px, for half a variance of 1
-# px² by which a point spread is wider than the known one. Coma of a lens, and interpolation between
-# pixels, shift centres by so much.
+# Standard deviation, px, of a shift along one axis that all centres in an image share, if half the
+# variance differs by 1 px². Coma of a lens, and interpolation between pixels, cause such shifts.
 LEAN = 0.6
 # Shortest smear that changes the result of a fit, in standard deviations of the point spread.
 SHORTEST_SMEAR = 1.5
@@ -68,17 +68,17 @@ class StickerObservation:
     left_pixels, right_pixels  (k, 2), sticker centres in the distorted images, without eccentricity
     points, covariances        (k, 3) and (k, 3, 3), in the camera frame, m
     pixel_variances            (k,), of pixel coordinates, mean over both images and axes, px²
-    rays                       (k,), signed distances of both rays of a sticker, in deviations
+    rays                       (k,), signed distance of a sticker's two rays, in standard deviations
     outlines                   ellipses of the stickers; None if the detector states no ellipses
     searched                   (f,), number of stickers that were searched in each of f exposures;
                                None if all were found
-    detected                   (f,), number of these that the detector found in both images, or None
+    detected                   (f,), number of these that were detected in both images, or None
     spreads                    (k, 2, 2, 2), covariances of the pixels in both images, px²; None if
                                only the points are known
     shifts                     (f, 2), standard deviation, px, of a shift that all centres in an
                                image share; None if there is none
     frame_ends                 (f, 2, 4, 4), camera_from_body half a frame period before and after
-                               the middle of the exposures; None if the movement is not known
+                               the middle of each exposure; None if the movement is not known
     """
 
     index: NDArray[np.int_]
@@ -111,15 +111,15 @@ class StickerObservation:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    index             (k,), indices of the stickers among the body's stickers
+    index             (k,), j n + i for sticker i of the body's n stickers in exposure j
     exposures         (k,), number of the exposure that shows each sticker, in rising order
-    camera_from_body  (4, 4) or (N, 4, 4), expected place of the body in each exposure
-    places, normals   (k, 3), of the stickers, in body axes, m
-    corners           (2, k, 2), first pixels of the windows
+    camera_from_body  (4, 4) or (N, 4, 4), expected transform of the body in each exposure
+    places, normals   (k, 3), of the stickers, in body axes; places in m
+    corners           (2, k, 2), first pixels (x, y) of the windows
     windows           (2, k, h, h), grey values without vignetting in which stickers are bright;
                       empty without images
     offsets           (2, k, 2), eccentricities of the ellipses, px
-    found             result of the detector for exposures without images, otherwise None
+    found             simulated detections, for exposures without images; otherwise None
     """
 
     observer: Observer
@@ -140,10 +140,10 @@ class StickerWindows:
     ) -> StickerObservation:
         """Return the stickers in these windows; see ``Observer.observe`` for the parameters."""
         if len(self.index) == 0:
-            none = np.zeros((0, 3))
-            pixels = none[:, :2]
+            points = np.zeros((0, 3))
+            pixels = points[:, :2]
             return StickerObservation(
-                self.index, pixels, pixels, none, np.zeros((0, 3, 3)), none[:, 0], none[:, 0]
+                self.index, pixels, pixels, points, np.zeros((0, 3, 3)), points[:, 0], points[:, 0]
             )
         settings = self.observer.settings
         fits = self.found or self.centres()
@@ -154,28 +154,26 @@ class StickerWindows:
         if self.found is None and isinstance(fits, EllipseFits):
             shifts = self._shifts(fits)
             fits = self._lit(fits, smears)
-        seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
+        centres = fits.centres.reshape(2, -1, 2) - self.offsets
         if settings.row_share > 0.0 and frame_ends is not None:
-            seen_at = seen_at - self._swept(frame_ends)
+            centres = centres - self._swept(frame_ends)
         allowed = settings.allowed
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         systematic += allowed.changing_px**2
-        spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
-        # Errors of the rig part the two rays of a sticker. With weights from noise alone, the point
-        # would be too near to the ray of the sharper image.
+        spreads = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
+        # Errors of the rig separate the two rays of a sticker. With weights from noise alone, the
+        # point would be too near to the ray of the sharper image.
         line_variance = settings.line_error_px**2
-        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
-        near = apply_each(moves, self.places[:, None])[:, 0]
-        left, right = seen_at
+        left, right = centres
         seen = triangulate(
-            self.observer.rig, left, right, spread[0], spread[1], near, line_variance
+            self.observer.rig, left, right, spreads[0], spreads[1], self._expected, line_variance
         )
         good = np.all(fits.good.reshape(2, -1), axis=0)
         # Mean variance over two coordinates in two images.
-        noise = 0.25 * np.einsum("ckii->k", spread)
+        variances = 0.25 * np.einsum("ckii->k", spreads)
         outlines = _outlines(fits, settings.centre_error_px**2 + allowed.outline_px**2)
-        found = StickerObservation(
-            self.index, left, right, seen.points, seen.covariances, noise, seen.rays, outlines
+        observation = StickerObservation(
+            self.index, left, right, seen.points, seen.covariances, variances, seen.rays, outlines
         )
         exposures = len(self.camera_from_body.reshape(-1, 4, 4))
         searched = np.bincount(self.exposures, minlength=exposures)
@@ -183,12 +181,12 @@ class StickerWindows:
         good &= seen.ray_gap < settings.largest_ray_gap
         ends = None
         if frame_ends is not None:
-            ends = np.stack([one.reshape(-1, 4, 4) for one in frame_ends], axis=1)
+            ends = np.stack([end.reshape(-1, 4, 4) for end in frame_ends], axis=1)
         return replace(
-            found,
+            observation,
             searched=searched,
             detected=detected,
-            spreads=spread.swapaxes(0, 1),
+            spreads=spreads.swapaxes(0, 1),
             shifts=shifts,
             frame_ends=ends,
         ).selected(good)
@@ -223,18 +221,22 @@ class StickerWindows:
         return EllipseFits(*(np.concatenate(values)[order] for values in parts))
 
     @cached_property
+    def _expected(self) -> Array:
+        """Expected positions (k, 3) m of the stickers in the camera frame."""
+        transforms = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
+        return apply_each(transforms, self.places[:, None])[:, 0]
+
+    @cached_property
     def _spreads_px(self) -> Array:
-        """Point spreads (2k,) px at the expected depths of the stickers, in steps."""
-        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures]
-        near = apply_each(moves, self.places[:, None])[:, 0]
+        """Rounded point spreads (2k,) px at the expected depths of the stickers."""
+        rig = self.observer.rig
+        optics = self.observer.settings.optics
         spreads = [
-            self.observer.settings.optics.spreads_px(camera.focal_px, apply(move, near)[:, 2])
-            for camera, move in zip(
-                self.observer.rig.cameras, self.observer.rig.from_camera, strict=True
-            )
+            optics.spreads_px(camera.focal_px, apply(move, self._expected)[:, 2])
+            for camera, move in zip(rig.cameras, rig.from_camera, strict=True)
         ]
-        steps = SPREAD_STEP_PX * np.round(np.concatenate(spreads) / SPREAD_STEP_PX)
-        return np.where(steps < NARROWEST_PX, 0.0, steps)
+        rounded = SPREAD_STEP_PX * np.round(np.concatenate(spreads) / SPREAD_STEP_PX)
+        return np.where(rounded < NARROWEST_PX, 0.0, rounded)
 
     @cached_property
     def ellipses_at_rest(self) -> EllipseFits:
@@ -245,7 +247,7 @@ class StickerWindows:
         return self.ellipses()
 
     def centres(self, smears: Array | None = None) -> DetectedCentres:
-        """Return the centres that the detector finds in the windows."""
+        """Return the centres that the detector finds in all 2k windows; see also ``ellipses``."""
         detector = self.observer.detector
         noise = self.observer.upright
         settings = self.observer.settings
@@ -266,8 +268,8 @@ class StickerWindows:
     def _shifts(self, even: EllipseFits) -> Array | None:
         """Return the standard deviation (f, 2), px, of the common shift of centres in each image.
 
-        A point spread that is wider than the known one can lean to one side. The result is None if
-        print that is not perfect widens the images as well.
+        A point spread that differs from the known one can lean to one side. The result is None if
+        print is known to be imperfect, because it widens the images of stickers as well.
         """
         if self.observer.settings.allowed.known:
             return None
@@ -279,10 +281,10 @@ class StickerWindows:
             self.exposures[good],
             even.lights[:, 5:].reshape(2, -1, 2)[:, good].swapaxes(0, 1),
         )
-        right, information = np.moveaxis(evidence, -1, 0)
-        seen = information > 0.0
-        deviation = 1.0 / np.sqrt(np.where(seen, information, np.inf))
-        blur = np.abs(right) * deviation**2
+        sums, information = np.moveaxis(evidence, -1, 0)
+        known = information > 0.0
+        deviation = 1.0 / np.sqrt(np.where(known, information, np.inf))
+        blur = np.abs(sums) * deviation**2
         return LEAN * np.maximum(blur - LARGEST_BLUR * deviation - KNOWN_BLUR, 0.0)
 
     def _lit(self, even: EllipseFits, smears: Array) -> DetectedCentres:
@@ -296,60 +298,61 @@ class StickerWindows:
 
         good = np.flatnonzero(np.all(even.good.reshape(2, -1), axis=0))
         exposures = np.arange(self.exposures[-1] + 2)
-        moves = self.camera_from_body.reshape(-1, 4, 4)[self.exposures[good]]
-        near = apply_each(moves, self.places[good, None])[:, 0]
+        expected = self._expected[good]
+        origins = self.camera_from_body.reshape(-1, 4, 4)[self.exposures[good], :3, 3]
         sizes = np.empty(len(exposures) - 1)
-        # Whole copies, because the kernel is compiled once more for parts of arrays.
+        # Contiguous copies, because the kernel would be compiled once more for parts of arrays.
         light_sizes(
             self.observer.rig.kernel_cameras,
-            near,
-            near - moves[:, :3, 3],
+            expected,
+            expected - origins,
             np.ascontiguousarray(even.covariances.reshape(2, -1, 2, 2)[:, good]),
             np.ascontiguousarray(even.lights.reshape(2, -1, 7)[:, good]),
             np.searchsorted(self.exposures[good], exposures),
             sizes,
         )
-        shown = (sizes > self.observer.settings.allowed.largest_light)[self.exposures]
-        if not shown.any():
+        chosen = (sizes > self.observer.settings.allowed.largest_light)[self.exposures]
+        if not chosen.any():
             return even
-        part = self._selected(shown)
-        lit = part.ellipses(smears[:, shown].reshape(-1, 2), lit=True)
+        part = self._selected(chosen)
+        lit = part.ellipses(smears[:, chosen].reshape(-1, 2), lit=True)
         lit = lit.within(self.observer.settings.limits, self.observer.upright)
         return even.with_others(
-            np.flatnonzero(np.tile(shown, 2)), lit, np.ones(2 * len(part.index), dtype=bool)
+            np.flatnonzero(np.tile(chosen, 2)), lit, np.ones(2 * len(part.index), dtype=bool)
         )
 
     def _more_likely(
-        self, still: DetectedCentres, exposure_ends: tuple[Array, Array], taken: Array
+        self, still: DetectedCentres, exposure_ends: tuple[Array, Array], chosen_smears: Array
     ) -> DetectedCentres:
         """Choose, for each exposure, between the result for a body at rest and for a moving body.
 
-        The movement between ``exposure_ends`` is only a prediction, and the platform can have
-        stopped. The result that agrees better with the images is therefore chosen. ``still`` is the
-        result for a body at rest. ``taken`` (2, k, 2) is filled with the movements of the stickers
-        in the chosen results, px.
+        The movement between ``exposure_ends`` is only a prediction, and the body can have stopped.
+        The result that agrees better with the images is therefore chosen. ``still`` is the result
+        for a body at rest. ``chosen_smears`` (2, k, 2) contains zeros, and is filled with the
+        movements of the stickers in chosen results for a moving body, px.
         """
-        smears, shown = self._smears(exposure_ends)
-        if still.misfits is None or not shown.any():
+        smears, measurable = self._smears(exposure_ends)
+        if still.misfits is None or not measurable.any():
             return still
-        moving = self._selected(shown).centres(smears[:, shown].reshape(-1, 2))
-        again = np.tile(shown, 2)
+        moving = self._selected(measurable).centres(smears[:, measurable].reshape(-1, 2))
         if moving.misfits is None:
             return still
-        gains = (still.misfits[again] - moving.misfits).reshape(2, -1)
-        _, starts, counts = np.unique(self.exposures[shown], return_index=True, return_counts=True)
-        better = [np.median(own) > 0.0 for own in np.split(gains, starts[1:], axis=1)]
+        windows = np.flatnonzero(np.tile(measurable, 2))
+        gains = (still.misfits[windows] - moving.misfits).reshape(2, -1)
+        exposures = self.exposures[measurable]
+        _, starts, counts = np.unique(exposures, return_index=True, return_counts=True)
+        better = [np.median(part) > 0.0 for part in np.split(gains, starts[1:], axis=1)]
         chosen = np.repeat(better, counts)
-        at = np.flatnonzero(shown)[chosen]
-        taken[:, at] = smears[:, at]
+        stickers = np.flatnonzero(measurable)[chosen]
+        chosen_smears[:, stickers] = smears[:, stickers]
         both = np.tile(chosen, 2)
-        return still.with_others(np.flatnonzero(again)[both], moving, both)
+        return still.with_others(windows[both], moving, both)
 
     def _smears(self, exposure_ends: tuple[Array, Array]) -> tuple[Array, NDArray[np.bool_]]:
         """Return the stickers' movements (2, k, 2) px during the exposure, and a mask (k,).
 
-        The mask is False for exposures in which the longest movement is too short compared with the
-        point spread, or too long to be measured.
+        The mask is False for the stickers of exposures in which the longest movement is too short
+        compared with the point spread, or too long to be measured.
         """
         moved = self._moved(exposure_ends)
         shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
@@ -368,17 +371,14 @@ class StickerWindows:
         return np.asarray(last - first)
 
     def _swept(self, frame_ends: tuple[Array, Array]) -> Array:
-        """Return the movements (2, k, 2) px of stickers between the exposures of the middle row and
-        of their own rows.
-        """
-        return np.asarray(self.late()[..., None] * self._moved(frame_ends))
+        """Return the movements (2, k, 2) px from the middle row's exposure to each sticker's."""
+        return np.asarray(self.row_delays()[..., None] * self._moved(frame_ends))
 
-    def late(self) -> Array:
+    def row_delays(self) -> Array:
         """Return the delays (2, k) of the stickers' rows after the middle row, in frame periods."""
         rows = self.corners[..., 1] + 0.5 * (self.windows.shape[-1] - 1)
         middles = [0.5 * (camera.height - 1) for camera in self.observer.rig.cameras]
-        share = self.observer.settings.row_share
-        return np.asarray(share * (rows - np.array(middles)[:, None]))
+        return np.asarray(self.observer.settings.row_share * (rows - np.array(middles)[:, None]))
 
     def _selected(self, keep: NDArray[np.bool_]) -> StickerWindows:
         """Return the windows of only some of the stickers."""

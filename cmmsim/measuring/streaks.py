@@ -7,9 +7,9 @@ sticker at rest shows an ellipse A_0, an ellipse A fitted to the streak therefor
     A A = A_0 A_0 + d d' / 3.
 
 The stickers of a rigid body share one small movement w (6,). With the derivative P of a sticker's
-pixels by the movement, d = P w. Least squares over both images give w. An ellipse fits a streak
-only roughly. The fit is therefore repeated with an ellipse that moves by the current d. The
-difference A A - A_0 A_0 is then only the remaining part of the streak. A new d is found from
+pixels with respect to the movement, d = P w. Least squares over both images give w. An ellipse fits
+a streak only roughly. The fit is therefore repeated with an ellipse that moves by the current d.
+The difference A A - A_0 A_0 is then only the remaining part of the streak. A new d is computed from
 A A - A_0 A_0 + d d' / 3, until d no longer changes. Streaks do not show the sign of the movement.
 The pose refers to the middle of the exposure, and is the same for both signs.
 """
@@ -33,19 +33,20 @@ from cmmsim.measuring.sticker_windows import LONGEST_SMEAR_PX, StickerWindows
 CHANCE = 1e-4
 # Fewest ellipses in both images together: four stickers.
 FEWEST = 8
-# Limit on the squared misfit of one ellipse, because a partly hidden sticker is not a streak.
+# Largest contribution of one ellipse to the sum of squared misfits. An ellipse of a partly hidden
+# sticker does not fit a streak.
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Largest number of repetitions of the fit.
 ROUNDS = 8
 # Repetition ends at a smaller change of d, which has no visible effect on centres and ellipses.
 TOLERANCE_PX = 0.05
-# Number of times that the weights for the start values are updated.
+# Number of least-squares fits, with updated weights, for a start value.
 REWEIGHTED = 5
-TINY_PX2 = 1e-6
-# Relative limit on singular values. The start values omit combinations of movements with smaller
-# ones.
+# Smallest median of squared residuals that scales the weights, px^4.
+TINY_PX4 = 1e-6
+# Singular values below this fraction of the largest one count as zero in fits of start values.
 SMALLEST_SHARE = 1e-2
-# Step of numerical derivatives by a movement, m or rad.
+# Step of numerical derivatives with respect to a movement, m or rad.
 UNIT = 1e-4
 
 
@@ -65,7 +66,7 @@ class Streaks:
 class _Ellipses:
     """Ellipses fitted under the assumption that they move by ``smears`` during the exposure.
 
-    smears  (k, 2), px
+    smears  (k, 2), d, px
     excess  (k, 3), entries xx, xy, yy of A A - A_0 A_0 + d d' / 3, px²
     whiten  (k, 3, 3), matrices that transform the covariances of ``excess`` into unit matrices
     bright  (k,), True for ellipses with enough contrast
@@ -93,15 +94,15 @@ class _Ellipses:
 
     @property
     def explained(self) -> bool:
-        """True if the misfits of the good ellipses are not larger than noise."""
+        """True if noise explains the misfits of the good ellipses."""
         return bool(
             self._squared_misfits[self.good].sum() < chdtri(3 * np.count_nonzero(self.good), CHANCE)
         )
 
     @property
     def _squared_misfits(self) -> Array:
-        left = self.excess - _entries(_outer(self.smears)) / 3.0
-        return np.asarray((np.einsum("kij,kj->ki", self.whiten, left) ** 2).sum(axis=1))
+        residuals = self.excess - _entries(_outer(self.smears)) / 3.0
+        return np.asarray((np.einsum("kij,kj->ki", self.whiten, residuals) ** 2).sum(axis=1))
 
     @property
     def longest_px(self) -> float:
@@ -110,10 +111,10 @@ class _Ellipses:
 
 
 def find_streaks(read: StickerWindows) -> Streaks | None:
-    """Return the movement during the exposure of the body whose stickers were read.
+    """Return the movement of a body during the exposure, from windows around its stickers.
 
-    The result is None if no movement is visible. Raises LostError if the streaks are longer than
-    LONGEST_SMEAR_PX.
+    ``read`` must have one exposure. The result is None if no movement is visible, or if too few
+    ellipses are good. Raises LostError if the streaks are longer than LONGEST_SMEAR_PX.
     """
     observer = read.observer
     places = read.places
@@ -124,8 +125,8 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
 
     def compared(smears: Array, fits: EllipseFits) -> _Ellipses:
         squares, whiten = _squares(fits, settings.centre_error_px**2)
-        added = _entries(_outer(smears)) / 3.0
-        excess = squares - _entries(at_rest @ at_rest) + added
+        from_smears = _entries(_outer(smears)) / 3.0
+        excess = squares - _entries(at_rest @ at_rest) + from_smears
         return _Ellipses(
             smears, excess, whiten, fits.contrast >= settings.limits.smallest_contrast, fits.good
         )
@@ -139,17 +140,17 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
         return None
     middle = places.mean(axis=0)
     by_movement = _pixels_by_movement(rig, read.camera_from_body, places, middle)
-    found = _movement_and_ellipses(still, fit, by_movement)
-    if found is None:
+    best = _movement_and_ellipses(still, fit, by_movement)
+    if best is None:
         _require_short(still)
         return None
     # A movement with six parameters must reduce the misfit by more than noise explains.
-    if still.misfit - found[1].misfit < chdtri(6, CHANCE):
+    if still.misfit - best[1].misfit < chdtri(6, CHANCE):
         return None
-    movement, ellipses = found
+    movement, ellipses = best
     if ellipses.longest_px > LONGEST_SMEAR_PX:
         raise LostError(streak_message(ellipses.longest_px))
-    ends = [read.camera_from_body @ _moved(share * movement, middle) for share in (-0.5, 0.5)]
+    ends = [read.camera_from_body @ _moved(part * movement, middle) for part in (-0.5, 0.5)]
     return Streaks((ends[0], ends[1]), ellipses.longest_px)
 
 
@@ -192,7 +193,7 @@ def _movement_and_ellipses(
 def _converged_movement(
     movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array
 ) -> tuple[Array, _Ellipses] | None:
-    """Repeat the fit from a movement (6,) until it no longer changes.
+    """Repeat the fit, starting from a movement (6,), until the movement no longer changes.
 
     The results are the movement and the ellipses fitted with it, or None if too few ellipses are
     good. The repetition ends early with a movement longer than LONGEST_SMEAR_PX.
@@ -216,16 +217,17 @@ def _converged_movement(
 
 def _moved(movement: Array, middle: Array) -> Array:
     """Return the transform (4, 4) of a movement (6,): shift, and rotation about ``middle``."""
-    turn = rotation_exp(movement[3:])
-    return rigid(turn, movement[:3] + middle - turn @ middle)
+    rotation = rotation_exp(movement[3:])
+    return rigid(rotation, movement[:3] + middle - rotation @ middle)
 
 
 def _pixels_by_movement(
     rig: StereoRig, camera_from_body: Array, places: Array, middle: Array
 ) -> Array:
-    """Return the derivatives (2k, 2, 6) of the pixels of k stickers by a movement (6,).
+    """Return the derivatives (2k, 2, 6) of pixels with respect to a movement (6,) of the body.
 
-    The pixels are those in both images. The movement is about the point ``middle`` (3,).
+    The pixels are those of k stickers in both images. The movement rotates the body about the point
+    ``middle`` (3,), and is in body axes.
     """
     columns = [
         np.subtract(
@@ -268,7 +270,7 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
 
 
 def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:
-    """Return three movements (6,) from which to search: general, without rotation, without shift.
+    """Return three start values (6,) of a movement: general, without rotation, without shift.
 
     In a single start value, the stickers' movements can have wrong relative signs. A search from
     there can end in a local minimum.
@@ -305,16 +307,18 @@ def _linear_movement(by_movement: Array, excess: Array) -> Array:
             (weights * excess).ravel(),
             rcond=SMALLEST_SHARE,
         )[0]
-        left = ((excess - design @ entries) ** 2).sum(axis=1, keepdims=True)
-        weights = 1.0 / (1.0 + left / max(float(np.median(left)), TINY_PX2))
-    found = np.zeros((len(scale), len(scale)))
-    found[rows, columns] = found[columns, rows] = entries
-    squares, axes = np.linalg.eigh(found)
-    return np.asarray(axes[:, -1] * np.sqrt(max(squares[-1], 0.0)) / scale)
+        squared_residuals = ((excess - design @ entries) ** 2).sum(axis=1, keepdims=True)
+        weights = 1.0 / (
+            1.0 + squared_residuals / max(float(np.median(squared_residuals)), TINY_PX4)
+        )
+    matrix = np.zeros((len(scale), len(scale)))
+    matrix[rows, columns] = matrix[columns, rows] = entries
+    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
+    return np.asarray(eigenvectors[:, -1] * np.sqrt(max(eigenvalues[-1], 0.0)) / scale)
 
 
 def _fitted_movements(ellipses: _Ellipses, by_movement: Array, starts: list[Array]) -> list[Array]:
-    """Return the movements (6,) found from each start, the best first.
+    """Return the movements (6,) fitted from each start value, the best first.
 
     They are fitted to the good ellipses with a robust loss, because some stickers can be partly
     hidden.
@@ -325,15 +329,15 @@ def _fitted_movements(ellipses: _Ellipses, by_movement: Array, starts: list[Arra
     scale = np.sqrt((by_movement**2).sum(axis=(0, 1)))
 
     def residuals(scaled: Array) -> Array:
-        left = excess - _entries(_outer(by_movement @ (scaled / scale))) / 3.0
-        return np.asarray(np.einsum("kij,kj->ki", whiten, left).ravel())
+        unexplained = excess - _entries(_outer(by_movement @ (scaled / scale))) / 3.0
+        return np.asarray(np.einsum("kij,kj->ki", whiten, unexplained).ravel())
 
     rough = max(1.0, min(float(np.median(np.abs(residuals(start * scale)))) for start in starts))
-    found = [
+    fits = [
         least_squares(residuals, start * scale, loss="cauchy", f_scale=3.0 * rough)
         for start in starts
     ]
     return [
         np.asarray(result.x / scale)
-        for result in sorted(found, key=lambda result: float(result.cost))
+        for result in sorted(fits, key=lambda result: float(result.cost))
     ]

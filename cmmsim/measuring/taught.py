@@ -1,7 +1,8 @@
 """Result of teaching: the base frame relative to the cameras, and sticker places on the platform.
 
-A result is valid for the cameras, planes and sticker places of one sensor file. It does not depend
-on noise, lens blur, timing, detector and renderer, because these do not change the true frames.
+A result is valid for the cameras, planes, sticker places and print of one sensor file. It does not
+depend on noise, lens blur, timing, detector and renderer, because these do not change the true
+frames.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pos
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.uncertainty.known_rig import KnownRig
 
+# Largest numbers of differing entries in a message, and of characters of a value.
 SHOWN_CHANGES = 3
-# Largest number of characters of a value in a message.
 SHOWN_CHARACTERS = 40
 
 
@@ -50,9 +51,10 @@ class Taught:
     known : KnownRig or None
         Rig that was used for teaching, if it differs from the file's rig.
     by_rig : ndarray, shape (6 + 3 n, 24), or None
-        Derivative of the errors of ``base_from_camera`` and of the platform's places by the errors
-        of the known rig, if teaching has adjusted the rig. The covariances are then those for an
-        exact rig. Otherwise the derivative follows from the geometry of the simulated teaching.
+        Derivative of the errors of ``base_from_camera`` and of the platform's places with respect
+        to the errors of the known rig, if teaching has adjusted the rig. The covariances are then
+        those for an exact rig. If it is None, the derivative is computed from the geometry of
+        simulated teaching.
     platform_ids : tuple of str
         Names of the platform's stickers, if they are not all stickers of the sensor file.
     radius : float or None
@@ -140,7 +142,7 @@ class Taught:
         return f"Taught({self.sensor_name!r}, {stickers})"
 
     def calibration_covariance(self, pose: Array, method: str = "registration") -> Array:
-        """Return the covariance of the pose error that errors of teaching cause.
+        """Return the covariance of the pose error due to errors of teaching.
 
         This error is the same in every frame.
 
@@ -167,7 +169,7 @@ class Taught:
 
 def setup_of(file: SensorFile) -> str:
     """Return the entries of a sensor file that teaching depends on, as JSON with sorted keys."""
-    # The position already accounts for the distance, and the covariance changes no true frame.
+    # The stated position already accounts for the distance. The covariance changes no true frame.
     rig = file.rig.model_dump(exclude={"distance", "covariance"})
     bodies = {
         name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")
@@ -183,8 +185,8 @@ def setup_of(file: SensorFile) -> str:
 def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
     """Raise TeachingError unless a result of teaching is valid for a sensor file.
 
-    The message names the entries that differ. ``stickers`` is the file's number of stickers of the
-    platform. A result without a setup must have the name of the file's sensor.
+    The message names the entries that differ. ``stickers`` is the number of the platform's stickers
+    in the file. A result without a setup must have the name of the file's sensor.
     """
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(

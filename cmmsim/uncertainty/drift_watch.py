@@ -130,7 +130,7 @@ class DriftWatch:
         camera_from_base = self.geometry.camera_from_base
         seen = observer.observe(images, camera_from_base, places, body.sticker_normals)
         try:
-            return solve_frame(seen, camera_from_base, observer, body, places).of(0)
+            return solve_frame(seen, camera_from_base, observer, body, places).used_in(0)
         except LostError:
             return None
 

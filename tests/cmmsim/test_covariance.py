@@ -146,7 +146,7 @@ def solved(seen):
     """Stickers that agree, camera_from_body and its covariance, from half a millimetre beside."""
     near = CAMERA_FROM_BASE @ pose_to_transform(HOME + 5e-4)
     found = solve_frame(seen, near, OBSERVER, BODY, BODY.nominal)
-    return found.of(0), found.camera_from_body[0], found.covariances[0]
+    return found.used_in(0), found.camera_from_body[0], found.covariances[0]
 
 
 def misfits_of(fit, points, places, covariances):
@@ -263,6 +263,13 @@ def test_four_stickers_are_refused_and_five_of_which_one_is_wrong():
         LostError, match=r"5 visible stickers contradict each other, 4 are left .* squared misfit"
     ):
         solved(seen_from_home(np.random.default_rng(4), [0, 3, 5, 7, 12], shift_px=1.0))
+
+
+def test_a_frame_lost_by_the_size_of_all_residuals_says_so():
+    """Seven deviations of noise in each sticker, and no sticker that differs from the others."""
+    seen = seen_from_home(np.random.default_rng(9), ALL)
+    with pytest.raises(LostError, match=r"the first rejected one is \w+, because the mean square"):
+        solved(replace(seen, covariances=seen.covariances / 49.0))
 
 
 def test_a_group_that_has_slipped_refuses_the_frame_even_if_it_is_a_third():
