@@ -145,9 +145,8 @@ def tabulated(
     """Return the covariance xx, xy, yy px² of the centre of an ellipse, from the table.
 
     xx, xy, yy are the entries of the ellipse's shape, px, and ``light`` is the fraction of full
-    light on it. The first four parameters are those of ``CentreNoise``. Between entries of the
-    table the interpolation is linear. Beyond the table, the covariance is that of m, p and q at its
-    edge, but scaled by the true m.
+    light on it. The first four parameters are those of ``CentreNoise``. The table is interpolated
+    linearly. Beyond the table, its entries at the edge are used, with the true m.
     """
     mean = 0.5 * (xx + yy)
     a = (mean - first[0]) / steps[0]
@@ -166,11 +165,11 @@ def tabulated(
         for across in range(2):
             entries = table[i + up, j + across]
             weight = (a if up else 1.0 - a) * (b if across else 1.0 - b)
-            near = weight * (1.0 - c)
-            far = weight * c
-            inverse_xx += near * entries[k, 0] + far * entries[k + 1, 0]
-            inverse_xy += near * entries[k, 1] + far * entries[k + 1, 1]
-            inverse_yy += near * entries[k, 2] + far * entries[k + 1, 2]
+            lower_weight = weight * (1.0 - c)
+            upper_weight = weight * c
+            inverse_xx += lower_weight * entries[k, 0] + upper_weight * entries[k + 1, 0]
+            inverse_xy += lower_weight * entries[k, 1] + upper_weight * entries[k + 1, 1]
+            inverse_yy += lower_weight * entries[k, 2] + upper_weight * entries[k + 1, 2]
     scale = by_light[0] / (light * light) + by_light[1] / light + by_light[2]
     scale /= mean * (inverse_xx * inverse_yy - inverse_xy * inverse_xy)
     return scale * inverse_yy, -scale * inverse_xy, scale * inverse_xx
@@ -180,8 +179,9 @@ def tabulated(
 def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
     """Return the covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px.
 
-    It is computed without the table, for the actual position of ``centre`` (x, y) within its pixel.
-    ``shape`` is xx, xy, yy, px, and ``light`` the fraction of full light.
+    It is computed without the table, for the actual position of ``centre`` (x, y) px within its
+    pixel. ``smear`` is (x, y), ``shape`` is (xx, xy, yy) px, and ``light`` the fraction of full
+    light.
     """
     local = np.empty((1, 2))
     covariances = np.empty((1, 5, 5))
@@ -202,9 +202,10 @@ def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear
 
 @compiled
 def contains(centre: float, reach: float, size: int) -> bool:
-    """Tell whether an ellipse lies inside the fitted part of ``size`` px around its centre.
+    """Return True if an ellipse lies inside the fitted part of ``size`` px around its centre.
 
-    ``centre`` and the half extent ``reach`` are px along one axis.
+    Only one axis is tested, along which the ellipse has the ``centre`` and the half extent
+    ``reach``, px.
     """
     local = centre - np.rint(centre - 0.5 * (size - 1))
     return local - reach > -0.5 and local + reach < size - 0.5
@@ -233,11 +234,11 @@ class Ellipses(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Fitted parts of the images, with sides of ``size`` px.
+    """Fitted parts of the images, which are squares of ``size`` px.
 
     ``sides`` (k,) is 0 for the left and 1 for the right image. ``stickers`` (k,) are the indices of
-    their stickers, and ``corners`` (k, 2) their first pixels. ``found`` (k,) is False for a part
-    without a sticker, whose index is then meaningless.
+    their stickers, and ``corners`` (k, 2) their first pixels (x, y). ``found`` (k,) is False for a
+    part without a sticker, whose index is then meaningless.
     """
 
     sides: Array
@@ -263,7 +264,7 @@ class Fits(NamedTuple):
 
 
 class DetectionLimits(NamedTuple):
-    """Limits of the ellipses that can be fitted.
+    """Limits for the ellipses that can be fitted.
 
     radius       smallest half axis, px
     thin_px      smaller half axis, px, at which half of the fits fail, because the ellipse is too
@@ -285,8 +286,9 @@ def nearest_stickers(
     """Choose the fitted part of each window, and write it to ``windows``.
 
     The windows have sides of ``side_px`` px and the first pixels ``corners`` (2, k, 2). A part is
-    centred at the sticker nearest to the middle of its window, but it is shifted so that it does
-    not extend beyond the window. The parts of the left image come first.
+    centred at the sticker nearest to the middle of its window, among those in the mask ``seen``
+    (2, m). The part is shifted so that it does not extend beyond the window. The stickers have
+    ``centres`` (2, m, 2). The parts of the left image come first.
     """
     part = 0
     slack = side_px - windows.size
@@ -323,7 +325,7 @@ def fit_stickers(
 ) -> None:
     """Draw random results of the fits in windows, and write them to ``fits``.
 
-    A fit is successful if the ellipse keeps the limits ``smallest`` and lies wholly inside the
+    A fit is successful if the ellipse exceeds the limits ``smallest`` and lies wholly inside the
     fitted part. Results that are not good have unit covariances and meaningless values.
     """
     count = len(windows.stickers)
@@ -332,7 +334,7 @@ def fit_stickers(
     shapes = np.empty((count, 2, 2))
     smears = np.empty((count, 2))
     greys = np.empty((2, count))
-    known = np.empty((count, 5, 5))
+    fit_noise = np.empty((count, 5, 5))
     chosen = 0
     for k in range(count):
         side = windows.sides[k]
@@ -370,10 +372,10 @@ def fit_stickers(
         greys[1, :chosen],
         size,
         settings,
-        known[:chosen],
+        fit_noise[:chosen],
     )
     root = np.empty((5, 5))
-    off = np.empty(5)
+    errors = np.empty(5)
     chosen = 0
     for k in range(count):
         side = windows.sides[k]
@@ -381,17 +383,17 @@ def fit_stickers(
         for i in range(5):
             for j in range(5):
                 fits.covariances[k, i, j] = (
-                    known[chosen, i, j] if fits.good[k] else 1.0 if i == j else 0.0
+                    fit_noise[chosen, i, j] if fits.good[k] else 1.0 if i == j else 0.0
                 )
                 root[i, j] = fits.covariances[k, i, j]
         chosen += fits.good[k]
-        # Cholesky's factor of the covariance transforms unit noise to the noise of the fit.
+        # The Cholesky factor of the covariance transforms unit noise to the noise of the fit.
         factorise(root)
         for i in range(5):
-            off[i] = 0.0
+            errors[i] = 0.0
             for j in range(i + 1):
-                off[i] += root[i, j] * ellipses.noise[side, n, j]
+                errors[i] += root[i, j] * ellipses.noise[side, n, j]
         for i in range(2):
-            fits.centres[k, i] = ellipses.centres[side, n, i] + off[i]
+            fits.centres[k, i] = ellipses.centres[side, n, i] + errors[i]
             for j in range(2):
-                fits.shapes[k, i, j] = ellipses.shapes[side, n, i, j] + off[2 + i + j]
+                fits.shapes[k, i, j] = ellipses.shapes[side, n, i, j] + errors[2 + i + j]

@@ -1,7 +1,7 @@
 """Compiled kernels that simulate measured poses frame by frame, without images.
 
-The positions of stickers that two cameras triangulate are compared with the positions expected at
-the true pose. The differences are due to noise, and to the errors of teaching and of the rig.
+Noise is added to the image centres of stickers in the true cameras. The assumed cameras triangulate
+these centres, and the pose is fitted to the points as for images.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from cmmsim.measuring.solver_kernels import (
 from cmmsim.without_images.drawn_fit_kernels import CentreNoise, contains, smeared, tabulated
 from cmmsim.without_images.hiding_kernels import Solids, hidden_stickers
 
-# A triangulation, which starts at the expected position, ends with a step shorter than this, m.
+# A triangulation starts at the expected position, and ends with a step shorter than this, m.
 STEP_TOLERANCE = 2e-4
 
 
 class Frame(NamedTuple):
-    """Stickers found by two cameras in one frame.
+    """Stickers in both images of one frame.
 
     stickers   mask of the used stickers, and triangulated points
-    pixels     (n, 2, 2), centres in both images
+    pixels     (n, 2, 2), centres in both images, px
     spreads    (n, 2, 2, 2), covariances of the pixels, px²
     variances  (n,), variance of a pixel coordinate, mean over both images, px²
     longest    (1,), longest path of a sticker during the exposure, px
@@ -73,8 +73,8 @@ class Limits(NamedTuple):
 
     grazing        smallest cosine between the normal of a sticker and the direction to a camera
                    with which the estimator searches for the sticker
-    thin_px        mean of the smallest accepted half axis of an ellipse
-    thin_std_px    standard deviation of the smallest accepted half axis
+    thin_px        mean of the smallest accepted half axis of an ellipse, px
+    thin_std_px    standard deviation of the smallest accepted half axis, px
     largest_gap    largest squared distance of the two rays in units of its variance
     clear          radius around a sticker, in its plane, within which no body may hide a point, m
     vignetting     vignetting of the lens
@@ -131,7 +131,8 @@ def image_stickers(
     ``side`` is 0 for the left and 1 for the right image. ``camera_from_bodies`` (b, 4, 4) belong to
     all solids, the platform first. If the platform is ``moving``, ``ends`` (2, 4, 4) are its
     camera_from_body at the beginning and the end of the exposure. ``noise`` (n, 3) are standard
-    normal numbers: two for the centre, and one for the limit of thin ellipses.
+    normal numbers: two for the centre, and one for the limit of thin ellipses. The left image must
+    be the first, because it starts the mean variances of the pixels.
     """
     count = len(frame.variances)
     used = frame.stickers.used
@@ -221,9 +222,10 @@ def observe(
     ``poses`` (6, 6) of the platform are those in the middle, at the beginning and at the end of the
     left camera's exposure, then of the right camera's. ``bodies`` (b, 4, 4) are base_from_body of
     all solids except the platform. ``noise`` (2, n, 3) is that of ``image_stickers`` for both
-    images. ``kept`` (n,) is False for stickers that are omitted at random.
+    images. ``kept`` (n,) is False for stickers that are omitted at random. ``longest`` of the frame
+    is filled, too.
     """
-    # Both flags begin as results of comparisons, because `image_stickers` would be compiled once
+    # Both flags begin as results of comparisons, because ``image_stickers`` would be compiled once
     # more for the constant False.
     moving = poses[1, 0] != poses[2, 0]
     apart = poses[3, 0] != poses[0, 0]
@@ -250,12 +252,18 @@ def observe(
 
 
 @compiled
-def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> int:
+def shows(size: Array, u: float, v: float) -> bool:
+    """Return True if a pixel lies inside an image of ``size`` (width, height)."""
+    return -0.5 < u < size[0] - 0.5 and -0.5 < v < size[1] - 0.5
+
+
+@compiled
+def triangulate_stickers(scene: StereoScene, camera_from_platform: Array, frame: Frame) -> int:
     """Triangulate the used stickers, and return the number that the estimator would search for.
 
-    ``place`` is the camera_from_platform (4, 4) at which stickers are expected. Stickers are marked
-    as not used if the estimator would not search for them, if they lie outside an image, or if
-    their rays are too far apart.
+    Stickers are expected at ``camera_from_platform`` (4, 4). The estimator searches for those that
+    face both cameras and whose centres are expected inside both images. Stickers are marked as not
+    used if they are not searched for, or if their rays are too far apart.
     """
     seen = frame.stickers
     expected = np.empty(3)
@@ -267,20 +275,23 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> int:
     limits = scene.limits
     searched = 0
     for n in range(len(seen.used)):
-        transform_point(place, scene.stickers.taught[n], 1.0, expected)
-        transform_point(place, scene.stickers.normals[n], 0.0, direction)
+        transform_point(camera_from_platform, scene.stickers.taught[n], 1.0, expected)
+        transform_point(camera_from_platform, scene.stickers.normals[n], 0.0, direction)
         found = True
         for side in range(2):
             transform_point(cameras.extrinsics[side], expected, 1.0, point)
             transform_point(cameras.extrinsics[side], direction, 0.0, normal)
             found = found and faces(point, normal, limits.grazing)
+            u = frame.pixels[n, side, 0]
+            v = frame.pixels[n, side, 1]
+            # The detected centre of a used sticker is so near to the expected one that it serves
+            # as well.
+            if found and not seen.used[n]:
+                u, v, _, _, _, _ = project(cameras.intrinsics[side], point[0], point[1], point[2])
+            found = found and shows(cameras.size[side], u, v)
         searched += found
         if not seen.used[n]:
             continue
-        for side in range(2):
-            for i in range(2):
-                pixel = frame.pixels[n, side, i]
-                found = found and -0.5 < pixel < cameras.size[side, i] - 0.5
         if found:
             for i in range(3):
                 seen.points[n, i] = expected[i]
@@ -293,7 +304,7 @@ def triangulate_stickers(scene: StereoScene, place: Array, frame: Frame) -> int:
             from_entries(scratch[0], seen.informations[n])
             from_entries(scratch[1], seen.covariances[n])
             for i in range(3):
-                seen.arms[n, i] = expected[i] - place[i, 3]
+                seen.arms[n, i] = expected[i] - camera_from_platform[i, 3]
                 seen.gaps[n, i] = seen.points[n, i] - expected[i]
         seen.used[n] = found
     return searched
@@ -307,30 +318,31 @@ def measure_frame(
     """Fill the measured ``pose`` (6,) and its covariance ``spread`` (6, 6).
 
     Both are NaN if the frame is lost. The first parameters are those of ``observe``. ``verdict``
-    gets the state of the frame and the other columns of ``solver_kernels``.
+    (COLUMNS,) is filled with the columns of ``solver_kernels``.
     """
     observe(scene, poses, bodies, noise, kept, frame)
     platform = np.empty((4, 4))
-    place = np.empty((4, 4))
+    camera_from_platform = np.empty((4, 4))
     covariance = np.empty((6, 6))
     pose_transform(poses[0], platform)
-    multiply(scene.camera_from_base, platform, place)
-    searched = triangulate_stickers(scene, place, frame)
+    multiply(scene.camera_from_base, platform, camera_from_platform)
+    searched = triangulate_stickers(scene, camera_from_platform, frame)
     stickers = scene.stickers
     none = np.empty((0, 2, 3)), np.empty((0, 2, 6))
     outlines = Outlines(none[0], none[1], stickers.normals, stickers.radius, scene.assumed_cameras)
-    # Only the direction of the movement counts, and only if the right camera exposes later.
+    # The poses in the middle of both exposures stand for the movement. Only its direction counts,
+    # and only if the right camera exposes later.
     ends = np.empty((1, 2, 4, 4))
     for end in range(2):
         pose_transform(poses[3 * end], platform)
         multiply(scene.camera_from_base, platform, ends[0, end])
     images = Images(frame.pixels, frame.spreads, np.zeros((1, 2)), ends, scene.assumed_cameras)
     solve(
-        frame.stickers, stickers.taught, outlines, scene.solver_limits, place, covariance,
-        searched, images, 0, np.empty((6, 6)), verdict,
+        frame.stickers, stickers.taught, outlines, scene.solver_limits, camera_from_platform,
+        covariance, searched, images, 0, np.empty((6, 6)), verdict,
     )  # fmt: skip
     if verdict[STATE] == MEASURED:
-        multiply(scene.base_from_camera, place, platform)
+        multiply(scene.base_from_camera, camera_from_platform, platform)
         transform_pose(platform, pose)
         pose_covariance(pose, scene.base_from_camera, covariance, spread)
     else:
@@ -347,7 +359,7 @@ def measure_frames(
 
     The frames have poses (N, 6, 6), noise (N, 2, n, 3) and kept (N, n). The bodies (b, 4, 4) are
     the same in all frames. Fills the measured poses ``found`` (N, 6), their covariances ``spreads``
-    (N, 6, 6), and the verdicts.
+    (N, 6, 6), and the verdicts (N, COLUMNS). ``frame`` is overwritten.
     """
     longest = 0.0
     for k in range(len(poses)):

@@ -51,9 +51,9 @@ ABSENT = frozen(rigid(np.eye(3), (0.0, 0.0, -1e3)))
 
 @dataclass(frozen=True)
 class Light:
-    """Radiances, 0 to 1, of stickers and of their rings, and the properties of the lens.
+    """Radiances, 0 to 1, of stickers and of their rings, with the lens and the print.
 
-    ``print`` has thickness and retro-shift of the stickers.
+    Of ``print``, only thickness and retro-reflection are used here.
     """
 
     sticker: float
@@ -79,9 +79,10 @@ class StatisticalStereoCamera:
     """Two virtual cameras that simulate the results of the fit in the true scene.
 
     They correspond to `VirtualStereoCamera`, but draw no images. ``rig`` and ``camera_from_base``
-    (4, 4) are the true values. ``exposure`` is the exposure time and ``right_later`` the delay of
-    the right camera, s. ``obstacle_names`` are the names of the scene's solids after platform and
-    base. ``print_errors`` has the errors of centres due to uneven print and outlines, or is None.
+    (4, 4) are the true values. ``exposure`` is the exposure time, s, and ``right_later`` the delay
+    of the right camera, s. ``obstacle_names`` are the names of the scene's solids after platform
+    and base. ``print_errors`` has the errors of centres due to uneven print and outlines, or is
+    None.
     """
 
     rig: StereoRig
@@ -160,8 +161,8 @@ class StatisticalStereoCamera:
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return centres (m, 2) and shapes (m, 2, 2) of the ellipses in one image, px.
 
-        The third result is the mask (m,) of stickers that face the camera and are not hidden, in
-        the image or outside. The ellipse of a sticker that faces away is meaningless.
+        The third result is the mask (m,) of stickers that face the camera and are not hidden. They
+        can lie outside the image. The ellipse of a sticker that faces away is meaningless.
         """
         places, normals = self.scene.placed(camera_from_bodies)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
@@ -179,11 +180,11 @@ class StatisticalStereoCamera:
             )
             middles[facing] += seen.shifts_of_kind(printed).sum(axis=-1)
         if not camera.distortion.is_zero:
-            holds = camera.distort(middles)[1]
+            valid = camera.distort(middles)[1]
             shift = curvature_shift(camera, middles, shapes)
             distort_outlines(camera, middles, shapes)
             middles += shift
-            facing &= holds
+            facing &= valid
         return (
             middles,
             shapes,
@@ -192,7 +193,7 @@ class StatisticalStereoCamera:
 
 
 class DrawnStickers:
-    """Simulated fit results of one exposure, which are computed only when they are needed.
+    """Simulated results of fits in one exposure, which are computed when they are needed.
 
     ``exposed`` (6, 6) are poses from ``StatisticalStereoCamera.exposed``, ``bodies`` (b, 4, 4) are
     transforms from ``StatisticalStereoCamera.placed``, and ``rng`` generates the noise.
@@ -233,13 +234,13 @@ class DrawnStickers:
                 from_base @ np.concatenate([place[None], self.bodies])
                 for place in places[3 * side : 3 * side + 3]
             )
-            at, shape, whole = camera.side(lens, middle)
-            centres.append(at)
+            centre, shape, visible = camera.side(lens, middle)
+            centres.append(centre)
             shapes.append(shape)
-            seen.append(whole)
+            seen.append(visible)
             # A body at rest has no motion blur.
             if np.array_equal(first, last):
-                smears.append(np.zeros(at.shape))
+                smears.append(np.zeros(centre.shape))
                 continue
             ends = (
                 lens.project(camera.scene.placed(camera_from_bodies)[0])[0]
@@ -248,10 +249,12 @@ class DrawnStickers:
             smears.append(np.asarray(np.subtract(*ends)))
         require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
         noise = self.rng.standard_normal((2, len(seen[0]), 6))
-        at, shape, smear = (np.stack(values) for values in (centres, shapes, smears))
+        centre, shape, smear = (np.stack(values) for values in (centres, shapes, smears))
         if camera.print_errors is not None:
-            at = camera.print_errors.added_to(at, self.rng)
-        return Ellipses(at, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0)))
+            centre = camera.print_errors.added_to(centre, self.rng)
+        return Ellipses(
+            centre, shape, smear, np.stack(seen), noise, np.zeros((2, 0)), np.zeros((2, 0))
+        )
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """Simulate the fit of the sticker nearest to each window's middle (``StickerExposure``)."""
@@ -265,20 +268,20 @@ class DrawnStickers:
         return self._fitted(windows, observer)
 
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
-        """Simulate the fits of all ellipses in both whole images, see ``StickerExposure``."""
+        """Simulate the fits of all ellipses that lie wholly inside an image."""
         found = []
         for side, camera in enumerate(self.camera.rig.cameras):
             centres = self._found.centres[side]
             reach = np.linalg.norm(self._found.shapes[side], axis=2)
-            whole = self._found.seen[side] & np.all(
+            complete = self._found.seen[side] & np.all(
                 (centres - reach > 0.0) & (centres + reach < (camera.width - 1, camera.height - 1)),
                 axis=1,
             )
-            windows = _empty_windows(int(whole.sum()), observer)
+            windows = _empty_windows(int(complete.sum()), observer)
             windows.sides[:] = side
-            windows.stickers[:] = np.flatnonzero(whole)
+            windows.stickers[:] = np.flatnonzero(complete)
             windows.found[:] = True
-            windows.corners[:] = np.rint(centres[whole] - 0.5 * (windows.size - 1))
+            windows.corners[:] = np.rint(centres[complete] - 0.5 * (windows.size - 1))
             found.append(self._fitted(windows, observer))
         return found[0], found[1]
 
@@ -302,16 +305,16 @@ class DrawnStickers:
             THIN_STD_PX,
             float(settings.limits.smallest_contrast),
         )
-        how = fit_settings(noise, settings.optics.psf_px)
+        fit_options = fit_settings(noise, settings.optics.psf_px)
         fit_stickers(
             self._found._replace(contrasts=contrasts, grounds=grounds),
             windows,
             smallest,
-            how,
+            fit_options,
             found,
         )
         if settings.allowed.largest_light == 0.0:
-            found = self._lit(found, windows, how)
+            found = self._lit(found, windows, fit_options)
         return EllipseFits(
             found.centres,
             found.covariances[:, :2, :2],
@@ -324,33 +327,34 @@ class DrawnStickers:
             np.zeros((count, 7)),
         )
 
-    def _lit(self, even: "Fits", windows: "Windows", how: "FitSettings") -> "Fits":
-        """Return the simulated fits in windows, if light that rises is fitted in each of them.
+    def _lit(self, even: "Fits", windows: "Windows", fit_options: "FitSettings") -> "Fits":
+        """Return the simulated fits in windows if light that rises is fitted in each of them.
 
-        ``even`` are the simulated fits of even light, and ``how`` are the settings of the fit.
+        ``even`` are the simulated fits of even light, with the same random numbers. ``fit_options``
+        are the settings of the fit.
         """
         from cmmsim.without_images.drawn_fit_kernels import lit_covariances
 
         at = windows.sides, windows.stickers
         ellipses = self._found
         covariances = np.array(even.covariances)
-        own = np.flatnonzero(even.good)
-        found = np.empty((len(own), 5, 5))
+        good = np.flatnonzero(even.good)
+        lit = np.empty((len(good), 5, 5))
         lit_covariances(
-            (ellipses.centres[at] - windows.corners)[own],
-            ellipses.shapes[at][own],
-            ellipses.smears[at][own],
-            even.contrasts[own],
-            even.grounds[own],
+            (ellipses.centres[at] - windows.corners)[good],
+            ellipses.shapes[at][good],
+            ellipses.smears[at][good],
+            even.contrasts[good],
+            even.grounds[good],
             windows.size,
-            how,
-            found,
+            fit_options,
+            lit,
         )
-        covariances[own] = found
+        covariances[good] = lit
         roots = np.linalg.cholesky(covariances)
-        off = np.einsum("kij,kj->ki", roots, ellipses.noise[at][:, :5])
-        shapes = ellipses.shapes[at] + off[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        centres = ellipses.centres[at] + off[:, :2]
+        errors = np.einsum("kij,kj->ki", roots, ellipses.noise[at][:, :5])
+        shapes = ellipses.shapes[at] + errors[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+        centres = ellipses.centres[at] + errors[:, :2]
         return even._replace(centres=centres, shapes=shapes, covariances=covariances)
 
 
@@ -359,8 +363,8 @@ def _empty_windows(count: int, observer: Observer) -> "Windows":
     # Imported late, because importing numba takes time.
     from cmmsim.without_images.drawn_fit_kernels import Windows
 
-    whole = np.empty((2, count), dtype=int)
+    indices = np.empty((2, count), dtype=int)
     found = np.empty(count, dtype=bool)
     return Windows(
-        whole[0], whole[1], np.empty((count, 2), dtype=int), found, observer.settings.fit_size
+        indices[0], indices[1], np.empty((count, 2), dtype=int), found, observer.settings.fit_size
     )

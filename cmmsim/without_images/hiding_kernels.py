@@ -35,7 +35,7 @@ class Solids(NamedTuple):
 
 @compiled
 def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
-    """Tell whether the segment from ``eye`` to ``point`` meets the ball around ``middle``.
+    """Return True if the segment from ``eye`` to ``point`` meets the ball around ``middle``.
 
     All three are (3,), and ``radius`` is that of the ball.
     """
@@ -72,16 +72,16 @@ def hidden_stickers(
     owners: Array,
     clear: float,
     solids: Solids,
-    asked: Array,
+    tested: Array,
     hidden: Array,
 ) -> None:
-    """Fill ``hidden`` (n,), which is True if a solid hides a sticker or its surroundings.
+    """Fill ``hidden`` (n,), which is True if a solid hides a part of a sticker's surroundings.
 
-    The surroundings are a disc of radius ``clear`` m around the sticker, in its plane. Its middle
-    and PROBES points on its rim are tested. ``camera_from_bodies`` (b, 4, 4) belong to the solids,
-    and positions ``places`` (n, 3) and normals (n, 3) of stickers are in camera axes. The solid
-    ``owners`` (n,) to which a sticker belongs does not hide it. Stickers outside of the mask
-    ``asked`` (n,) are not tested and count as not hidden.
+    The surroundings are a disc of radius ``clear`` m around the sticker's centre, in its plane. The
+    centre and PROBES points on the rim are tested. ``camera_from_bodies`` (b, 4, 4) belong to the
+    solids. Positions ``places`` (n, 3) and normals (n, 3) of stickers are in camera axes. The solid
+    ``owners[n]``, to which sticker n belongs, does not hide it. Stickers outside the mask
+    ``tested`` (n,) are not tested, and count as not hidden.
     """
     camera = np.zeros(3)
     eyes = np.empty((len(camera_from_bodies), 3))
@@ -94,7 +94,7 @@ def hidden_stickers(
         transform_point(camera_from_bodies[b], solids.middles[b], 1.0, middles[b])
     for n in range(len(places)):
         hidden[n] = False
-        if not asked[n]:
+        if not tested[n]:
             continue
         probed = False
         for b in range(len(camera_from_bodies)):

@@ -5,10 +5,10 @@ centre comes from a table, except in fast motion. There is no search: the window
 centred at its ellipse.
 
 The table describes the noise of a sticker's centre as a function of its ellipse. The covariance
-from ``fit_covariances`` belongs to one position of the centre. It is averaged over all positions
-within a pixel and inverted. The inverse grows with the length of the rim. The table contains the
-inverse divided by the mean half axis m, which depends only weakly on m. It depends smoothly on the
-ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
+from ``fit_covariances`` belongs to one position of the centre. It is averaged over positions within
+a pixel and inverted. The inverse grows with the length of the rim. The table contains the inverse
+divided by the mean half axis m, because this quotient depends only weakly on m. It depends smoothly
+on the ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
 """
 
 import os
@@ -53,12 +53,13 @@ from cmmsim.without_images.verified import require_short
 OVAL = np.linspace(-0.78, 0.78, 14)
 # Number of tabulated mean half axes. The largest is half the side of the fitted part.
 RADII = 8
-# Largest ovalness hypot(p, q) of an ellipse; entries of the table beyond have this ovalness.
+# Largest ovalness hypot(p, q) of an ellipse. Entries of the table with larger p and q are computed
+# for this ovalness.
 MOST_OVAL = 0.85
 # Number of positions within a pixel along each axis, without and with a point spread.
 SHARP_PHASES = 5
 BLURRED_PHASES = 2
-# px: smallest distance of a tabulated ellipse from the edge of the fitted part, if it is centred.
+# Smallest distance between a tabulated ellipse that is centred and the edge of the fitted part, px.
 EDGE_PX = 0.2
 # Fractions of full light at which the growth of the covariance is computed.
 LIGHTS = np.array([0.4, 0.7, 1.0])
@@ -74,7 +75,7 @@ BLOCK = 512
 def centre_noise(
     noise: CameraNoise, psf_px: float, fit_size: int, sticker: float, ring: float
 ) -> CentreNoise:
-    """Return the table of the centre's inverse covariance for fits in windows of ``fit_size`` px.
+    """Return the table of the centre's inverse covariance for fitted parts of ``fit_size`` px.
 
     ``sticker`` and ``ring`` are the radiances of stickers and rings, 0 to 1.
     """
@@ -87,22 +88,22 @@ def centre_noise(
 
     def covariances(shapes: Array, light: float) -> Array:
         """Return mean covariances (n, 2, 2) of centres of ellipses with shapes (n, 2, 2)."""
-        found = np.empty((len(shapes), 5, 5))
+        of_fits = np.empty((len(shapes), 5, 5))
         total = np.zeros((len(shapes), 2, 2))
         for phase in np.stack(np.meshgrid(within, within), axis=-1).reshape(-1, 2):
             centres = np.tile(0.5 * (fit_size - 1) + phase, (len(shapes), 1))
             contrasts = np.full(len(shapes), light * (bright - dark))
             grounds = np.full(len(shapes), black + light * (dark - black))
             still = np.zeros((len(shapes), 2))
-            fit_covariances(centres, shapes, still, contrasts, grounds, fit_size, settings, found)
-            total += found[:, :2, :2]
+            fit_covariances(centres, shapes, still, contrasts, grounds, fit_size, settings, of_fits)
+            total += of_fits[:, :2, :2]
         return total / phases**2
 
     radii = np.linspace(SMALLEST_RADIUS_PX, 0.5 * fit_size, RADII)
     m, p, q = np.meshgrid(radii, OVAL, OVAL, indexing="ij")
-    found = covariances(_shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX), 1.0)
-    known = np.linalg.inv(found)[:, [0, 0, 1], [0, 1, 1]] / m.reshape(-1, 1)
-    table = known.reshape(*m.shape, 3)
+    tabulated = _shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX)
+    inverses = np.linalg.inv(covariances(tabulated, 1.0))[:, [0, 0, 1], [0, 1, 1]]
+    table = (inverses / m.reshape(-1, 1)).reshape(*m.shape, 3)
     # The growth of the covariance with less light hardly depends on the shape, so it is computed
     # for one typical ellipse.
     usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
@@ -141,7 +142,7 @@ class StatisticalTracker:
     """Tracker with the methods of `Tracker` that measures poses without images.
 
     It makes no predictions, so a lost frame does not affect the next one. Raises CmmError if the
-    estimator does not measure by registration.
+    estimator's method is not registration.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -151,8 +152,8 @@ class StatisticalTracker:
             )
         self._estimator = estimator
         self._camera: StatisticalStereoCamera | None = None
-        # Buffer for the stickers of one frame, which the next frame overwrites.
-        self._one = self._frame()
+        # The stickers of a single frame, which the next frame overwrites.
+        self._single_frame = self._frame()
 
     def forget(self) -> None:
         """Do nothing, because this tracker has no memory."""
@@ -170,14 +171,14 @@ class StatisticalTracker:
                 "a sensor without images measures only results of its own look(); use "
                 "measure_frame for images"
             )
-        frame = self._one
-        found = np.empty(6)
-        spread = np.empty((6, 6))
+        frame = self._single_frame
+        pose = np.empty(6)
+        covariance = np.empty((6, 6))
         noise, kept = self._draws(exposure.rng, 1)
         scene = self._scene_of(exposure.camera)
         drawn = exposure.exposed, exposure.bodies, noise[0], kept[0]
         verdict = np.empty(COLUMNS)
-        measure_frame(scene, *drawn, frame, found, spread, verdict)
+        measure_frame(scene, *drawn, frame, pose, covariance, verdict)
         require_short(frame.longest[0])
         estimator = self._estimator
         used = frame.stickers.used
@@ -187,8 +188,8 @@ class StatisticalTracker:
             first = str(ids[int(verdict[FIRST])])
             return lost_measurement(lost_reason(verdict, first, places))
         return Measurement(
-            found,
-            spread,
+            pose,
+            covariance,
             frame.stickers.points[used],
             frame.stickers.covariances[used],
             frame.pixels[used, 0],
@@ -211,12 +212,13 @@ class StatisticalTracker:
 
         ``exposed`` comes from ``StatisticalStereoCamera.exposed``. ``bodies`` (b, 4, 4) are
         base_from_body of the base and the obstacles, which stand still. A lost frame has a pose and
-        a covariance of NaN, and 0 stickers. Raises CmmError as ``measure`` does for motion blur.
+        a covariance of NaN, and 0 stickers. Raises CmmError for motion blur beyond the verified
+        length.
         """
         count = len(exposed)
         scene = self._scene_of(camera)
-        found = np.empty((count, 6))
-        spreads = np.empty((count, 6, 6))
+        measured = np.empty((count, 6))
+        covariances = np.empty((count, 6, 6))
         stickers = np.empty(count, dtype=int)
         starts = range(0, count, BLOCK)
 
@@ -225,7 +227,7 @@ class StatisticalTracker:
             poses = exposed[part]
             noise, kept = self._draws(own, len(poses))
             verdicts = np.empty((len(poses), COLUMNS))
-            filled = found[part], spreads[part], verdicts
+            filled = measured[part], covariances[part], verdicts
             require_short(measure_frames(scene, poses, bodies, noise, kept, self._frame(), *filled))
             stickers[part] = np.where(verdicts[:, STATE] == MEASURED, verdicts[:, LEFT], 0)
 
@@ -233,7 +235,7 @@ class StatisticalTracker:
         # results do not depend on the number of threads.
         with ThreadPoolExecutor(min(len(starts) or 1, os.cpu_count() or 1)) as pool:
             list(pool.map(block, starts, rng.spawn(len(starts))))
-        return MeasuredPoses(found, spreads, stickers)
+        return MeasuredPoses(measured, covariances, stickers)
 
     def _scene_of(self, camera: StatisticalStereoCamera) -> StereoScene:
         """Return the cameras and their scene in the form that the kernels take.
@@ -251,6 +253,7 @@ class StatisticalTracker:
         return self._scene
 
     def _frame(self) -> Frame:
+        """Return an empty frame with all stickers of the platform."""
         # a copy, because the kernels would be compiled once more for a read-only array
         planes = self._estimator.platform.plane_index.copy()
         n = len(planes)
@@ -262,8 +265,8 @@ class StatisticalTracker:
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
         """Draw standard normal noise (N, 2, n, 3), and the mask (N, n) of stickers that are kept.
 
-        The noise is that of ``observe``. Stickers are omitted at random, because the test of
-        outlines rejects a few good ones.
+        Both are those of ``observe``. Stickers are omitted at random, because the test of outlines
+        rejects a few good ones.
         """
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
@@ -273,8 +276,8 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
     """Return the cameras and their scene in the form that the kernels take."""
     settings = estimator.settings
     taught = estimator.taught
-    own = camera.scene.owners == 0
-    count = int(own.sum())
+    on_platform = camera.scene.owners == 0
+    count = int(on_platform.sum())
     light = camera.light
     limits = Limits(
         GRAZING,
@@ -285,8 +288,8 @@ def _scene(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> StereoS
         light.optics.vignetting,
         settings.line_error_px**2,
     )
-    places = camera.scene.places[own]
-    normals = camera.scene.normals[own]
+    places = camera.scene.places[on_platform]
+    normals = camera.scene.normals[on_platform]
     # a copy, because the kernels would be compiled once more for a read-only array
     taught_places = np.array(taught.platform_places, order="C")
     return StereoScene(

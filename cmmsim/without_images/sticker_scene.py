@@ -68,17 +68,17 @@ class StickerScene:
         return places, normals
 
     def hidden(
-        self, camera_from_bodies: Array, places: Array, normals: Array, asked: NDArray[np.bool_]
+        self, camera_from_bodies: Array, places: Array, normals: Array, tested: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Return the mask (m,) of stickers that a solid of another body hides.
 
-        A sticker is hidden if a part of the disc of CLEAR radii around it is. Stickers have
-        positions ``places`` and normals (m, 3) in camera axes. Only stickers in the mask ``asked``
+        A sticker is hidden if a part of the disc of CLEAR radii around it is hidden. Stickers have
+        positions ``places`` and normals (m, 3) in camera axes. Only stickers in the mask ``tested``
         (m,) are tested; the others count as not hidden.
         """
         from cmmsim.without_images.hiding_kernels import hidden_stickers
 
-        hidden = np.empty(len(asked), dtype=bool)
+        hidden = np.empty(len(tested), dtype=bool)
         hidden_stickers(
             camera_from_bodies,
             places,
@@ -86,7 +86,7 @@ class StickerScene:
             self.owners,
             CLEAR * self.radius,
             self.occluders,
-            asked,
+            tested,
             hidden,
         )
         return hidden
@@ -99,14 +99,15 @@ class StickerScene:
         faces = [solid.faces for solid in self.solids]
         middles = np.array([solid.middle for solid in self.solids])
         radii = [
-            np.linalg.norm(s.vertices - m, axis=1).max()
-            for s, m in zip(self.solids, middles, strict=True)
+            np.linalg.norm(solid.vertices - middle, axis=1).max()
+            for solid, middle in zip(self.solids, middles, strict=True)
         ]
         starts = np.cumsum([0, *(len(normals) for normals, _ in faces)])
         normals, offsets = (np.concatenate(values) for values in zip(*faces, strict=True))
         return Solids(starts, normals, offsets, middles, np.array(radii))
 
 
+# Number of the random stream of print errors of centres.
 PRINT_STREAM = 2
 
 
@@ -114,9 +115,8 @@ PRINT_STREAM = 2
 class CentreErrors:
     """Errors of sticker centres due to uneven print and outlines that are not round.
 
-    ``constant`` (2, m, 2) px are the constant errors of each sticker in both images, and
-    ``changing_px`` is the standard deviation per coordinate of errors that are new in each
-    exposure.
+    ``constant`` (2, m, 2) px are the constant errors of the stickers in both images. Further errors
+    are new in each exposure, with the standard deviation ``changing_px`` per coordinate.
     """
 
     constant: Array

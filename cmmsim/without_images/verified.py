@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cmmsim.without_images.drawn_stickers import Light
 
 NAME = "statistical"
-# Largest verified standard deviation of the point spread, and length of motion blur.
+# Largest verified standard deviation of the point spread, and largest length of motion blur.
 WIDEST_PSF_PX = 1.0
 LONGEST_STREAK_PX = 4.0
 # Grey values must be at least this many standard deviations of noise away from black and white.
@@ -34,7 +34,7 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
     low, high = (float(np.sqrt(noise.variance(np.array(grey)))) for grey in (ring, bright))
     stickers = file.stickers
     detector = file.detection.detector
-    others = {
+    zero_keys = {
         "light.lamps": len(file.light.lamps),
         "light.fall_off": file.light.fall_off,
         "light.clutter": file.light.clutter,
@@ -59,11 +59,11 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
                                                               f"{stickers.ring_radius:g} m",
          f"at least {RING_REACH:g} times radius {stickers.radius:g} m"),
         (not (file.print.is_perfect or file.print.known), "print.known false", "true"),
-        *((value != 0, f"{key} {value:g}", "0") for key, value in others.items()),
+        *((value != 0, f"{key} {value:g}", "0") for key, value in zero_keys.items()),
     ]  # fmt: skip
-    for refused, what, needed in wrong:
+    for refused, condition, needed in wrong:
         if refused:
-            raise CmmError(_not_proved(what, needed))
+            raise CmmError(_not_proved(condition, needed))
 
 
 def require_short(longest_px: float) -> None:
@@ -77,8 +77,8 @@ def require_short(longest_px: float) -> None:
         )
 
 
-def _not_proved(what: str, needed: str) -> str:
+def _not_proved(condition: str, needed: str) -> str:
     return (
-        f"renderer {NAME!r} is not verified for {what}, only for {needed}; use the renderer "
+        f"renderer {NAME!r} is not verified for {condition}, only for {needed}; use the renderer "
         "analytic or pyrender"
     )

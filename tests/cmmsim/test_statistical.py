@@ -220,6 +220,16 @@ def test_many_at_once_are_as_many_one_by_one():
     assert abs(np.mean([len(m.target_ids) for m in alone]) - together.stickers[:500].mean()) < 0.1
 
 
+def test_stickers_outside_of_an_image_do_not_widen_the_covariance():
+    """Fewer than half of the stickers lie in both images; the stated errors are those of images."""
+    drawing, without = exact(), statistical()
+    pose = drawing.home + np.array([0.0, 0.7, 0.0, 0.0, 0.0, 0.0])
+    images = drawing.estimator.measure(drawing.look(pose), camera_from(drawing, pose))[0]
+    drawn = without.measure(pose)
+    assert len(images.target_ids) == len(drawn.target_ids) < 9
+    assert abs(np.trace(drawn.covariance) / np.trace(images.covariance) - 1.0) < 0.05
+
+
 def test_many_by_planes_are_those_of_frames_alone():
     """In motion, with one out of sight."""
     sensor = statistical(changes={"timing.exposure": 0.002}, method="planes")
