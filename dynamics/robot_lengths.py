@@ -330,7 +330,9 @@ def _comments(
         f"Gains by design: the inertia at the joints is {drives.inertias[0]:.2g} to "
         f"{drives.inertias[1]:.2g} {inertia}. With lp, the natural frequencies are "
         f"{drives.frequencies[1]:.3g} to {drives.frequencies[0]:.3g} rad/s; with ld, the damping "
-        f"ratio of the lowest is {drives.damping:g}. With the scenario's servo the loop is stable "
-        "at 60 Hz, and at 29 Hz with one frame of latency, up to "
-        f"{drives.margin:.3g} times the gains of the servo.",
+        f"ratio of the lowest is {drives.damping:g}. The loop of the scenario's servo is "
+        "tested with the two built-in sensors: at 60 Hz without latency, and at 29 Hz with one "
+        f"frame of latency. Both are stable up to {drives.margin:.3g} times the gains of the "
+        "servo. cmmsim check finds the lowest frame rate at which the loop of a scenario is "
+        "stable, which depends on its latency.",
     ]

@@ -81,7 +81,7 @@ def check_loop(
     rate = stability.lowest_frame_rate(*arguments)
     change = "stays stable down to" if radius < 1 else "becomes stable at"
     text = (
-        f"with this latency, the loop {change} {rate:.3g} Hz"
+        f"with {1e3 * timing.latency_s:.3g} ms of latency, the loop {change} {rate:.3g} Hz"
         if rate > 0
         else "no higher frame rate makes the loop stable"
     )
