@@ -263,7 +263,7 @@ HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, distinct 
 
 
 def validation_figure(result: dict[str, Any]) -> Figure:
-    """Draw the actual and the predicted distance of the true robot from the predicted poses.
+    """Draw the actual and the expected distance of the true robot from the predicted poses.
 
     The RMS distances of each validation trajectory have bars and diamonds. The distance of the
     measured poses from the identified model, and the limits of the goals, are drawn as well.
