@@ -296,8 +296,8 @@ def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
     )
 
 
-# Largest ratio of a position of home, or of the travel of sliders, to the size of the robot, beyond
-# which it is likely in mm.
+# Largest ratio of a position of home, of the travel of sliders, or of the length of a leg at
+# coordinate zero, to the size of the robot, beyond which it is likely in mm.
 MOST_SIZES = 50.0
 # Largest travel of joints that turn, and angle of home, rad. Larger ones are likely in degrees.
 MOST_TRAVEL = 4 * np.pi
@@ -305,7 +305,7 @@ MOST_ANGLE = 2 * np.pi
 
 
 def _check_units(content: RobotFile) -> None:
-    """Raise RobotFileError for a home or a travel that is likely in mm or in degrees.
+    """Raise RobotFileError for a home, a travel or a leg that is likely in mm or in degrees.
 
     The size of the robot is the largest coordinate of a joint on base or platform.
     """
@@ -314,9 +314,12 @@ def _check_units(content: RobotFile) -> None:
     angle = max(content.home_pose[3:], key=abs)
     travel = content.travel_limit
     slides = content.legs[0].prismatic
+    longest = max(getattr(leg, "zero_length", 0.0) for leg in content.legs)
     inside = f"all joints on base and platform lie within {size:.3g} m of their frames"
     if abs(far) > MOST_SIZES * size > 0:
         found = f"home_pose has a position of {far:g} m, and {inside}", "mm", 1e-3 * far, "m"
+    elif longest > MOST_SIZES * size > 0:
+        found = f"zero_length is {longest:g} m, and {inside}", "mm", 1e-3 * longest, "m"
     elif abs(angle) > MOST_ANGLE:
         found = f"home_pose has an angle of {angle:g} rad", "degrees", np.radians(angle), "rad"
     elif slides and travel > MOST_SIZES * size > 0:

@@ -209,21 +209,14 @@ def _height(leg: Leg, new: Mapping[str, float]) -> float:
 
 
 def _travel(geometry: RobotGeometry, old: RobotGeometry, ratios: Mapping[str, float]) -> float:
-    """Travel limit, m, in proportion to the link or to `_home_to_end`. A limit in rad is kept."""
+    """Travel limit, m, in proportion to the link or to the stroke. A limit in rad is kept."""
     if not geometry.prismatic:
         return old.travel_limit
     if "leg" not in ratios:
         ratio = ratios["link"]
     else:
-        ratio = _home_to_end(geometry) / _home_to_end(old)
+        ratio = geometry.legs[0].travel_room / old.legs[0].travel_room
     return float(f"{ratio * old.travel_limit:.9g}")
-
-
-def _home_to_end(geometry: RobotGeometry) -> float:
-    """Distance of home from the nearer end of the stroke, m."""
-    leg = geometry.legs[0]
-    shortest, longest = leg.stroke  # type: ignore[attr-defined]
-    return float(min(leg.zero_length - shortest, longest - leg.zero_length))  # type: ignore[attr-defined]
 
 
 def _check_stroke(leg: Leg) -> None:

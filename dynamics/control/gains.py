@@ -170,10 +170,14 @@ def design_drives(
             if best is None or not best.margin >= drives.margin:
                 best = drives
     if best is None or not best.margin > 1:
+        needed = (
+            f"with the best, the gains of the servo must be {best.margin:.3g} times as large"
+            if best is not None and best.margin > 0
+            else "the loop is unstable with any gains of the servo"
+        )
         raise SimulationError(
             f"no gains of the drives of {robot.name} make the servo stable at "
-            f"{', '.join(f'{loop.timing.frame_rate_hz:g} Hz' for loop in loops)}: with the best, "
-            f"the gains of the servo must be {best.margin if best else 0:.3g} times as large"
+            f"{', '.join(f'{loop.timing.frame_rate_hz:g} Hz' for loop in loops)}: {needed}"
         )
     return best
 

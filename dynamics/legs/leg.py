@@ -155,6 +155,11 @@ class Leg(BaseModel, ABC):
     )
 
     @property
+    def travel_room(self) -> float:
+        """Largest travel, m, in both directions that the stroke allows. Infinite without one."""
+        return float("inf")
+
+    @property
     def side(self) -> float | ca.SX:
         """Sign of the square root in the inverse kinematics. It is +1 if no branch is selected."""
         return 1.0 if self.branch is None else self.branch

@@ -61,6 +61,12 @@ class UpsLeg(Leg):
         """
         return max(self.cylinder_length, self.rod_length), self.cylinder_length + self.rod_length
 
+    @property
+    def travel_room(self) -> float:
+        """Distance, m, of coordinate zero from the nearer end of the stroke."""
+        shortest, longest = self.stroke
+        return min(self.zero_length - shortest, longest - self.zero_length)
+
     def lengths(self) -> str:
         shortest, longest = self.stroke
         return (

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.commands.options import (
+    STANDARD_OUTPUT,
     JsonFile,
     Plugins,
     Quiet,
@@ -145,7 +146,13 @@ def _tell(
     }
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
-        said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
+        # standard output has the texts, unless it has neither the table nor the JSON
+        shown = not quiet or str(json) == STANDARD_OUTPUT
+        said = (
+            ", ".join(finding.check for finding in failed)
+            if shown
+            else "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
+        )
         raise VerificationError(
             f"{len(failed)} of {len(findings)} findings about {about} fail: {said}"
         )

@@ -26,7 +26,7 @@ from dynamics.closed_loop import (
 )
 from dynamics.control.computed_torque import DecayingErrors, computed_torque, error_map
 from dynamics.control.feedforward import feedforward, joint_commands
-from dynamics.control.gains import design_servo, servo_figures, torque_figures
+from dynamics.control.gains import design_drives, design_servo, servo_figures, torque_figures
 from dynamics.control.inverse_dynamics import FITTED_DOUBT, Model, spans
 from dynamics.control.law_interface import Assignment, Feedback
 from dynamics.errors import SimulationError
@@ -485,3 +485,11 @@ def test_what_the_servo_cannot_drive_is_refused(robot, identified, asked, said):
 def test_a_torque_limit_is_a_number_above_zero(limit):
     with pytest.raises(SimulationError, match="torque limit"):
         Drives(torque_limit=limit)
+
+
+def test_a_loop_that_no_gains_make_stable_is_said_to_be_so_without_a_number(monkeypatch):
+    robot = dynamics.load_robot("rss6")
+    truth = robot.parameter_sets["truth"].dynamic
+    monkeypatch.setattr("dynamics.control.gains.stability.gain_margin", lambda *_: float("nan"))
+    with pytest.raises(SimulationError, match="at 29 Hz: the loop is unstable with any gains of"):
+        design_drives(robot, [truth], [LoopSettings(SERVO, SLOW)])

@@ -212,11 +212,14 @@ def test_robot_files_that_make_no_robot(load_changed, old, new, message):
         load_changed({old: new})
 
 
-def test_a_travel_of_sliders_in_mm_and_a_key_of_all_legs_in_one_are_named():
+def test_travel_and_length_of_sliders_in_mm_and_a_key_of_all_legs_in_one_are_named():
     text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
     changed = text.replace("travel_limit = 0.06 ", "travel_limit = 60.0 ")
     assert changed != text
     with pytest.raises(RobotFileError, match=r"travel_limit is 60 m, .* in mm, it is 0.06 in m"):
+        parsed_robot(changed, "mine.toml")
+    changed = text.replace("zero_length = 0.3013337393884099", "zero_length = 301.3")
+    with pytest.raises(RobotFileError, match=r"zero_length is 301.3 m, .* mm, it is 0.3013 in m"):
         parsed_robot(changed, "mine.toml")
     with pytest.raises(ValueError, match=r"leg 1: crank_axes is a key of all legs, .* crank_axis"):
         RobotFile.model_validate({"legs": [{"type": "rss", "crank_axes": [0, 0, 1]}]})

@@ -73,6 +73,10 @@ def test_a_limit_that_is_missed_and_a_command_that_cannot_be_done_have_statuses_
     monkeypatch.setattr("identify.verification.robot_check.check_robot", lambda *_: [far])
     assert command("check", "rss6", "--quiet") == BEYOND_LIMIT
     assert "1 of 1 findings about rss6 fail: reach: too far" in one_line(capfd.readouterr().err)
+    assert command("check", "rss6") == BEYOND_LIMIT
+    out, err = capfd.readouterr()
+    assert "too far" in out
+    assert err == "error: 1 of 1 findings about rss6 fail: reach\n"
     assert command("check", "none.toml") == NOT_DONE
     one_line(capfd.readouterr().err)
 

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dynamics import load_robot
+from dynamics import Robot, load_robot
+from dynamics.robot_file import parsed_robot
 from identify.commands import run_stages
 from identify.commands.help import BEYOND_LIMIT
 from identify.commands.options import built_in_names
@@ -17,7 +18,7 @@ from identify.errors import EstimationError, ScenarioError
 from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
 from identify.setup import Setup
-from identify.verification.robot_check import about_sensor, run_warning
+from identify.verification.robot_check import about_sensor, check_travel, run_warning
 from tests.identify.commands import command, one_line
 
 
@@ -151,6 +152,20 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd, monkeypatch):
     said = capfd.readouterr().err.splitlines()
     assert [line.partition(":")[0] for line in said] == ["warning", "error"]
     assert warned in said[0]
+
+
+def test_a_travel_beyond_the_stroke_of_a_leg_fails_with_the_travel_that_fits():
+    """Cylinder and rod of ups6 are 0.2 m long, and a leg is 0.30133 m at coordinate zero."""
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    longer = text.replace("cylinder_length = 0.2", "cylinder_length = 0.28")
+    assert parsed_robot(longer, "mine.toml").geometry.legs[0].travel_room == pytest.approx(
+        0.02133, abs=1e-5
+    )
+    far = Robot(parsed_robot(text.replace("travel_limit = 0.06", "travel_limit = 0.2"), "mine"))
+    found = {one.check: one for one in check_travel(far, load_scenario("paper").excitation)}
+    assert not found["stroke"].ok
+    assert found["stroke"].limit == pytest.approx(0.09867, abs=1e-5)
+    assert not found["travel closes"].ok
 
 
 def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read(capfd):
