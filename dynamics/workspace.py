@@ -184,18 +184,30 @@ def check_motion(
         )
 
     def check(
-        worst: Extreme, is_allowed: bool, kind: type[DynamicsError], quantity: str, relation: str
+        worst: Extreme,
+        is_allowed: bool,
+        kind: type[DynamicsError],
+        quantity: str,
+        relation: str,
+        note: str = "",
     ) -> None:
         if not is_allowed:
             when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
             who = f" of leg {worst.leg}" if worst.leg else ""
             raise kind(
                 f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, "
-                f"{relation}{worst.limit:.4g} (pose {row_text(poses[worst.row], 4)})"
+                f"{relation}{worst.limit:.4g} (pose {row_text(poses[worst.row], 4)}{note})"
             )
 
     reach = extreme(measures.reach_margin, 0.0, np.argmin)
-    check(reach, reach.value > 0, UnreachablePoseError, "reach margin", "must be > ")
+    check(
+        reach,
+        reach.value > 0,
+        UnreachablePoseError,
+        "reach margin",
+        "must be > ",
+        "; the margin has no unit, and below 0 the leg does not reach the pose",
+    )
     travel = extreme(np.abs(measures.theta), robot.travel_limit - travel_margin, np.argmax)
     check(
         travel,

@@ -24,6 +24,12 @@ STATUSES = {
     STOPPED: "Ctrl-C stopped the command.",
 }
 
+# Keys of a scenario outside of its sections, for which some would expect an option.
+SCENARIO_KEYS = ("robot", "sensor", "renderer", "pose_method")
+
+# Error of a wrong command line, which typer has under no public name.
+UsageError: Any = typer.BadParameter.__base__
+
 OTHERS = "Further commands"  # title of the commands that have no group of their own
 
 
@@ -31,6 +37,33 @@ class Command(TyperCommand):
     """Command whose help ends with the list of its possible exit statuses."""
 
     statuses: ClassVar[tuple[int, ...]] = (DONE, NOT_DONE, MISUSED, STOPPED)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments. An error names the form in which the command takes what was typed.
+
+        The stages of a run have the option --out for its folder, and other commands an argument.
+        """
+        try:
+            return super().parse_args(ctx, args)
+        except UsageError as error:
+            said = self._remedy(getattr(error, "option_name", None) or "", error.message)
+            if said:
+                error.message += f"; {said}"
+                error.possibilities = None
+            raise
+
+    def _remedy(self, option: str, message: str) -> str:
+        """Return the right form of an unknown option or a superfluous argument, or nothing."""
+        names = {name for one in self.params for name in (one.name, *one.opts)}
+        key = option.lstrip("-").replace("-", "_")
+        if option == "--out" and "run" in names:
+            return f"the folder of the run stands alone: cmmsim {self.name} FOLDER"
+        if key in SCENARIO_KEYS and "--set" in names:
+            return f"it is a key of the scenario: --set {key}=VALUE"
+        if "extra argument" in message and "--out" in names:
+            folder = message.rpartition("(")[2].rstrip(")").split()[0]
+            return f"a folder stands after --out: cmmsim {self.name} --out {folder}"
+        return ""
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Write the exit statuses."""

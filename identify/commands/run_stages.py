@@ -177,7 +177,17 @@ def excite(
         compare_excitation(setup, folder.path, terminal_progress(quiet), json, quiet)
         return
     _pipeline().excite(setup, folder.path, terminal_progress(quiet))
-    tell(load_result(folder.trajectories), json, quiet, lambda: None)
+    tell(
+        load_result(folder.trajectories),
+        json,
+        quiet,
+        lambda: _wrote(folder.trajectories, "record"),
+    )
+
+
+def _wrote(path: Path, stage: str) -> None:
+    """Print which file of a run was written, and the command of the next stage."""
+    typer.echo(f"wrote {path}; next: cmmsim {stage} --out {path.parent}")
 
 
 def record(
@@ -201,6 +211,8 @@ def record(
     RunFolder(out).require("scenario.toml", "trajectories.json")
     context.with_resource(lock_folder(out))
     _pipeline().record(out, terminal_progress(quiet))
+    if not quiet:
+        _wrote(RunFolder(out).experiment, "identify")
 
 
 def identify(
@@ -302,7 +314,7 @@ def validate(
         folder.require(*PLANNED, "result.json")
     context.with_resource(lock_folder(out))
     _pipeline().validate(out, terminal_progress(quiet), workers)
-    tell(load_result(folder.result), json, quiet, lambda: None)
+    tell(load_result(folder.result), json, quiet, lambda: _wrote(folder.result, "report"))
 
 
 def report(

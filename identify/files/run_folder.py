@@ -87,8 +87,10 @@ class RunFolder:
         read, or its digest is wrong.
         """
         if not self.path.is_dir():
+            later = any(WRITTEN_BY[name] != "excite" for name in names)
+            command = "run quick" if later else "excite"
             raise OutputFolderError(
-                f"no run folder {self.path}; make it with: cmmsim excite --out {self.path}"
+                f"no run folder {self.path}; make it with: cmmsim {command} --out {self.path}"
             )
         for name in names:
             if not (self.path / name).is_file():

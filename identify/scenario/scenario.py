@@ -4,7 +4,7 @@ Each field states its unit. An error names the key, the value and the unit and, 
 the valid names.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
@@ -201,9 +201,12 @@ class Scenario(Section):
         """
         # Values that are not set are left out, so that another sensor can provide them.
         data = self.model_dump(exclude_none=True, exclude_unset=True)
-        for path, value in overrides.items():
-            _replace(data, path, value)
-        return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
+        try:
+            for path, value in overrides.items():
+                _replace(data, path, value)
+            return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
+        except ScenarioError as error:
+            raise ScenarioError(f"{error}{_of_sensor(overrides)}") from None
 
     def with_estimator_settings(self, overrides: Mapping[str, Any]) -> "Scenario":
         """Return the scenario of a record with other settings of the estimator, by dotted path.
@@ -362,3 +365,24 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
         data.pop(key, None)
     else:
         data[key] = value
+
+
+def _of_sensor(paths: Iterable[str]) -> str:
+    """Return words on the first path that is a key of the sensor file, and none of a scenario."""
+    from cmmsim.files.schema import SensorFile
+
+    for path in paths:
+        key = path.removeprefix("sensor.")
+        if not _has(Scenario, path) and _has(SensorFile, key):
+            return f"; {key!r} is a key of the sensor file: set sensor_changes.{key}"
+    return ""
+
+
+def _has(model: Any, path: str) -> bool:
+    """Return whether a model has the field at the end of a dotted path."""
+    for part in path.split("."):
+        fields = getattr(model, "model_fields", {})
+        if part not in fields:
+            return False
+        model = fields[part].annotation
+    return True

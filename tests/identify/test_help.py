@@ -152,3 +152,26 @@ def test_a_failed_check_is_told_with_its_remedy_and_without_its_lists(tmp_path, 
     assert one_line(capfd.readouterr().err).rstrip().endswith(": set kp = 3")
     (entry,) = json.loads((tmp_path / "found.json").read_text())["findings"]
     assert entry["text"] == f"{text}: evidence"
+
+
+ROW_TIME = "set sensor_changes.timing.row_time"
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("identify runs/x", "cmmsim identify --out runs/x"),
+        ("budget --out runs/x", "cmmsim budget FOLDER"),
+        ("run quick --sensor x", "--set sensor=VALUE"),
+        ("replay runs/x", "cmmsim run quick --out runs/x"),
+        ("record --out runs/x", "cmmsim excite --out runs/x"),
+        ("excite quick --set timing.row_time=1e-5", ROW_TIME),
+        ("excite quick --set sensor.timing.row_time=1e-5", ROW_TIME),
+    ],
+)
+def test_a_line_that_nearly_fits_is_refused_with_the_one_that_does(
+    typed, said, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    assert command(*typed.split()) in (1, 2)
+    assert capfd.readouterr().err.strip().endswith(said)
