@@ -60,7 +60,7 @@ class Command(TyperCommand):
             return f"the folder of the run stands alone: cmmsim {self.name} FOLDER"
         if key in SCENARIO_KEYS and "--set" in names:
             return f"it is a key of the scenario: --set {key}=VALUE"
-        if "extra argument" in message and "--out" in names:
+        if "extra argument" in message and "--out" in names and "run" not in names:
             folder = message.rpartition("(")[2].rstrip(")").split()[0]
             return f"a folder stands after --out: cmmsim {self.name} --out {folder}"
         return ""

@@ -369,7 +369,7 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
 
 def _of_sensor(paths: Iterable[str]) -> str:
     """Return words on the first path that is a key of the sensor file, and none of a scenario."""
-    from cmmsim.files.schema import SensorFile
+    from cmmsim.files import SensorFile
 
     for path in paths:
         key = path.removeprefix("sensor.")

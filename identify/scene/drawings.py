@@ -29,6 +29,8 @@ BRIGHT = "#fdfdf5"
 FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
 
 SIDES = ("left", "right")
+# Labels of bodies. The stickers of the base are on a body beside the robot.
+LABELS = {"base": "stickers\nof the base"}
 
 ARROWS = 3000.0  # factor that enlarges errors of a hundredth of a pixel, so that they can be seen
 # Half width, half height and length of the box that represents a camera, in m.
@@ -264,7 +266,7 @@ def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -
         end = flat[np.argmax(side * flat[:, 0])]
         align = "left" if side > 0 else "right"
         axes.annotate(
-            body.name,
+            LABELS.get(body.name, body.name),
             tuple(end),
             (8 * side, 8),
             textcoords="offset points",
@@ -273,7 +275,7 @@ def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -
             zorder=5,
             arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkA": 1, "shrinkB": 0},
         )
-    axes.annotate("axes of the base: 0.15 m", (0.0, 0.0), xycoords="axes fraction", fontsize=7)
+    axes.annotate("length of the axes: 0.15 m", (0.0, 0.0), xycoords="axes fraction", fontsize=7)
 
 
 def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float | None) -> None:

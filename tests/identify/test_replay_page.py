@@ -149,6 +149,9 @@ def test_play_moves_on_and_switches_work(replayed, browser):
     assert (
         page.run("return document.querySelectorAll('#differences path').length") == 12
     )  # two models, six components
+    key = "return document.getElementById('differences-key').textContent"
+    assert page.run(key) == "identified modelinitial model"
+    assert "-" not in page.run("return document.getElementById('figures').textContent")
     page.run(
         "const e = document.getElementById('enlarged'); e.value = '10000'; e.dispatchEvent(new "
         "Event('change'))"

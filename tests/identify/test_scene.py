@@ -163,7 +163,8 @@ def test_the_base_hides_no_leg_of_the_robot_in_a_picture(cell):
 @pytest.mark.slow
 def test_figures_are_drawn_with_words_of_what_they_show(cell, view):
     scene = drawn_words(scene_figure(cell, MOVED))
-    assert {"left camera", "right camera", "platform", "base", "x", "y", "z"} <= scene
+    assert {"left camera", "right camera", "platform", "x", "y", "z"} <= scene
+    assert "stickers\nof the base" in scene
     both = drawn_words(stereo_figure(view, arrows=2000.0))
     assert any("2000 times enlarged" in words for words in both)
     assert {"18 stickers found on the platform"} <= drawn_words(overview_figure(cell, view))
@@ -215,7 +216,7 @@ def test_what_a_run_lacks_is_left_out_and_said(run_folder):
 
 @pytest.mark.slow
 def test_what_no_replay_can_be_made_of_is_refused_in_one_line(run_folder, tmp_path):
-    assert "cmmsim excite" in refusal(OutputFolderError, read_motion, tmp_path / "none")
+    assert "cmmsim run quick" in refusal(OutputFolderError, read_motion, tmp_path / "none")
     assert "cmmsim excite" in refusal(OutputFolderError, read_motion, tmp_path)
     assert "excitation, run01, run02" in refusal(RecordError, read_motion, run_folder.path, "run03")
     record = read_group(run_folder.experiment)

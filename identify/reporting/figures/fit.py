@@ -255,7 +255,7 @@ def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
-        list(entries.values()), list(entries), loc="outside upper left", ncols=3, handlelength=3.0
+        list(entries.values()), list(entries), loc="outside upper left", ncols=2, handlelength=3.0
     )
 
 
@@ -270,7 +270,7 @@ def validation_figure(result: dict[str, Any]) -> Figure:
     """
     validation = result["validation"]
     limits = {goal.name: goal.limit for goal in check_goals(result)}
-    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
     for axes, first, goal in ((panels[0], 0, UNSEEN_POSITION), (panels[1], 3, UNSEEN_ORIENTATION)):
@@ -318,7 +318,8 @@ def validation_figure(result: dict[str, Any]) -> Figure:
             label=f"limit of the goal, {limits[goal]:.3g} {UNITS[first]}",
         )
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        # On a narrow screen, a legend at the right would be out of sight.
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
         axes.grid(visible=False, axis="x")
     panels[1].set_xlabel("validation trajectory")
     panels[1].set_xticks(runs)

@@ -47,7 +47,7 @@ def excitation_figure(time: Array, poses: Array) -> Figure:
         for i in (i for i in shown if first <= i < first + 3):
             axes.plot(time, 1e3 * (poses[:, i] - poses[0, i]), label=COMPONENTS[i], **LINES[i])
         axes.set_ylabel(f"{name}\nfrom the start [{unit}]")
-        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=3.0)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, handlelength=3.0)
     panels[-1].set_xlabel("time [s]")
     return figure
 

@@ -66,7 +66,7 @@ class Panel {
     for (const value of roundNumbers(low, high, 5)) {
       element("line", { class: "grid", x1: 0, x2: 1, y1: down(value), y2: down(value) }, this.svg);
       const top = `calc(1.4rem + (100% - 2.8rem) * ${down(value)} - 0.55rem)`;
-      this.text("tick", String(value), { right: "calc(100% - 3.4rem)", top });
+      this.text("tick", String(value).replace("-", "−"), { right: "calc(100% - 3.4rem)", top });
     }
     for (const value of roundNumbers(this.first, this.first + this.length, 5)) {
       const left = `calc(3.6rem + (100% - 4rem) * ${(value - this.first) / this.length})`;

@@ -17,6 +17,11 @@ const SAMPLES = {
 const OFF_AT_FIRST = ["starting"];
 const NAMES = ["x", "y", "z", "α", "β", "γ"];
 
+/* Return a number with a minus sign in place of a hyphen. */
+function typographic(value, digits) {
+  return value.toFixed(digits).replace("-", "−");
+}
+
 class Replay {
   constructor(data) {
     this.data = data;
@@ -180,9 +185,21 @@ class Replay {
     const difference = (kind, k) => {
       return residual ? this.column("measured", k, 1e6, kind) : this.column(kind, k, 1e6, "true");
     };
+    this.writeKey("poses-key", this.kinds());
+    this.writeKey("differences-key", shown);
     this.panels.differences.forEach((panel, k) => {
       panel.draw(shown.map((kind) => ({ values: difference(kind, k), ...look(kind), ...alone })));
     });
+  }
+
+  /* Write the key of the curves beside their title. */
+  writeKey(place, kinds) {
+    const entries = kinds.map((kind) => {
+      const item = document.createElement("li");
+      item.append(this.sample(kind), SHORT[kind]);
+      return item;
+    });
+    document.getElementById(place).replaceChildren(...entries);
   }
 
   /* Return the nearest frame with images. */
@@ -230,15 +247,16 @@ class Replay {
   writeFigures() {
     const truth = this.pose("true", this.frame);
     const kinds = Object.keys(this.data.poses).filter((kind) => kind !== "true");
-    const head = ["", truth ? "true" : "", ...kinds.map((kind) => (truth ? `${SHORT[kind]} minus true` : SHORT[kind]))];
+    const [large, small] = ["[mm,\u00a0mrad]", "[µm,\u00a0µrad]"];
+    const titles = kinds.map((kind) => (truth ? `${SHORT[kind]} − true ${small}` : `${SHORT[kind]} ${large}`));
+    const head = ["", truth ? `true ${large}` : "", ...titles];
     const rows = NAMES.map((name, k) => {
-      const [large, small] = k < 3 ? ["mm", "µm"] : ["mrad", "µrad"];
       const cells = kinds.map((kind) => {
         const pose = this.pose(kind, this.frame);
         if (!pose) return kind === "measured" ? "lost" : "none";
-        return truth ? `${(1e6 * (pose[k] - truth[k])).toFixed(2)} ${small}` : `${(1e3 * pose[k]).toFixed(4)} ${large}`;
+        return truth ? typographic(1e6 * (pose[k] - truth[k]), 2) : typographic(1e3 * pose[k], 4);
       });
-      return [name, truth ? `${(1e3 * truth[k]).toFixed(4)} ${large}` : "", ...cells];
+      return [name, truth ? typographic(1e3 * truth[k], 4) : "", ...cells];
     });
     const table = document.getElementById("figures");
     table.replaceChildren();
