@@ -100,14 +100,23 @@ def test_every_command_line_is_one_that_the_program_takes():
 def test_each_equation_of_the_paper_names_code_and_a_test_and_each_exhibit_a_command():
     """The paper has equations 1 to 40 and A1 to A6, thirteen figures and five tables."""
     text = (ROOT / "docs" / "reference" / "paper.md").read_text(encoding="utf-8")
-    rows = re.findall(
-        r"^\| ([^|]+) \| [^|]+ \| `([\w.]+)` \| `([^:|]+)::(\w+)` \|$", text, re.MULTILINE
-    )
-    equations = [one for cells in rows for one in cells[0].split(", ") if "section" not in one]
+    rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| `([\w.]+)` \|$", text, re.MULTILINE)
+    tests = re.findall(r"^- (.+): `(\w+)` in `([\w/.]+)`$", text, re.MULTILINE)
+    assert [said for said, _ in rows] == [said for said, _, _ in tests]
+
+    def counted(one):
+        first, _, last = one.partition(" to ")
+        letter, *numbers = first.rstrip("0123456789"), *re.findall(r"\d+", one)
+        assert not last or last.startswith(letter)
+        return [f"{letter}{k}" for k in range(int(numbers[0]), int(numbers[-1]) + 1)]
+
+    said = [one for cell, _ in rows for one in cell.split(", ") if "section" not in one]
+    equations = [number for one in said for number in counted(one)]
     wanted = [*map(str, range(1, 41)), *(f"A{k}" for k in range(1, 7))]
     assert sorted(equations) == sorted(wanted)
-    for _, function, file, test in rows:
+    for _, function in rows:
         resolve_name(function)
+    for _, test, file in tests:
         source = (ROOT / file).read_text(encoding="utf-8")
         assert re.search(rf"^def {test}\(", source, re.MULTILINE), f"{file}::{test}"
     exhibits = re.findall(
