@@ -41,6 +41,7 @@ RADII = ("base_radius", "platform_radius")
 # Number of digits to which points are rounded, counted from the first digit of their radius.
 DIGITS = 9
 SAMPLES = 2000  # number of random positions of the joints within the travel limit
+FIRST_SAMPLES = 100  # number of these positions that are tried first
 # Factor by which the travel limit is reduced until no pose within it is near a singularity.
 TRAVEL_FACTOR = 0.95
 LEAST_TRAVEL = 0.1  # smallest ratio of the reduced travel limit to the original one
@@ -231,28 +232,37 @@ def _check_stroke(leg: Leg) -> None:
 
 def _within_limits(robot: Robot) -> Robot:
     """Robot whose travel limit keeps sampled poses from singularities. Raises RobotFileError."""
-    limit = robot.travel_limit
-    while True:
-        geometry = replace(robot.geometry, travel_limit=limit)
-        limited = Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
-        measures = workspace.measure_travel(limited, SAMPLES)
-        if len(measures.theta) and _far_from_limits(measures):
-            return limited
-        limit = float(f"{TRAVEL_FACTOR * limit:.3g}")
-        if limit < LEAST_TRAVEL * robot.travel_limit:
-            raise RobotFileError(_near_singularity(limited, measures))
+    limits = [robot.travel_limit]
+    while (limit := float(f"{TRAVEL_FACTOR * limits[-1]:.3g}")) >= LEAST_TRAVEL * limits[0]:
+        limits.append(limit)
+    # If the smallest travel is near a singularity, so are all others.
+    measures = workspace.measure_travel(robot, SAMPLES, limits[-1])
+    if not _far_from_limits(measures):
+        raise RobotFileError(_near_singularity(robot, measures))
+    chosen = next(
+        limit
+        for limit in limits
+        if all(
+            _far_from_limits(workspace.measure_travel(robot, samples, limit))
+            # few positions, which are also among the many, refuse most limits sooner
+            for samples in (FIRST_SAMPLES, SAMPLES)
+        )
+    )
+    geometry = replace(robot.geometry, travel_limit=chosen)
+    return Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
 
 
 def _far_from_limits(measures: workspace.WorkspaceMeasures) -> bool:
     return bool(
-        (measures.reach_margin > 0).all()
+        len(measures.theta)
+        and (measures.reach_margin > 0).all()
         and (measures.leverage >= workspace.LEAST_LEVERAGE).all()
         and (measures.platform_condition <= workspace.MOST_CONDITION).all()
     )
 
 
 def _near_singularity(robot: Robot, measures: workspace.WorkspaceMeasures) -> str:
-    """Message about limits that are exceeded even within the travel limit of a robot."""
+    """Message about limits of a robot that are exceeded even within the smallest travel."""
     home = _at_home(robot)
     texts = [f"{SAMPLES - len(measures.theta)} of {SAMPLES} positions of the joints have no pose"]
     if len(measures.theta):
@@ -273,8 +283,9 @@ def _near_singularity(robot: Robot, measures: workspace.WorkspaceMeasures) -> st
                 f"{workspace.MOST_CONDITION:g}, {home.platform_condition[0]:.3g} at home"
             )
     return (
-        f"{robot.name} comes near a singularity within a travel of only {robot.travel_limit:.3g} "
-        f"{robot.layout.joint_unit} about home: {'; '.join(texts)}; choose other lengths"
+        f"{robot.name} comes near a singularity within a travel of only "
+        f"{measures.travel_limit:.3g} {robot.layout.joint_unit} about home: {'; '.join(texts)}; "
+        "choose other lengths"
     )
 
 

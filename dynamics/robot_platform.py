@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, row_text, rows
-from dynamics.compiled.machine_code import MachineFunction
+from dynamics.compiled.machine_code import Functions
 from dynamics.errors import (
     ChartError,
     RobotFileError,
@@ -72,8 +72,8 @@ class RobotPlatform:
         return self.geometry.chart.coordinate_names
 
     @property
-    def functions(self) -> dict[str, MachineFunction]:
-        """Compiled functions by name. They are compiled at their first use."""
+    def functions(self) -> Functions:
+        """Compiled functions by name. They are compiled at their first use, in two parts."""
         if self.functions_of is self.geometry:
             return own_functions(self.geometry)
         return nearby_functions(self.functions_of, self.geometry)

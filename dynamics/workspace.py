@@ -19,7 +19,7 @@ for rss6). `rigid_body.jacobians.singularity_measures` has the measures as CasAD
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -136,18 +136,22 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     return WorkspaceMeasures(theta, margin, leverage[..., 0], platform_rows, robot.travel_limit)
 
 
-def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
+def measure_travel(
+    robot: Robot, samples: int, travel_limit: float | None = None
+) -> WorkspaceMeasures:
     """Measures of poses for random joint coordinates within the travel limit.
+
+    The travel limit is that of the robot, unless another one is given.
 
     The search for each pose begins at home. Joint coordinates without a pose are omitted, so that
     there can be fewer rows than samples.
     """
-    limit = robot.travel_limit
+    limit = robot.travel_limit if travel_limit is None else travel_limit
     # the seed is fixed, because a report of a robot must not change from run to run
     joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
     start = np.tile(robot.home_pose, (samples, 1))
     solution = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
-    return measure(robot, solution.pose[solution.converged])
+    return replace(measure(robot, solution.pose[solution.converged]), travel_limit=limit)
 
 
 def check_motion(

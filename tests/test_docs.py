@@ -203,7 +203,7 @@ def test_every_page_can_be_reached():
     assert sorted(set(PAGES) - reached) == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_it_is_built_without_a_warning(tmp_path):
     """Without running the examples, which `sh .ci/docs` does; on a copy, whose outputs are nobody
     else's.

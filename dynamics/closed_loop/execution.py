@@ -38,7 +38,7 @@ from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.closed_loop.visual_servo_kernels import measure_ideally
 from dynamics.compiled.kernel import address, chosen, plain
-from dynamics.compiled.machine_code import MachineFunction
+from dynamics.compiled.machine_code import Functions, MachineFunction
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.parameters import LANES
 
@@ -276,7 +276,7 @@ def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarr
 def _fill(
     memory: Memory,
     problem: LoopProblem,
-    functions: dict[str, MachineFunction],
+    functions: Functions,
     servo_jacobian: MachineFunction,
     addresses: dict[str, int],
 ) -> None:

@@ -11,7 +11,7 @@ results.
 import ctypes
 import gc
 import json
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -81,6 +81,10 @@ class MachineFunction:
         return partial(
             single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data)
         )
+
+
+# Compiled functions by name.
+Functions = Mapping[str, MachineFunction]
 
 
 def compiled_functions(

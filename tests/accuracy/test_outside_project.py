@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -115,13 +116,24 @@ def test_the_guide_names_every_option_and_every_file_and_no_other(pytestconfig):
     assert set(re.findall(r"\]\(([^)]+)\)", TEXT)) == {path.name for path in FILES}
 
 
-@pytest.mark.slow
-def test_the_wheel_holds_every_file_of_the_packages(outside):
+def files_of_the_packages():
+    """Paths within this checkout."""
     files = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
-    wanted = [
-        path.relative_to(ROOT) for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")
-    ]
+    return [path.relative_to(ROOT) for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")]
+
+
+def test_every_file_of_the_packages_is_code_or_of_a_kind_that_wheels_hold():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    data = tomllib.loads(text)["tool"]["setuptools"]["package-data"]["*"]
+    kinds = ("*.py", *data)
+    wanted = files_of_the_packages()
     assert len(wanted) > 200
+    assert [path for path in wanted if not any(path.match(kind) for kind in kinds)] == []
+
+
+@pytest.mark.thorough
+def test_the_wheel_holds_every_file_of_the_packages(outside):
+    wanted = files_of_the_packages()
     assert [path for path in wanted if not (packages(outside) / path).exists()] == []
 
 

@@ -92,7 +92,10 @@ def test_everything_compiles_only_once(tmp_path, record_property):
     """Functions, and then kernels, into an empty cache; another process finds them, compiles
     nothing, and takes a quarter of the time."""
     load_robot = "import dynamics as d; robot = d.load_robot('rss6'); "
-    steps = [load_robot + "robot.functions", *[load_robot + "d.closed_loop.prepare(robot)"] * 2]
+    steps = [
+        load_robot + "dict(robot.functions)",
+        *[load_robot + "d.closed_loop.prepare(robot)"] * 2,
+    ]
     environment = os.environ | {"CMMSIM_CACHE": str(tmp_path)}
     spent, stamps = [], []
     with OtherLoad() as load:

@@ -4,6 +4,7 @@ package.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
@@ -82,6 +83,55 @@ SLOW_ROBOTS = [
     pytest.param(name, marks=OFTEN.get(name, (pytest.mark.slow,)))
     for name in dynamics.built_in_robots()
 ]
+
+
+MIXED = "mixed"
+
+
+@lru_cache(maxsize=1)
+def mixed_robot(folder: Path) -> dynamics.Robot:
+    """Sliders with links of two lengths on universal joints and on balls, and cylinders: from its
+    file alone.
+    """
+    legs = [
+        *[
+            (dynamics.load_robot("pus6").geometry.legs[k], {"link_length": 0.3 + 0.02 * (k == 1)})
+            for k in (0, 1)
+        ],
+        *[(dynamics.load_robot("pss6").geometry.legs[k], {"link_length": 0.31}) for k in (2, 3)],
+        *[(dynamics.load_robot("ups6").geometry.legs[k], {}) for k in (4, 5)],
+    ]
+    lines = [
+        'name = "mixed"',
+        'chart = "free"',
+        "home_pose = [0, 0, 0.2, 0, 0, 0]",
+        "travel_limit = 0.08",
+    ]
+    for leg, changes in legs:
+        fields = {
+            name: value for name, value in leg.model_dump().items() if name != "branch"
+        } | changes
+        lines.append("[[legs]]")
+        lines += [
+            f"{name} = {np.array(value).tolist()!r}".replace("'", '"')
+            for name, value in fields.items()
+        ]
+    lines += [
+        *(
+            "[parameters.guess]",
+            "platform = { mass = 24.0, Ixx = 0.178, Iyy = 0.19, Izz = 0.35 }",
+        ),
+        *(
+            "slider = { mass = 1.4, Ixx = 0.1, Iyy = 0.1, Izz = 0.1 }",
+            "joint = { coulomb = 1.5, viscous = 40.0 }",
+        ),
+        'joint_pid = { lp = 4000.0, li = 4300.0, ld = 170.0, unit = "N/m" }',
+    ]
+    for name in ("link", "cylinder", "rod"):
+        lines.append(f"{name} = {{ mass = 1.1, Ixx = 0.0081, Iyy = 0.0079, Izz = 0.0006 }}")
+    path = folder / "mixed.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return dynamics.load_robot(path)
 
 
 def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:

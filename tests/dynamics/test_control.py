@@ -130,7 +130,9 @@ def size(errors, axes=slice(0, 3)):
 @pytest.mark.parametrize(
     "timing", [FAST, replace(FAST, hold="linear"), SLOW], ids=["60 Hz", "linear", "29 Hz"]
 )
-@pytest.mark.parametrize("name", ["rss6", pytest.param("ups6", marks=pytest.mark.slow), "delta3"])
+@pytest.mark.parametrize(
+    "name", ["rss6", pytest.param("ups6", marks=pytest.mark.thorough), "delta3"]
+)
 def test_feedforward_of_the_true_model_leaves_a_fiftieth_of_what_the_servo_alone_does(name, timing):
     """By simulated plants with dry friction, which know nothing of the law."""
     robot = dynamics.load_robot(name)
@@ -153,8 +155,11 @@ def test_computed_torque_with_an_observer_leaves_an_eighth_of_what_the_servo_alo
     """Of positions and of orientations, with dry friction and noise; half as fast it leaves more:
     noise is no limit.
     """
-    alone, own = follow(robot, timing, None)[1], follow(robot, timing, computed_torque)[1]
-    slow = follow(robot, timing, computed_torque, bandwidth=0.5 * timing.frame_rate_hz)[1]
+    bandwidths = timing.frame_rate_hz, 0.5 * timing.frame_rate_hz
+    alone = follow(robot, timing, None, seconds=2.0)[1]
+    own, slow = (
+        follow(robot, timing, computed_torque, seconds=2.0, bandwidth=one)[1] for one in bandwidths
+    )
     for axes in (slice(0, 3), slice(3, 6)):
         assert size(own, axes) < size(alone, axes) / 8
         assert size(own, axes) < size(slow, axes)
@@ -414,7 +419,7 @@ def test_the_linear_response_is_that_of_the_simulated_loop(robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["delta3", pytest.param("rss6", marks=pytest.mark.thorough)])
 def test_designed_gains_give_the_bandwidth_and_damping_that_were_asked_for(name):
     robot = dynamics.load_robot(name)
     model = Model(robot, robot.parameter_sets["truth"].vector, FrictionLaw())

@@ -3,8 +3,6 @@ consistent in itself.
 """
 
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -26,63 +24,29 @@ from dynamics.legs import KINDS
 from dynamics.legs.leg import Leg
 from dynamics.robot_functions import CASADI
 from dynamics.workspace import check_motion
-from tests.dynamics.conftest import SLOW_ROBOTS, Loop, States, derivative
+from tests.dynamics.conftest import MIXED, SLOW_ROBOTS, Loop, States, derivative, mixed_robot
 
 BOX = np.repeat([0.010, 0.040], 3)
 FULL_BOX = np.repeat([0.015, 0.050], 3)
 SCALES = BOX, np.repeat([0.1, 0.5], 3), np.repeat([1.0, 5.0], 3)  # of pose, twist and twist rate
 
-MIXED = "mixed"
 SERVO = ServoGains(0.3, 0.001, 2.4)  # of the paper
+# For what is made of the equations of all legs in the same way.
+FEW = ("delta3", "rss6", "ups6")
+few_robots = pytest.mark.parametrize(
+    "robot",
+    [
+        name if name in FEW else pytest.param(name, marks=pytest.mark.thorough)
+        for name in (*dynamics.built_in_robots(), MIXED)
+    ],
+    indirect=True,
+    scope="module",
+)
 
 
-@lru_cache(maxsize=1)
-def mixed_robot(folder: Path) -> dynamics.Robot:
-    """Sliders with links of two lengths on universal joints and on balls, and cylinders: from its
-    file alone.
-    """
-    legs = [
-        *[
-            (dynamics.load_robot("pus6").geometry.legs[k], {"link_length": 0.3 + 0.02 * (k == 1)})
-            for k in (0, 1)
-        ],
-        *[(dynamics.load_robot("pss6").geometry.legs[k], {"link_length": 0.31}) for k in (2, 3)],
-        *[(dynamics.load_robot("ups6").geometry.legs[k], {}) for k in (4, 5)],
-    ]
-    lines = [
-        'name = "mixed"',
-        'chart = "free"',
-        "home_pose = [0, 0, 0.2, 0, 0, 0]",
-        "travel_limit = 0.08",
-    ]
-    for leg, changes in legs:
-        fields = {
-            name: value for name, value in leg.model_dump().items() if name != "branch"
-        } | changes
-        lines.append("[[legs]]")
-        lines += [
-            f"{name} = {np.array(value).tolist()!r}".replace("'", '"')
-            for name, value in fields.items()
-        ]
-    lines += [
-        *(
-            "[parameters.guess]",
-            "platform = { mass = 24.0, Ixx = 0.178, Iyy = 0.19, Izz = 0.35 }",
-        ),
-        *(
-            "slider = { mass = 1.4, Ixx = 0.1, Iyy = 0.1, Izz = 0.1 }",
-            "joint = { coulomb = 1.5, viscous = 40.0 }",
-        ),
-        'joint_pid = { lp = 4000.0, li = 4300.0, ld = 170.0, unit = "N/m" }',
-    ]
-    for name in ("link", "cylinder", "rod"):
-        lines.append(f"{name} = {{ mass = 1.1, Ixx = 0.0081, Iyy = 0.0079, Izz = 0.0006 }}")
-    path = folder / "mixed.toml"
-    path.write_text("\n".join(lines), encoding="utf-8")
-    return dynamics.load_robot(path)
-
-
-@pytest.fixture(scope="module", params=[*SLOW_ROBOTS, pytest.param(MIXED, marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=[*SLOW_ROBOTS, pytest.param(MIXED, marks=pytest.mark.thorough)]
+)
 def robot(request, tmp_path_factory):
     if request.param == MIXED:
         return mixed_robot(tmp_path_factory.getbasetemp())
@@ -111,7 +75,7 @@ def states(robot):
 
 
 def test_forward_dynamics_agrees_with_pinocchios_closed_chain(robot, values, states):
-    """twist_dot of 200 random states, torques and bodies to 1e-9 of its size; friction enters as
+    """twist_dot of 60 random states, torques and bodies to 1e-9 of its size; friction enters as
     joint torque.
     """
     pytest.importorskip("pinocchio")
@@ -120,11 +84,10 @@ def test_forward_dynamics_agrees_with_pinocchios_closed_chain(robot, values, sta
     own, layout = values[robot.layout.dynamic], robot.layout
     chain, rng = ClosedChain(robot, own), np.random.default_rng(5)
     largest = 1 + np.abs(robot.static_torque(robot.home_pose, own)).max()
-    torques = 2 * largest * rng.standard_normal((200, layout.joints))
-    ours = robot.forward_dynamics(states.pose, states.twist, torques, own)
-    for pose, twist, torque, acceleration in zip(
-        states.pose, states.twist, torques, ours, strict=True
-    ):
+    poses, twists = states.pose[:60], states.twist[:60]
+    torques = 2 * largest * rng.standard_normal((60, layout.joints))
+    ours = robot.forward_dynamics(poses, twists, torques, own)
+    for pose, twist, torque, acceleration in zip(poses, twists, torques, ours, strict=True):
         rate = robot.joint_jacobian(pose) @ twist
         state = chain.state(
             pose, twist, torque - own[layout.coulomb] * np.sign(rate) - own[layout.viscous] * rate
@@ -200,6 +163,7 @@ def test_joint_rates_and_accelerations_are_derivatives_of_joint_coordinates(robo
     np.testing.assert_allclose(ours, numeric, atol=1e-8 * np.abs(ours).max())
 
 
+@few_robots
 def test_sensitivities_of_a_run_are_its_finite_differences(robot, values):
     """By every parameter to 1e-6 of the largest, over 40 frames with stick and slip; what has no
     effect has none.
@@ -334,6 +298,7 @@ def test_a_leg_whose_link_lies_along_an_axis_at_home_is_refused(name, moved):
 
 
 @pytest.mark.slow
+@few_robots
 def test_casadi_functions_are_the_compiled_ones_and_name_what_they_take(robot, values):
     """At random states, to 1e-12 of the largest entry; derivatives of a function exist."""
     rng = np.random.default_rng(5)

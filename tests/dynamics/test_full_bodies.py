@@ -25,7 +25,7 @@ from dynamics.rigid_body.equation_of_motion import (
     stop_derivatives,
 )
 from dynamics.rigid_body.passive_friction import SLOW
-from tests.dynamics.conftest import SLOW_ROBOTS
+from tests.dynamics.conftest import MIXED, mixed_robot
 
 SCALES = np.repeat([0.01, 0.04], 3), np.repeat([0.1, 0.5], 3), np.repeat([1.0, 5.0], 3)
 
@@ -49,23 +49,58 @@ def drawn_bodies(robot, rng):
     return np.array(found)
 
 
-@pytest.fixture(scope="module", params=SLOW_ROBOTS)
-def full(request):
-    """A robot with full bodies only and friction in all passive joints, its parameters, and 20
+# Every kind of leg; the legs of a mixed robot are those of pus6, pss6 and ups6.
+EVERY_KIND = [
+    *("delta3", "rrr3"),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("rus6", MIXED)),
+    *(pytest.param(name, marks=pytest.mark.thorough) for name in ("rss6", "pss6", "pus6", "ups6")),
+]
+every_kind = pytest.mark.parametrize("full", EVERY_KIND, indirect=True, scope="module")
+REST = [
+    pytest.param(name, marks=pytest.mark.thorough)
+    for name in ("rrr3", "rus6", "pss6", "pus6", "ups6")
+]
+# For what adds up legs, of which test_families.py has every kind.
+two_kinds = pytest.mark.parametrize(
+    "full", ["delta3", "rss6", *REST], indirect=True, scope="module"
+)
+
+
+@pytest.fixture(scope="module")
+def full(request, tmp_path_factory):
+    """A robot with full bodies only and friction in all passive joints, its parameters, and 8
     states that its platform can have.
     """
-    robot = dynamics.load_robot(request.param).with_full_bodies(["all"])
+    mixed = request.param == MIXED
+    robot = (
+        mixed_robot(tmp_path_factory.getbasetemp()) if mixed else dynamics.load_robot(request.param)
+    ).with_full_bodies(["all"])
     robot = robot.with_passive_friction(passive_parameters(robot.geometry.legs))
     rng = np.random.default_rng(1)
     values = robot.nominal_parameters.copy()
     values[robot.layout.inertial] = robot.layout.rigid_of(drawn_bodies(robot, rng))
     values[robot.layout.passive] = rng.uniform(0.01, 0.1, len(robot.layout.passive_names))
     free = robot.geometry.chart.basis @ robot.geometry.chart.basis.T
-    away, twist, gain = (rng.uniform(-1, 1, (20, 6)) * scale @ free for scale in SCALES)
+    away, twist, gain = (rng.uniform(-1, 1, (8, 6)) * scale @ free for scale in SCALES)
     return robot, values, (robot.home_pose + away, twist, gain)
 
 
+class ByCasadi:
+    """The kinematics of a robot that is not compiled for so few questions."""
+
+    def __init__(self, robot):
+        self.home_pose = robot.home_pose
+        self._joints, self._jacobian = map(robot.casadi, ("inverse_kinematics", "joint_jacobian"))
+
+    def inverse_kinematics(self, pose):
+        return self._joints(pose)[0].full().ravel()
+
+    def joint_jacobian(self, pose):
+        return self._jacobian(pose).full()
+
+
 @pytest.mark.slow
+@every_kind
 def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
     """Every column to 1e-9 of its size over all states; accelerations to 1e-9 of theirs."""
     pytest.importorskip("pinocchio")
@@ -78,12 +113,11 @@ def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
     layout, free = robot.layout, robot.geometry.chart.basis
     frictionless = np.array(values)
     frictionless[layout.inertial.stop :] = 0
-    centred = robot.with_full_bodies(()).with_passive_friction(())
-    chain = ClosedChain(robot, values, moving=centred)
+    chain = ClosedChain(robot, values, moving=ByCasadi(robot))
     rest = np.zeros((2, 6))
     holding = robot.casadi("inverse_dynamics")(robot.home_pose, *rest, values).full()
     torques = (1 + 2 * np.abs(holding).max()) * np.random.default_rng(5).standard_normal(
-        (20, layout.joints)
+        (len(states[0]), layout.joints)
     )
     errors, sizes = [], []
     for pose, twist, torque in zip(*states[:2], torques, strict=True):
@@ -106,6 +140,7 @@ def test_regressor_and_motion_are_those_of_pinocchios_closed_chain(full):
 
 
 @pytest.mark.slow
+@two_kinds
 def test_mass_and_coriolis_matrix_and_equation_of_motion_are_one_dynamics(full):
     """M twist_dot + C twist + G is the wrench of the regressor; M_dot - 2 C is skew-symmetric; the
     equation of motion of the integrator has the same forces; its derivatives are differences.
@@ -161,6 +196,7 @@ def _angle_rates(pose, omega):
 
 
 @pytest.mark.slow
+@every_kind
 def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(full):
     """With the angular velocities of the chain that Pinocchio gets: viscous c |w|^2, which as a
     quadratic form in the twist is the whole wrench; dry c |w|^2 / sqrt(|w|^2 + SLOW^2).
@@ -203,7 +239,9 @@ def test_friction_of_passive_joints_takes_the_power_of_their_relative_rotation(f
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("full", ["delta3", "rss6"], indirect=True)
+@pytest.mark.parametrize(
+    "full", ["delta3", pytest.param("rss6", marks=pytest.mark.thorough)], indirect=True
+)
 def test_a_passive_joint_of_one_leg_has_its_share_of_the_friction_of_all_legs(full):
     """The friction of all legs is the sum of that of single legs, which begin with its value."""
     robot, values, (poses, twists, _) = full
@@ -235,14 +273,11 @@ def test_a_full_body_without_first_moments_and_products_is_a_centred_body(robot,
     assert full.with_full_bodies(()).layout == robot.layout
     values = robot.parameter_sets["truth"].dynamic
     torques = np.ones(6)
+    other = full.casadi("forward_dynamics")
     for pose, twist in zip(states.pose[:20], states.twist[:20], strict=True):
-        centred, other = (
-            one.casadi("forward_dynamics")(
-                pose, twist, torques, one.parameter_sets["truth"].dynamic
-            ).full()
-            for one in (robot, full)
-        )
-        np.testing.assert_allclose(other, centred, rtol=1e-10)
+        centred = robot.forward_dynamics(pose, twist, torques, values)
+        found = other(pose, twist, torques, full.parameter_sets["truth"].dynamic).full().ravel()
+        np.testing.assert_allclose(found, centred, rtol=1e-10)
     np.testing.assert_array_equal(
         full.layout.converted(full.parameter_sets["truth"].dynamic, robot.layout), values
     )
@@ -326,10 +361,9 @@ def test_full_bodies_of_a_robot_file(load_changed):
     "name",
     [
         "delta3",
-        "pss6",
         *(
             pytest.param(name, marks=pytest.mark.thorough)
-            for name in ("rrr3", "rss6", "rus6", "pus6", "ups6")
+            for name in ("rrr3", "rss6", "rus6", "pss6", "pus6", "ups6")
         ),
     ],
 )

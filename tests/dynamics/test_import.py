@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,13 +16,14 @@ from dynamics.engines.mjcf_import import robot_of_mjcf
 from dynamics.engines.urdf import urdf_texts
 from dynamics.engines.urdf_import import robot_of_urdf
 from dynamics.errors import RobotFileError
-from dynamics.inertia import physical_inertias, travel_states
+from dynamics.inertia import physical_inertias
 from dynamics.pseudo_inertia import full_body
-from dynamics.rigid_body.virtual_work import robot_functions
+from dynamics.rigid_body.jacobians import joint_coordinates, joint_jacobian
+from dynamics.rigid_body.virtual_work import inertial_wrench
 from dynamics.robot import Robot, load_robot
 from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
-from tests.dynamics.conftest import SLOW_ROBOTS
+from tests.dynamics.conftest import BOX, SLOW_ROBOTS
 from tests.identify.commands import refusal
 
 
@@ -34,31 +36,42 @@ def with_bodies(robot):
 
 
 @cache
-def functions_of(geometry):
-    """Functions by name as CasADi evaluates them: compiling takes longer than so few questions."""
-    return {one.name(): one for one in robot_functions(geometry)}
+def legs_of(geometry):
+    """CasADi function of pose, twist, its rate and inertial parameters: joint coordinates, joint
+    Jacobian and wrench without friction of the actuators.
+    """
+    pose, twist, twist_dot = (ca.SX.sym(name, 6) for name in ("pose", "twist", "twist_dot"))
+    rigid = ca.SX.sym("rigid", geometry.layout.rigid.stop)
+    found = [
+        joint_coordinates(geometry, pose),
+        joint_jacobian(geometry, pose),
+        inertial_wrench(geometry, pose, twist, twist_dot, rigid),
+    ]
+    return ca.Function("legs", [pose, twist, twist_dot, rigid], found)
 
 
 def assert_same_dynamics(robot, values, description, folder):
-    """The same accelerations and joint coordinates all over the travel, of the robot and of what
-    its file holds.
+    """The same joint coordinates, Jacobians and wrenches at random states, and the same friction,
+    of the robot and of what its file holds. Accelerations follow from these.
     """
     (folder / "robot.toml").write_text(robot_text(description, ["a\nnote"]), encoding="utf-8")
     other = load_robot(folder / "robot.toml")
     assert other.geometry == description.geometry
     assert other.layout == robot.layout
     assert other.travel_limit == robot.travel_limit
-    pose, twist, torque = (values.T for values in travel_states(robot, values))
-    joints, accelerations = [], []
-    for one, parameters in ((robot, values), (other, other.nominal_parameters)):
-        functions = functions_of(one.geometry)
-        joints.append(np.array(functions["inverse_kinematics"](pose)[0]))
-        accelerations.append(
-            np.array(functions["forward_dynamics"](pose, twist, torque, parameters))
+    layout, basis = robot.layout, robot.geometry.chart.basis
+    drawn = np.random.default_rng(0).uniform(-1, 1, (20, 3, 6)) @ basis @ basis.T
+    for away, twist, twist_dot in drawn:
+        state = robot.home_pose + BOX * away, twist, 10 * twist_dot
+        ours, theirs = (
+            legs_of(one.geometry)(*state, parameters[layout.rigid])
+            for one, parameters in ((robot, values), (other, other.nominal_parameters))
         )
-    ours, theirs = accelerations
-    assert (np.abs(ours - theirs).max(axis=0) <= 1e-9 * np.abs(ours).max(axis=0)).all()
-    np.testing.assert_allclose(*joints, atol=1e-9)
+        for one, same in zip(ours, theirs, strict=True):
+            one = np.array(one)
+            np.testing.assert_allclose(one, same, rtol=0, atol=1e-9 * max(1, np.abs(one).max()))
+    friction = slice(layout.rigid.stop, None)
+    np.testing.assert_allclose(other.nominal_parameters[friction], values[friction], rtol=1e-12)
     return other
 
 

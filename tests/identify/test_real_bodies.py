@@ -37,8 +37,13 @@ def uneven(centre, products=(0.0, 0.0, 0.0)):
     return values | {f"platform.I{pair}": own + by for pair, own, by in pairs}
 
 
-def recorded(values, seed=0):
-    scenario = identify.load_scenario("quick", renderer="statistical", plant={"values": values})
+SHORT = {"duration_s": 4.0, "candidates": 2}
+
+
+def recorded(values, seed=0, motion=None):
+    scenario = identify.load_scenario(
+        "quick", renderer="statistical", plant={"values": values}, excitation=motion or {}
+    )
     setup = identify.set_up(scenario, seed)
     return setup, setup.run()
 
@@ -46,7 +51,7 @@ def recorded(values, seed=0):
 @pytest.mark.slow
 def test_a_cause_acts_on_the_model_as_the_parameter_of_a_full_body_does():
     """Torques as changes of the commands, against the derivatives of a model with full bodies."""
-    _, record = recorded({})
+    _, record = recorded({}, motion=SHORT)
     asked = asked_of(record, None, None)
     problem = output_error_problem(asked.records, asked.side, asked.settings).driven_by_commands()
     run = replace(problem.runs[0], groups=None)
@@ -188,7 +193,7 @@ def test_changes_by_a_load_are_those_of_its_body_put_on_the_platform():
 
 
 def test_bodies_and_values_that_there_are_not_are_refused_in_one_line():
-    scenario = identify.load_scenario("quick", renderer="statistical")
+    scenario = identify.load_scenario("quick", renderer="statistical", excitation=SHORT)
 
     def refused(words, **changes):
         with pytest.raises(ScenarioError, match=words):

@@ -214,7 +214,7 @@ def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_w
         assert sorted(Path(folder).rglob("*")) == before
         return one_line(capsys.readouterr().err)
 
-    monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 0.5)
     for address, why in (another_program, ("tcp://127.0.0.1:1", ""), ("nonsense", "")):
         error = unchanged(".", "--scheduler", address)
         assert f"no Dask scheduler answers at {address}" in error

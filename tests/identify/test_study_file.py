@@ -436,6 +436,7 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
         "renderer": "analytic",
         "timing.latency_s": 0.004,
         "timing.latency_jitter_s": 0.001,
+        "excitation.duration_s": 3.0,
         "validation.duration_s": 0.5,
         "validation.count": 1,
         "identification.method": "command_driven",
