@@ -67,8 +67,8 @@ plt.show()
 # %%
 # The pose and its covariance
 # ---------------------------
-# A measurement states the covariance of its pose. It is computed from the noise of the grey values, propagated through
-# the fit of the ellipses, the triangulation, and the fit of the pose.
+# A measurement states the covariance of its pose. The noise of the grey values is known. It becomes noise of the ellipses'
+# centres, then of the triangulated points, and then of the pose, and the covariance states the last of these.
 
 error = measured.pose - pose
 claimed = np.sqrt(np.diag(measured.covariance))
@@ -114,9 +114,11 @@ plt.show()
 # Before its first measurement the sensor determines the frames of base and platform and the positions of the stickers,
 # from images of the platform at home. This is called *teaching*. The error of teaching is the same in every later
 # frame. Repeated measurements do not show it, and the covariance above does not contain it. A measurement states the
-# covariance of this error separately:
+# covariance of this error separately. In the mean of 300 errors the noise is nearly gone, so that mainly the error of
+# teaching is left. It is one draw of a random error: of the six numbers, about two thirds should be smaller than the
+# claimed standard deviation, and hardly any larger than twice of it.
 
 taught = np.sqrt(np.diag(measured.common_covariance))
 offset = poses.mean(axis=0) - pose
-print("claimed error of teaching [µm, µrad]:", np.round(1e6 * taught, 2))
-print("mean of 300 errors        [µm, µrad]:", np.round(1e6 * offset, 2))
+print("claimed standard deviation [µm, µrad]:", np.round(1e6 * taught, 2))
+print("mean of 300 errors         [µm, µrad]:", np.round(1e6 * offset, 2))
