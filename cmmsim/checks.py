@@ -31,6 +31,7 @@ NAME = r"^\w[\w .+-]*$"
 LONGEST_NAME = 60
 # Largest number of problems of one file in a message.
 MOST_COMPLAINTS = 8
+VALID = ", valid are "  # between an unknown key and the list of valid ones
 # Control characters other than tab and newline.
 _UNWANTED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 # Pattern of strings and comments of TOML. It never backtracks, so a search takes linear time.
@@ -143,7 +144,14 @@ def checked(model: type[M], content: dict[str, Any], source: str, error_class: t
         return model.model_validate(content)
     except ValidationError as error:
         problems = error.errors()
-        shown = [_explain(details, model) for details in problems[:MOST_COMPLAINTS]]
+        shown: list[str] = []
+        listed: set[str] = set()
+        for details in problems[:MOST_COMPLAINTS]:
+            problem = _explain(details, model)
+            # the valid keys of a section are listed once
+            key, _, valid = problem.partition(VALID)
+            shown.append(key if valid in listed else problem)
+            listed |= {valid} - {""}
         more = len(problems) - len(shown)
         shown += [f"and {more} more"] if more else []
         raise error_class(f"{source}: {'; '.join(shown)}") from error
@@ -197,9 +205,7 @@ def _explain(error: Any, model: type[BaseModel]) -> str:
     """Describe one problem that pydantic found."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
-        return (
-            f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
-        )
+        return f"unknown key {where!r}{VALID}{', '.join(_valid_keys(error['loc'][:-1], model))}"
     if error["type"] == "missing":
         return f"{where}: {error['msg']}"  # the input, the whole section, is not shown
     if error["type"] == "value_error":

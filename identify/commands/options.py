@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from cmmsim.allowed_plugins import ALLOWED, allow_plugin, is_plugin_name
+from identify.commands.kinds_of_files import check_kind
 from identify.errors import ScenarioError
 from identify.files.atomic import write_text
 from identify.files.run_folder import as_json
@@ -60,12 +61,25 @@ def completion(kind: str) -> Callable[[str], list[str]]:
     return offered
 
 
+def of_kind(kind: str) -> Callable[[str | None], str | None]:
+    """Return a callback that refuses a file that is not of a kind. See `check_kind`."""
+
+    def check(name: str | None) -> str | None:
+        if name is not None:
+            check_kind(kind, name)
+        return name
+
+    return check
+
+
 def named(kind: str, help_: str | None = None, **more: Any) -> Any:
     """Return the argument for a built-in name of a kind or the path of a TOML file."""
     said = (
         help_ or f"Built-in {kind} ({', '.join(built_in_names(kind))}), or the path of a TOML file."
     )
-    return typer.Argument(help=said, autocompletion=completion(kind), **more)
+    return typer.Argument(
+        help=said, autocompletion=completion(kind), callback=of_kind(kind), **more
+    )
 
 
 def new_folder(default: str) -> Any:
@@ -89,6 +103,7 @@ RobotOption = Annotated[
         help="Robot in place of the scenario's robot.",
         show_default="scenario's",
         autocompletion=completion("robot"),
+        callback=of_kind("robot"),
     ),
 ]
 NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
@@ -217,6 +232,7 @@ def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) ->
 
     Raises ScenarioError if there is no such scenario or if a setting is invalid.
     """
+    check_kind("scenario", name)
     chosen = {} if robot is None else {"robot": robot}
     return load_scenario(name).with_overrides(chosen | parse_settings(settings))
 

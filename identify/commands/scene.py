@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from identify.commands.kinds_of_files import KEYS
 from identify.commands.options import Plugins, Quiet
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import print_warnings, terminal_progress
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
 PICTURES = (".png", ".pdf", ".svg")
 PAGES = (".html", ".htm")
 SENSOR = "ctrack780"  # shown with a robot that is named alone
-# Keys of which one is enough to tell a robot file and a sensor file.
-ROBOT_KEYS = {"parameters", "legs", "family"}
-SENSOR_KEYS = {"rig", "stickers", "based_on"}
 
 
 def replay(
@@ -187,11 +185,12 @@ def kind_of(name: str) -> str:
         valid = f"robots {', '.join(built_in_robots())}, sensors {', '.join(built_in_names())}"
         raise ScenarioError(f"there is no robot, sensor or file {name!r}; built in: {valid}")
     content = parse_toml(read_text(name, name, ScenarioError), name, ScenarioError)
-    if ROBOT_KEYS & content.keys():
-        return "robot"
-    if SENSOR_KEYS & content.keys():
-        return "sensor"
+    shown = ("robot", "sensor")
+    for kind in shown:
+        if KEYS[kind] & content.keys():
+            return kind
+    robot, sensor = (", ".join(sorted(KEYS[kind])) for kind in shown)
     raise ScenarioError(
-        f"{name} is neither a robot nor a sensor: a robot has {', '.join(sorted(ROBOT_KEYS))}, a "
-        f"sensor {', '.join(sorted(SENSOR_KEYS))}; it has {', '.join(content) or 'nothing'}"
+        f"{name} is neither a robot nor a sensor: a robot has {robot}, a sensor {sensor}; it has "
+        f"{', '.join(content) or 'nothing'}"
     )

@@ -12,6 +12,7 @@ from identify.commands.options import (
     JsonFile,
     Plugins,
     completion,
+    of_kind,
     parse_settings,
     tell,
 )
@@ -36,6 +37,7 @@ def study(
             help="Built-in study (--list), or the path of a TOML file.",
             show_default=False,
             autocompletion=completion("study"),
+            callback=of_kind("study"),
         ),
     ] = None,
     out: Annotated[

@@ -170,13 +170,23 @@ DOTTED = (
 )
 
 
+VALID = "; valid names"  # between an unknown key and the list of valid ones
+
+
 def one_line(error: ValidationError, model: type[BaseModel]) -> str:
     """Return all errors of a validation in one line.
 
-    Each error has its key, value and unit and, for a wrong name, the valid names.
+    Each error has its key, value and unit. The valid names are listed once for all wrong names of a
+    table.
     """
     errors = error.errors()
-    complaints = [_complaint(details, model) for details in errors[:MOST_COMPLAINTS]]
+    complaints = []
+    listed: set[str] = set()
+    for details in errors[:MOST_COMPLAINTS]:
+        complaint = _complaint(details, model)
+        name, _, valid = complaint.partition(VALID)
+        complaints.append(name if valid in listed else complaint)
+        listed |= {valid} - {""}
     more = len(errors) - len(complaints)
     return "; ".join(complaints + ([f"and {more} more"] if more else []))
 
@@ -209,7 +219,7 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
     fields = owner.model_fields if owner is not None else {}
     if details["type"] == "extra_forbidden":
         within = f" in [{'.'.join(path[:-1])}]" if len(path) > 1 else ""
-        return f"unknown key {key!r}; valid names{within}: {', '.join(fields)}"
+        return f"unknown key {key!r}{VALID}{within}: {', '.join(fields)}"
     if details["type"] == "value_error":
         return f"{key}: {details['ctx']['error']}" if key else str(details["ctx"]["error"])
     if details["type"] == "missing":
