@@ -7,6 +7,7 @@ from pathlib import Path
 import cmmsim
 from identify.experiment.run import excitation_run
 from identify.experiment.sensor_in_loop import teach
+from identify.files.atomic import write_files
 from identify.files.run_folder import RunFolder, load_result, result_json
 from identify.progress import Progress
 from identify.record import recording
@@ -98,12 +99,17 @@ def report(
 
     began = time.perf_counter()
     path = RunFolder(folder).result
+    if seconds:
+        # The report shows the durations of all stages before it, in their order.
+        result = load_result(path)
+        result["seconds"] = {**seconds, **result["seconds"]}
+        write_files({path: result_json(result)})
 
     # A report marks a finished run, so result.json must not be written after the report.
     def timed_result() -> dict[Path, bytes]:
         result = load_result(path)
         now = time.perf_counter()
-        result["seconds"] |= {**(seconds or {}), "report": now - began}
+        result["seconds"]["report"] = now - began
         if run_began is not None:
             result["seconds"]["total"] = now - run_began
         return {path: result_json(result)}

@@ -44,11 +44,15 @@ def converged(cost: float, new_cost: float, change: float, criteria: StopCriteri
     """
     gain = (cost - new_cost) / cost
     if gain <= criteria.cost_tolerance:
-        return f"cost changed by {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} (eq. 35)"
+        return (
+            f"the relative change of the cost {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} "
+            "(identification.cost_tolerance, eq. 35 of the paper)"
+        )
     if change <= criteria.parameter_tolerance:
         return (
-            f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} (eq. "
-            "35)"
+            f"the relative change of the parameters {change:.2e} <= tol2 = "
+            f"{criteria.parameter_tolerance:g} (identification.parameter_tolerance, eq. 35 of the "
+            "paper)"
         )
     return ""
 

@@ -266,9 +266,10 @@ def sensor_table(result: dict[str, Any]) -> Table:
 
 
 def seconds_table(result: dict[str, Any]) -> Table:
-    """Return the time of each stage."""
-    rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
-    return Table("Time of the stages", ("stage", "seconds"), rows, folded=True)
+    """Return the time of each stage before the report."""
+    seconds = result.get("seconds", {}).items()
+    rows = tuple((name, number(v)) for name, v in seconds if name not in ("report", "total"))
+    return Table("Time of the stages before the report", ("stage", "seconds"), rows, folded=True)
 
 
 def estimator_table(result: dict[str, Any], recorded: str) -> Table:
@@ -333,8 +334,9 @@ def common_scale_sentence(identification: Mapping[str, Any]) -> str:
     shared = scale["shared"]
     known = sum(bool(one["identifiable"]) for one in identification["parameters"].values())
     said = (
-        f"The common scale, as {scale['gain']} shows it, is known to {100 * scale['std']:.2g} %: "
-        f"{len(shared) + 1} of the {known} identified parameters share its error"
+        f"The common scale, as the proportional gain {scale['gain']} shows it, is known to "
+        f"{100 * scale['std']:.2g} %: {len(shared) + 1} of the {known} identified parameters share "
+        "its error"
     )
     errors = found_errors(identification)
     if errors is None:

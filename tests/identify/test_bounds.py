@@ -113,7 +113,10 @@ def test_a_region_where_the_model_cannot_run_is_stepped_around():
 
 
 def test_the_stop_reason_names_the_criterion():
-    reasons = {(1e-3, 1e-12, 50): "tol1 = 0.001 (eq. 35)", (1e-15, 1e-15, 2): "max_iterations = 2"}
+    reasons = {
+        (1e-3, 1e-12, 50): "tol1 = 0.001 (identification.cost_tolerance",
+        (1e-15, 1e-15, 2): "max_iterations = 2",
+    }
     for criteria, says in (reasons | {(0.0, 0.0, 200): "no step lowers the cost"}).items():
         found = minimise(
             exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(*criteria)

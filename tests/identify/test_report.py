@@ -17,9 +17,11 @@ from matplotlib.image import imread
 
 import identify
 from dynamics.kinematics.platform import Chart
+from identify import pipeline
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import figure_bytes
-from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
+from identify.files.run_folder import RunFolder, load_result, rms_figures, rms_row, save_result
+from identify.progress import SilentProgress
 from identify.record.frame_times import missing_rows
 from identify.record.model_runs import build_model_run
 from identify.record.recording import read, write
@@ -718,6 +720,17 @@ def test_speed_stands_beside_the_goals_and_no_machine_misses_one(result):
     assert all(goal.passed for goal in check_goals(result))
     result["seconds"]["total"] = 3500.0
     assert tables.goals_table(result).rows[-1][:2] == ("whole run", "3500 s")
+
+
+def test_the_report_lists_the_times_of_all_stages_before_it(run_folder, monkeypatch):
+    shown = []
+
+    def written(folder, *_):
+        shown.extend(tables.seconds_table(load_result(RunFolder(folder).result)).rows)
+
+    monkeypatch.setattr("identify.reporting.report.write_report", written)
+    pipeline.report(run_folder.path, SilentProgress(), 0.0, {"excite": 2.5, "teach": 1.5})
+    assert shown == [("excite", "1"), ("teach", "1.5"), ("record", "30")]
 
 
 def test_parameter_is_inside_by_five_percent_or_three_deviations():
