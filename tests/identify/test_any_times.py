@@ -102,10 +102,14 @@ def test_a_form_is_identified_as_the_record_on_the_grid_is(form):
 
 
 @pytest.mark.slow
-def test_a_cause_is_named_in_a_record_at_any_times():
-    """The zero of joint 2 is off in a plant whose record begins in motion."""
-    scenario = scenario_of(**{"plant.joint_zero_error_rad": [0, 5e-4, 0, 0, 0, 0]})
-    telemetry = logged(*run_plant(scenario, 0, duration_s=10.0))
+@pytest.mark.parametrize(
+    ("seconds", "most"), [(5.0, 1.5e-4), pytest.param(10.0, 1e-4, marks=pytest.mark.thorough)]
+)
+def test_a_cause_is_named_in_a_record_at_any_times(seconds, most):
+    """The zero of joint 2 is off in a plant whose record begins in motion, after 1.5 s."""
+    true = 5e-4
+    scenario = scenario_of(**{"plant.joint_zero_error_rad": [0, true, 0, 0, 0, 0]})
+    telemetry = logged(*run_plant(scenario, 0, duration_s=seconds))
     telemetry = with_rows(telemetry, slice(90, None))
     telemetry = at_times(telemetry, telemetry.poses.time - telemetry.poses.time[0])
     record = record_from(telemetry)
@@ -113,7 +117,7 @@ def test_a_cause_is_named_in_a_record_at_any_times():
     found = diagnose(record)
     (first,) = found.findings
     assert first.name == "zero of joint 2"
-    assert abs(first.sizes[0].value - 5e-4) < CHANCE * first.sizes[0].std < 1e-4
+    assert abs(first.sizes[0].value - true) < CHANCE * first.sizes[0].std < most
     assert not found.left.significant
 
 

@@ -140,7 +140,9 @@ def test_drawn_zeros_are_those_of_the_seed_of_the_geometry():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["closed_loop", "command_driven"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("closed_loop", marks=pytest.mark.thorough), "command_driven"]
+)
 def test_zeros_and_scale_with_a_prior_are_estimated_and_intervals_hold(method):
     """Beside friction and gains, which are off by many deviations without the prior."""
     true = {"plant.joint_zero_error_rad": ZEROS, "plant.command_scale": 1.0015}

@@ -53,7 +53,13 @@ def drawn(scenario, seed, seconds):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [pytest.param(60.0, marks=pytest.mark.thorough), 29.0])
-@pytest.mark.parametrize(("method", "wider"), [("command_driven", 1.05), ("closed_loop", 1.6)])
+@pytest.mark.parametrize(
+    ("method", "wider"),
+    [
+        ("command_driven", 1.05),
+        pytest.param("closed_loop", 1.6, marks=pytest.mark.thorough),
+    ],
+)
 def test_a_record_with_half_a_frame_of_jitter_is_identified_as_well_as_one_without(
     method, wider, rate_hz
 ):

@@ -94,7 +94,7 @@ def test_whitened_residuals_have_a_covariance_of_one():
 
 
 @pytest.mark.parametrize(
-    "method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)]
+    "method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.thorough)]
 )
 def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them(method):
     """Without being told of them, the model seems wrong. Told, it is right, estimates lie within
@@ -131,7 +131,7 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)]
+    "method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.thorough)]
 )
 def test_poses_of_unseen_motion_are_predicted_with_what_the_record_taught(method):
     """The same errors lead the servo beside another motion, too. What the record taught of them

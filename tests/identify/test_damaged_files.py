@@ -99,7 +99,7 @@ def test_a_folder_is_for_one_process_and_a_lock_that_was_left_or_is_anothers_hol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [20, pytest.param(500, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("count", [10, pytest.param(500, marks=pytest.mark.thorough)])
 def test_damaged_files_of_a_run_are_refused_in_one_line_or_change_no_number(
     run_folder, tmp_path, capsys, count
 ):

@@ -59,15 +59,15 @@ def record(scenario):
 
 @pytest.fixture(scope="module")
 def ensemble():
-    """Results of eight experiments that differ by noise, weighing and starting guess, which errs by
+    """Results of six experiments that differ by noise, weighing and starting guess, which errs by
     as much as it says, 30 % of each parameter; the last loses frames."""
     found = []
-    for seed in range(8):
+    for seed in range(6):
         rng = np.random.default_rng([seed, 1])
         guess = np.maximum(1 + 0.3 * rng.standard_normal(len(NAMES)), 0.1) * truth()
         prior = {name: {"value": guess[k], "std": 0.3 * truth()[k]} for k, name in enumerate(NAMES)}
         scenario = quick(**{"identification.prior": prior})
-        lost = set(range(200, 215)) | {300, 420} if seed == 7 else ()
+        lost = set(range(200, 215)) | {300, 420} if seed == 5 else ()
         record, _ = run_plant(scenario, seed, lost=lost)
         record.attrs["scale_anchor_value"] += 0.005 * rng.standard_normal()
         found.append(identify(record, rss6(), scenario))
@@ -144,8 +144,8 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
     on average. With exactly known parameters the plant strays by what the servo lets through of the
     noise alone."""
     ratios, exact = [], []
-    for unseen in range(12):
-        result, rng = ensemble[unseen // 2], np.random.default_rng(unseen)
+    for unseen in range(6):
+        result, rng = ensemble[unseen], np.random.default_rng(unseen)
         record, plant = run_plant(
             scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0
         )
@@ -157,7 +157,7 @@ def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
             found.append(predict_poses(run, *model, rng).normalised_squared_error(plant.pose))
     assert 0.8 < np.mean(ratios) < 1.2, ratios
     assert np.mean(exact) == pytest.approx(1.0, abs=0.1), exact
-    for experiment, limits in ((1, [3e-6, 15e-6]), (7, [5e-6, 25e-6])):
+    for experiment, limits in ((1, [3e-6, 15e-6]), (5, [5e-6, 25e-6])):
         assert np.all(
             unseen_error(scenario, ensemble[experiment].estimate) < np.repeat(limits, 3)
         ), experiment

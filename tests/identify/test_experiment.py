@@ -39,7 +39,7 @@ from tests.identify.synthetic import (
     truth,
 )
 
-SHORT = {"excitation.duration_s": 1.0, "excitation.candidates": 2}
+SHORT = {"renderer": "analytic", "excitation.duration_s": 1.0, "excitation.candidates": 2}
 
 
 class Told:
@@ -140,7 +140,6 @@ def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sens
 
 
 @pytest.mark.slow
-@pytest.mark.rendering
 def test_run_experiment_returns_what_it_writes_with_the_noise_of_its_seed(tmp_path, sensor):
     record = run_experiment(quick(**SHORT), seed=2, path=tmp_path / "experiment.nc")
     with xr.open_dataset(tmp_path / "experiment.nc") as stored:

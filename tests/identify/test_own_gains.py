@@ -57,7 +57,7 @@ def with_unequal_gains(name: str) -> Robot:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["rss6", "ups6"])
+@pytest.mark.parametrize("name", ["rss6", pytest.param("ups6", marks=pytest.mark.thorough)])
 def test_gains_of_each_joint_are_identified_with_intervals(name):
     """Of a robot that turns and of one that slides, from one record; chi-square of the errors."""
     robot, scenario = with_unequal_gains(name), each()

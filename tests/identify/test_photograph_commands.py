@@ -26,6 +26,14 @@ def pictures(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def taught(pictures, tmp_path_factory):
+    """The file of what `cmmsim teach` learns of the pictures, not to be changed."""
+    path = tmp_path_factory.mktemp("taught") / "of_pictures"
+    assert teach(pictures, path, "--quiet") == 0
+    return path / "taught.json"
+
+
 def teach(pictures, out, *more):
     sides = pictures / "left", pictures / "right"
     return command("teach", *sides, "--sensor", "ctrack780", "--out", out, *more)
@@ -85,14 +93,13 @@ def linked(pictures, folder):
 
 
 @pytest.mark.slow
-def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, tmp_path, capfd):
-    assert teach(pictures, tmp_path / "taught", "--quiet") == 0
+def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, taught, tmp_path, capfd):
     linked(pictures, tmp_path)
     for side in ("left", "right"):
         dark = np.full((1536, 2048), 16 if side == "left" else 17, dtype=np.uint8)
         cv2.imwrite(str(tmp_path / side / "999.png"), dark)
     measuring = ("measure", tmp_path / "left", tmp_path / "right", "--sensor", "ctrack780")
-    taught, out = tmp_path / "taught" / "taught.json", tmp_path / "poses.csv"
+    out = tmp_path / "poses.csv"
     assert command(*measuring, "--taught", taught, "--out", out) == 0
     said = capfd.readouterr()
     assert "7 of 8 pairs measured" in said.out
@@ -115,8 +122,9 @@ def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, tmp_path, capfd
     assert "none of 1 pairs has a pose; the first is 999.png: 0 bright spots" in said
     assert not out.exists()
     assert not (tmp_path / "found").exists()
-    taught.write_text("{}")
-    assert command(*measuring, "--taught", taught, "--out", out) == 1
+    wrong = tmp_path / "taught.json"
+    wrong.write_text("{}")
+    assert command(*measuring, "--taught", wrong, "--out", out) == 1
     assert "taught.json is no taught.json of `cmmsim teach`" in one_line(capfd.readouterr().err)
 
 

@@ -2,20 +2,26 @@
 users meet on the way.
 
 What the command line passes on, says and refuses is proved in test_command_line.py, with the stages
-replaced.
+replaced. What figures look like is proved in test_report.py.
 """
 
+import io
 import os
+import pickle
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 
+import matplotlib as mpl
 import pytest
+from PIL import Image
 
 from identify import pipeline
 from identify.files.run_folder import RunFolder, load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read, read_runs
+from identify.reporting.figures.style import STYLE
 from identify.reporting.goals import check_goals
 from identify.scenario import load_scenario
 from identify.setup import Setup
@@ -34,13 +40,46 @@ def cmmsim(*arguments, **environment):
     )
 
 
+@contextmanager
+def mapped_here(workers, function, *tasks, start):
+    """Stand for worker processes, which take seconds to start: what they are given and give is
+    pickled.
+    """
+    counter, *given = start.args
+    start.func(counter, *pickle.loads(pickle.dumps(given)))
+    yield (pickle.loads(pickle.dumps(function(*task))) for task in zip(*tasks, strict=True))
+
+
+def drawn_bare(draw):
+    """Stand for `drawn`: the figure is made, but not laid out."""
+    with mpl.rc_context(STYLE):
+        return draw()
+
+
+def one_pixel(*_):
+    """Stand for the file of a figure."""
+    stream = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(stream, "png")
+    return stream.getvalue()
+
+
+def run_here(folder, *settings):
+    """Run `quick` in this process with some settings; figures are made and not drawn."""
+    words = [word for setting in settings for word in ("--set", setting)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("identify.validation.unseen.mapped", mapped_here)
+        patch.setattr("identify.reporting.report.drawn", drawn_bare)
+        patch.setattr("identify.reporting.report.figure_bytes", one_pixel)
+        patch.setattr("identify.reporting.report.svg_text", lambda *_: "<svg></svg>")
+        assert command("run", "quick", "--out", folder, "--workers", 2, "--quiet", *words) == 0
+    return RunFolder(folder)
+
+
 @pytest.fixture(scope="module")
 def quick_run(tmp_path_factory):
-    """The folder of `cmmsim run quick`, not to be changed."""
+    """The folder of `cmmsim run quick` with short unseen motions, not to be changed."""
     folder = tmp_path_factory.mktemp("quick") / "run"
-    done = cmmsim("run", "quick", "--out", folder)
-    assert done.returncode == 0, done.stderr
-    return RunFolder(folder)
+    return run_here(folder, "renderer=analytic", "validation.duration_s=2.0")
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +95,33 @@ def worst(result, key):
     """Largest position [um] and orientation [urad] error of any axis and unseen run."""
     runs = [run[key] for run in result["validation"]]
     return [max(max(run[figure]) for run in runs) for figure in RMS]
+
+
+@pytest.mark.thorough
+def test_the_command_that_the_readme_begins_with_meets_every_goal(tmp_path):
+    """In processes of its own, with the images and figures of every user."""
+    done = cmmsim("run", "quick", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert missed(load_result(tmp_path / "run" / "result.json")) == []
+
+
+def test_images_of_pyrender_are_measured_in_each_stage(tmp_path):
+    """Two seconds of excitation, which tell few parameters."""
+    short = {
+        "renderer": "pyrender",
+        "excitation.duration_s": 2.0,
+        "excitation.candidates": 2,
+        "identification.max_iterations": 1,
+        "validation.duration_s": 1.0,
+        "validation.count": 1,
+    }
+    pipeline.excite(Setup(quick(**short)), tmp_path, SilentProgress())
+    taught = pipeline.record(tmp_path, SilentProgress())
+    pipeline.identify(tmp_path, SilentProgress())
+    pipeline.validate(tmp_path, SilentProgress(), taught=taught)
+    goals = {goal.name: goal for goal in check_goals(load_result(tmp_path / "result.json"))}
+    for name in ("cameras, position", "cameras, orientation", "lost frames"):
+        assert goals[name].passed, goals[name]
 
 
 def test_a_quick_run_meets_every_goal_and_the_model_is_twenty_times_closer_than_before(result):
