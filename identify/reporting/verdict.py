@@ -205,9 +205,12 @@ def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool
     if goals.RESIDUALS in found:
         size = number(found[goals.RESIDUALS].value, 3)
         limit = number(found[goals.RESIDUALS].limit, 3)
+        # In the loop of the servo, noise also moves the robot, and gives more than its variance.
+        expected = result["identification"]["expected_noise_ratio"] or 0.0
+        moving = ", which also moves the robot," if expected > 1.0 else ""
         parts.append(
-            f"their mean square is {size} times the stated noise, and noise alone gives up to "
-            f"{limit}"
+            f"their mean square is {size} times the stated noise, and noise alone{moving} gives up "
+            f"to {limit}"
         )
     if goals.CHANCE in found:
         chance = share(found[goals.CHANCE].value / 100)

@@ -813,6 +813,8 @@ def test_the_page_says_how_many_quantities_a_motion_shows_and_why_noise_gives_mo
     assert "these 2 + 1 + 37 = 40 quantities up to one common factor, so that 39" in said
     details = [goal.detail for goal in check_goals(result)]
     assert any("1.100 ± 0.040, more than 1 as it also moves the robot" in text for text in details)
+    sentences = " ".join(verdict(result, True).sentences)
+    assert "noise alone, which also moves the robot, gives up to 1.22" in sentences
     found["expected_noise_ratio"] = 1.0
     assert not any("more than 1" in goal.detail for goal in check_goals(result))
 
