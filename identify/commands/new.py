@@ -1,23 +1,31 @@
 """Command ``new``: commented template files that work without changes, with editor schemas."""
 
-import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from identify.commands.help import Command, Commands
+from identify.commands.new_files import (
+    copy_of,
+    known,
+    renamed,
+    say,
+    schema_of,
+    toml_file,
+    with_schema,
+    write_new,
+)
 from identify.commands.options import (
     Quiet,
     RobotArgument,
-    built_in_folder,
     built_in_names,
     completion,
+    of_kind,
 )
 from identify.errors import OutputFolderError
-from identify.files.atomic import write_files
 
 NEW_HELP = """
 Write a commented file to start from: a robot, sensor, scenario, study, or record.
@@ -103,8 +111,8 @@ def robot(
     lengths = {name: value for name, value in given.items() if value is not None}
     try:
         made = _of_lengths(file, like, lengths) if lengths else None
-        text = made or _of_a_workshop(_copy("robot", like, file))
-        _write({_toml(file): text}, read_robot_file)
+        text = made or _of_a_workshop(copy_of("robot", like, file))
+        write_new({toml_file(file): text}, read_robot_file)
     except RobotFileError as error:
         large = [
             f"{name.replace('_', '-')} {value:g} m"
@@ -116,28 +124,57 @@ def robot(
                 f"cannot write {file}: lengths are in m: {', '.join(large)}; are they in mm?"
             ) from error
         raise
-    _say(quiet, file, f"judge it with: cmmsim check {file}")
+    say(quiet, file, f"judge it with: cmmsim check {file}")
 
 
 @new.command(cls=Command)
 def sensor(
-    file: File, like: Annotated[str, _like("sensor")] = "ctrack780", quiet: Quiet = False
+    file: File,
+    like: Annotated[str, _like("sensor")] = "ctrack780",
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="NAME|FILE",
+            help="Robot that the sensor is to see.",
+            show_default="none",
+            autocompletion=completion("robot"),
+            callback=of_kind("robot"),
+        ),
+    ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Write a sensor file: timing, cameras, light and stickers of a built-in sensor, under a name
     of your own.
 
-    Reads nothing of yours. Writes one TOML file.
+    With --robot, the file has the robot's home, a platform on which its legs end, and cameras that
+    see all stickers of the built-in sensor at home. It states these alone. The built-in sensor
+    supplies the rest.
+
+    Reads a robot file, if one is named. Writes one TOML file.
 
     \b
     Examples:
       cmmsim new sensor mine.toml
+      cmmsim new sensor mine.toml --robot pss6
       cmmsim acceptance mine.toml
       cmmsim run quick --set sensor=mine.toml
     """
     from cmmsim.files import read_sensor_file
 
-    _write({_toml(file): _copy("sensor", like, file)}, read_sensor_file)
-    _say(quiet, file, f"test it with: cmmsim acceptance {file}")
+    if robot is None:
+        write_new({toml_file(file): copy_of("sensor", like, file)}, read_sensor_file)
+        say(quiet, file, f"test it with: cmmsim acceptance {file}")
+        return
+    from dynamics import load_robot
+    from identify.experiment.fitted_sensor import fitted, fitted_text
+
+    basis = read_sensor_file(known("sensor", like))
+    if basis.based_on is not None:
+        raise OutputFolderError(f"--robot needs a sensor such as {basis.based_on} after --like")
+    text = fitted_text(fitted(basis, load_robot(robot)), toml_file(file).stem, like)
+    write_new({file: with_schema(schema_of("sensor"), text)}, read_sensor_file)
+    say(quiet, file, f"look with: cmmsim show {robot} {file}")
 
 
 @new.command(cls=Command)
@@ -157,9 +194,11 @@ def scenario(
     from identify.scenario import load_scenario
     from identify.scenario.settings_file import starting_toml
 
-    text = starting_toml(load_scenario(_known("scenario", like)))
-    _write({_toml(file): _with_schema(_schema("scenario"), _named(text, file))}, load_scenario)
-    _say(quiet, file, f"run it with: cmmsim run {file}")
+    text = starting_toml(load_scenario(known("scenario", like)))
+    write_new(
+        {toml_file(file): with_schema(schema_of("scenario"), renamed(text, file))}, load_scenario
+    )
+    say(quiet, file, f"run it with: cmmsim run {file}")
 
 
 @new.command(cls=Command)
@@ -189,9 +228,11 @@ def study(
     """
     from identify.studies.study_file import STARTING, load_study
 
-    starting = _with_schema(_schema("study"), _named(STARTING.read_text(encoding="utf-8"), file))
-    _write({_toml(file): starting if like is None else _copy("study", like, file)}, load_study)
-    _say(quiet, file, f"run it with: cmmsim study {file}")
+    starting = with_schema(schema_of("study"), renamed(STARTING.read_text(encoding="utf-8"), file))
+    write_new(
+        {toml_file(file): starting if like is None else copy_of("study", like, file)}, load_study
+    )
+    say(quiet, file, f"run it with: cmmsim study {file}")
 
 
 @new.command(cls=Command)
@@ -268,29 +309,17 @@ def record(
     if logs:
         proposal = proposed(logs, file, chosen, body, commands)
         head = description_text(chosen, named, file.name, proposal.rate_hz or FRAME_RATE_HZ)
-        text = _with_schema(SCHEMA, f"{head}{proposal.text}")
-        _write({beside: text}, lambda path: parse_toml(path.read_text(), str(path), RecordError))
+        text = with_schema(SCHEMA, f"{head}{proposal.text}")
+        write_new({beside: text}, lambda path: parse_toml(path.read_text(), str(path), RecordError))
         asked = f"answer {', '.join(proposal.asked)} in it, " if proposal.asked else ""
-        _say(quiet, beside, f"{asked}fill in the rest, then: cmmsim check {file}")
+        say(quiet, beside, f"{asked}fill in the rest, then: cmmsim check {file}")
         return
     text = description_text(chosen, named, file.name) + columns_text()
-    description = _with_schema(SCHEMA, text)
-    _write({file: table_text(chosen), beside: description}, lambda path: read_own_records([path]))
-    _say(quiet, file, f"fill in its rows and {beside}, then: cmmsim identify --record {file}")
-
-
-def _known(kind: str, like: str) -> str:
-    if like not in built_in_names(kind):
-        raise OutputFolderError(
-            f"unknown {kind} {like!r} after --like; valid: {', '.join(built_in_names(kind))}"
-        )
-    return like
-
-
-def _copy(kind: str, like: str, file: Path) -> str:
-    """Return the text of a built-in file under the name of another file."""
-    text = (built_in_folder(kind) / f"{_known(kind, like)}.toml").read_text(encoding="utf-8")
-    return _with_schema(_schema(kind), _named(text, file))
+    description = with_schema(SCHEMA, text)
+    write_new(
+        {file: table_text(chosen), beside: description}, lambda path: read_own_records([path])
+    )
+    say(quiet, file, f"fill in its rows and {beside}, then: cmmsim identify --record {file}")
 
 
 def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
@@ -301,7 +330,7 @@ def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
     from identify.loop_parameters import loop_settings
     from identify.scenario import load_scenario
 
-    chosen = load_robot(_known("robot", like))
+    chosen = load_robot(known("robot", like))
     valid = [_option(name) for name in lengths_of(chosen.geometry)]
     for name in map(_option, lengths):
         if name not in valid:
@@ -312,8 +341,8 @@ def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
         loop_settings(chosen, given.servo, timing, given.control, given.plant)
         for timing in (given.timing, slower)
     ]
-    made, comments = robot_of_lengths(_toml(file).stem, chosen, lengths, loops)
-    return _with_schema(_schema("robot"), robot_text(made, comments))
+    made, comments = robot_of_lengths(toml_file(file).stem, chosen, lengths, loops)
+    return with_schema(schema_of("robot"), robot_text(made, comments))
 
 
 def _option(length: str) -> str:
@@ -335,57 +364,3 @@ def _of_a_workshop(text: str) -> str:
         text,
         flags=re.MULTILINE,
     )
-
-
-def _named(text: str, file: Path) -> str:
-    """Set the key `name` of a TOML text to the name of its file."""
-    line = f"name = {json.dumps(file.stem)}"
-    # The replacement is a function, because re.sub would interpret backslashes in a string.
-    return re.sub(r"^name = .*$", lambda _: line, text, count=1, flags=re.MULTILINE)
-
-
-def _schema(kind: str) -> Path:
-    return built_in_folder(kind) / f"{kind}.schema.json"
-
-
-def _with_schema(schema: Path, text: str) -> str:
-    """Put a line that names a schema of this installation before a TOML text."""
-    return f"#:schema {schema.resolve().as_uri()}\n{text}"
-
-
-def _toml(file: Path) -> Path:
-    if file.suffix != ".toml" or not re.fullmatch(r"[\w.-]+", file.stem):
-        raise OutputFolderError(
-            f"cannot write {file}: its name must end in .toml, and consist of letters, digits, "
-            "dots, _ and -"
-        )
-    return file
-
-
-def _write(texts: Mapping[Path, str], read: Callable[[Path], Any]) -> None:
-    """Write new files into one folder: all of them, or none.
-
-    `read` checks the first file. Raises OutputFolderError if a file exists, and the errors of
-    `read`, for example for an invalid name.
-    """
-    for path in texts:
-        if path.exists():
-            raise OutputFolderError(
-                f"{path} exists already and is not replaced; name another file, or remove it"
-            )
-    first = next(iter(texts))
-
-    def check(temporary: Path) -> None:
-        try:
-            read(temporary)
-        except Exception as error:
-            # The user knows the file by the name that it will have.
-            error.args = (str(error).replace(temporary.name, first.name),)
-            raise
-
-    write_files({path: text.encode() for path, text in texts.items()}, parents=True, check=check)
-
-
-def _say(quiet: bool, file: Path, further: str) -> None:
-    if not quiet:
-        typer.echo(f"{file}; {further}")

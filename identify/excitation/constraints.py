@@ -23,6 +23,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.measuring.observation import GRAZING
@@ -43,8 +44,26 @@ from identify.trajectory import FourierTrajectory, box_of
 STICKERS_A_PLANE = 4
 
 PLANES = "ABC"
+# Remedy for a plane of which both cameras see too few stickers at home.
+MOVE_RIG = (
+    "move rig.position or rig.target of the sensor; cmmsim show ROBOT SENSOR --png FILE shows what "
+    "the cameras see, and cmmsim new sensor FILE --robot ROBOT places them"
+)
 
 CONDITIONING = "conditioning"
+
+
+def seen_by_plane(sight: SightLines, home: Array) -> dict[str, tuple[NDArray[np.int_], int]]:
+    """Return the indices of the visible stickers at home, and the needed number, of each plane."""
+    visible = sight.visible(home)
+    planes = {}
+    for index, plane in enumerate(PLANES):
+        on_plane = sight.platform.plane_index == index
+        planes[plane] = (
+            np.flatnonzero(visible & on_plane),
+            min(STICKERS_A_PLANE, int(on_plane.sum())),
+        )
+    return planes
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
@@ -57,16 +76,12 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
         _shares_function(sight, range(len(sight.platform.sticker_ids)))(home)
     ).reshape(-1, 2, 3)
     worst = np.abs(shares).max(axis=(1, 2))
-    visible = sight.visible(home)
     chosen: list[int] = []
-    for index, plane in enumerate(PLANES):
-        on_plane = sight.platform.plane_index == index
-        seen = np.flatnonzero(visible & on_plane)
-        needed = min(STICKERS_A_PLANE, int(on_plane.sum()))
+    for plane, (seen, needed) in seen_by_plane(sight, home).items():
         if len(seen) < needed:
             raise TrajectoryError(
                 f"visibility: {len(seen)} stickers of plane {plane} are visible to both cameras at "
-                f"the home pose, but {needed} are needed"
+                f"the home pose, but {needed} are needed: {MOVE_RIG}"
             )
         # With a stable sort, the choice among equally good stickers is the same on all machines.
         chosen += seen[np.argsort(worst[seen], kind="stable")][:needed].tolist()

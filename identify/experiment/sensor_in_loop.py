@@ -28,7 +28,10 @@ from identify.scenario.sections import Rig
 # homes of this platform and of the robot.
 OFF_PLATFORM_M = 0.05
 # Next step if the platform of the sensor is not that of the robot.
-OWN_SENSOR = "cmmsim new sensor FILE writes one to change, and --set sensor=FILE names it"
+OWN_SENSOR = (
+    "cmmsim new sensor FILE --robot ROBOT writes one that fits; --set sensor=FILE names it, in "
+    'Python load_scenario(..., sensor="FILE")'
+)
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class SensorPlan:
     @property
     def sight(self) -> SightLines:
         """Stickers and cameras, which determine the stickers that are visible."""
-        return _sight(self.file)
+        return sight_lines(self.file)
 
     def covariance(self, pose: Array) -> Array:
         """Return the covariance (6, 6) [m, rad] that the sensor states for a pose (6,) at rest."""
@@ -151,7 +154,7 @@ def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
         )
 
 
-def _sight(file: SensorFile) -> SightLines:
+def sight_lines(file: SensorFile) -> SightLines:
     """Return the stickers of the platform and the cameras of a sensor file."""
     return SightLines(marked_body("platform", file.platform), *rig_from_file(file.rig))
 
@@ -161,7 +164,7 @@ def _covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
     """Return the covariance that a sensor states for a pose. It is cached for rows of a study."""
     file = SensorFile.model_validate_json(file_json)
     sensor = cmmsim.Sensor(file, 0, method, renderer="analytic")
-    return stated_covariance(sensor, _sight(file), np.array(pose))
+    return stated_covariance(sensor, sight_lines(file), np.array(pose))
 
 
 class PoseSensor(Protocol):

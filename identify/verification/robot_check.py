@@ -18,9 +18,15 @@ from dynamics.errors import RobotFileError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
+from identify.excitation.constraints import MOVE_RIG, seen_by_plane
 from identify.experiment.law_in_loop import feedback
 from identify.experiment.leg_bodies import robot_meshes
-from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, OWN_SENSOR, platform_distances
+from identify.experiment.sensor_in_loop import (
+    OFF_PLATFORM_M,
+    OWN_SENSOR,
+    platform_distances,
+    sight_lines,
+)
 from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation
@@ -319,7 +325,7 @@ def check_meshes(robot: Robot) -> Iterator[Finding]:
 
 
 def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
-    """Check whether the platform in a sensor file is the robot's platform."""
+    """Check whether the platform in a sensor file is the robot's, and can be seen at home."""
     outside, away = platform_distances(robot, file)
     leg = int(np.argmax(outside))
     limit = OFF_PLATFORM_M
@@ -328,7 +334,7 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
     if most <= 0:
         text = f"all legs end on the platform that sensor {sensor} sees"
     elif most > limit:
-        text += f": {OWN_SENSOR}"
+        text += f": move platform.cuts or planes of the sensor outwards; {OWN_SENSOR}"
     yield Finding(
         "sensor's platform", most <= limit, most, text, limit=limit, unit="m", leg=leg + 1
     )
@@ -337,3 +343,13 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
         home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
         text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
     yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")
+    planes = seen_by_plane(sight_lines(file), robot.home_pose)
+    # the plane with the fewest stickers beyond the needed number
+    plane = min(planes, key=lambda name: len(planes[name][0]) - planes[name][1])
+    seen, needed = planes[plane]
+    text = f"both cameras of sensor {sensor} see {len(seen)} stickers of plane {plane} at home"
+    if len(seen) < needed:
+        text += f": {MOVE_RIG}"
+    yield Finding(
+        "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
+    )

@@ -9,12 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cmmsim.files import read_sensor_file
+from cmmsim.files.rig_and_bodies import marked_body
 from dynamics import Robot, load_robot
 from dynamics.robot_file import parsed_robot
 from identify.commands import run_stages
 from identify.commands.help import BEYOND_LIMIT
 from identify.commands.options import built_in_names
 from identify.errors import EstimationError, ScenarioError
+from identify.experiment.fitted_sensor import fitted
 from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
 from identify.setup import Setup
@@ -175,7 +178,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
     )
     said = one_line(capfd.readouterr().err)
     assert (
-        "2 of 22 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+        "2 of 23 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
         "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "
@@ -198,9 +201,42 @@ def test_a_robot_that_the_sensor_does_not_see_is_told_how_to_get_a_sensor_of_its
         update={"platform": seen.platform.model_copy(update={"home": (0.0, 0.0, 0.4, 0, 0, 0)})}
     )
     where = ", ".join(f"{value:.4g}" for value in robot.home_pose)
-    with pytest.raises(ScenarioError, match="cmmsim new sensor FILE writes one to change"):
+    with pytest.raises(ScenarioError, match="cmmsim new sensor FILE --robot ROBOT writes one"):
         check_platform(robot, away, "mine")
     found = {one.check: one for one in about_sensor(robot, "mine", away)}
     assert not found["sensor's home"].ok
     assert f"must be near [{where}]; cmmsim new sensor FILE" in found["sensor's home"].text
     assert "cmmsim new sensor" not in found["sensor's platform"].text
+
+
+def test_a_sensor_that_looks_past_the_platform_fails_the_check_with_its_remedy():
+    robot = load_robot("ups6")
+    file = load_scenario("quick").sensor_file()
+    rig = file.rig.model_copy(update={"target": (0.3, 0.0, 0.9)})
+    past = file.model_copy(update={"rig": rig})
+    for sensor, sees in ((file, True), (past, False)):
+        found = {one.check: one for one in about_sensor(robot, "mine", sensor)}["visible stickers"]
+        assert (found.ok, found.limit) == (sees, 4)
+        assert ("move rig.position or rig.target" in found.text) != sees
+
+
+def test_a_sensor_made_for_a_robot_sees_its_platform_and_holds_its_legs():
+    """The robot is ups6 with twice the platform and the base, half a metre higher."""
+    ups6 = load_robot("ups6")
+    large = {name: 2 * getattr(ups6.geometry, name) for name in ("platform_joints", "base_joints")}
+    home = ups6.home_pose + np.array([0, 0, 0.5, 0, 0, 0])
+    robot = SimpleNamespace(name="large", home_pose=home, geometry=SimpleNamespace(**large))
+    file = read_sensor_file("ctrack780")
+    with pytest.raises(ScenarioError, match=r"platform joint \d of large is 0\.2"):
+        check_platform(robot, file, "ctrack780")
+    made = fitted(file, robot)
+    assert all(one.ok for one in about_sensor(robot, "mine", made))
+    assert np.array(made.base.planes.A.point)[2] == pytest.approx(0.18 + 0.5)
+    assert marked_body("base", made.base).nominal[:, 0].min() > large["base_joints"][:, 0].max()
+
+
+def test_a_sensor_made_for_a_built_in_robot_is_the_built_in_sensor(tmp_path):
+    mine = tmp_path / "mine.toml"
+    assert command("new", "sensor", mine, "--robot", "rss6", "--quiet") == 0
+    own = {"name": "ctrack780", "based_on": None}
+    assert read_sensor_file(mine).model_copy(update=own) == read_sensor_file("ctrack780")
