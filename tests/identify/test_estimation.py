@@ -242,7 +242,7 @@ def test_a_record_that_hardly_moves_is_called_poorly_conditioned(scenario, ensem
     plain = ensemble[0]
     assert plain.conditioning.poses_alone < POOR
     few = scenario.with_overrides({"identification.max_iterations": 5})
-    little = identify(run_plant(scenario, seed=1, size=0.1)[0], rss6(), few)
+    little = identify(run_plant(scenario, seed=1, size=0.1, duration_s=5.0)[0], rss6(), few)
     assert little.conditioning.poses_alone > POOR
     assert little.conditioning.unshown > plain.conditioning.unshown
     assert any("poorly conditioned" in warning for warning in little.warnings)

@@ -86,6 +86,7 @@ VALIDATE = (
     "identify.stages.validate.predicted_runs",
 )
 REPORT = ("identify.reporting.report.read_run",)
+READ = ("identify.files.limited_process.within_limits",)
 VARIATION = (
     "identify.validation.variation.identify_each",
     "identify.reporting.variation_tables.variation_figure",
@@ -203,9 +204,10 @@ CASES = {
     ),
     "export mjcf": Case("export mjcf ups6 --out {place}/new/ups6.xml"),
     "export urdf": Case("export urdf ups6 --out {place}/new/ups6.urdf"),
-    "import mjcf": Case("import mjcf {made}/ups6.xml --out {place}/new/mine.toml"),
+    "import mjcf": Case("import mjcf {made}/ups6.xml --out {place}/new/mine.toml", once=READ),
     "import urdf": Case(
-        "import urdf {made}/robot.urdf --closures {made}/robot.yaml --out {place}/new/mine.toml"
+        "import urdf {made}/robot.urdf --closures {made}/robot.yaml --out {place}/new/mine.toml",
+        once=READ,
     ),
     "acceptance": Case(
         "acceptance --renderer analytic --standard vdi --out {place}/new/accepted",

@@ -162,7 +162,12 @@ def test_cameras_that_are_not_exact_are_handed_to_the_calibration():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "robot", ["rss6", pytest.param("ups6", marks=pytest.mark.thorough), "delta3", "rrr3"]
+    "robot",
+    [
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("rss6", "ups6")),
+        "delta3",
+        "rrr3",
+    ],
 )
 def test_designed_poses_predict_as_well_as_twice_as_many_random_ones(robot):
     """Judged by poses that neither were chosen from."""
