@@ -11,6 +11,9 @@ one first, in two cases:
 - The ellipse of a sticker in one image differs from the ellipse of an unhidden sticker. If a
   sticker is partly hidden or touches another bright spot, its centre and its rim both move.
 
+A sticker is kept if the slip of a whole plane explains more of the residuals than an error of this
+sticker, as ``slip_kernels`` tells. Both have three degrees of freedom.
+
 Undetected errors of both kinds are then of the size of the noise. At least five stickers must
 remain, and more than were rejected. If three or more of the rejected stickers agree with each other
 on another pose, a group of stickers has moved. The images do not show which group it was, so the

@@ -163,12 +163,14 @@ def worst_sticker(
 ) -> int:  # fmt: skip
     """Return the used sticker with the largest misfit, or -1 if all misfits are NaN.
 
-    ``misfits`` (2,) is filled with the squared misfits of this sticker's place and of its worse
-    ellipse. The misfit of the place is in units of noise, or of the other stickers' residuals if
-    those are larger than noise. All squared residuals together are ``total``.
+    ``misfits`` (3,) is filled with the squared misfits of this sticker's place, of its worse
+    ellipse, and of the worst ellipse of all stickers. The misfit of the place is in units of noise,
+    or of the other stickers' residuals if those are larger than noise. All squared residuals
+    together are ``total``.
     """
     worst = -1
     largest = -1.0
+    misfits[2] = 0.0
     half = np.empty((3, 6))
     entries = np.empty(6)
     inverse = np.empty(6)
@@ -186,6 +188,7 @@ def worst_sticker(
         if len(outlines.shapes):
             for side in range(2):
                 outline = max(outline, outline_misfit(outlines, n, side, transform, places[n]))
+        misfits[2] = max(misfits[2], outline)
         if max(misfit, outline) > largest:
             worst = n
             largest = max(misfit, outline)
@@ -201,10 +204,12 @@ def agree(
 ) -> None:  # fmt: skip
     """Reject stickers one by one until the others agree; see ``solve`` for the parameters.
 
-    At least ``fewest`` stickers must be left. Writes to all columns of ``verdict`` but RIVALS.
+    At least ``fewest`` stickers must be left. A sticker is kept if the slip of a plane explains
+    more of the residuals than an error of this sticker. Writes to all columns of ``verdict`` but
+    RIVALS.
     """
     normal = np.empty((6, 6))
-    misfits = np.zeros(2)
+    misfits = np.zeros(3)
     rejected = 0
     verdict[FIRST] = -1
     verdict[SEEN] = np.sum(seen.used)
@@ -228,10 +233,14 @@ def agree(
         if worst < 0:
             verdict[STATE] = TOO_FEW
             return
-        if (
-            max(misfits[0], misfits[1]) <= limits.largest_misfit
-            and verdict[EXCESS] <= limits.largest_excess
-        ):
+        agreed = max(misfits[0], misfits[1]) <= limits.largest_misfit
+        if limits.exact and not agreed and misfits[2] <= limits.largest_misfit:
+            slip = largest_slip(
+                seen.used, seen.planes, seen.arms, seen.gaps, seen.informations, covariance, normal
+            )
+            # Both are chi-square numbers with three degrees of freedom.
+            agreed = slip > verdict[EXCESS] * misfits[0]
+        if agreed and verdict[EXCESS] <= limits.largest_excess:
             verdict[STATE] = MEASURED
             return
         if rejected == 0:
@@ -366,30 +375,19 @@ def solve_frames(
         first = starts[f]
         last = starts[f + 1]
         own = ObservedStickers(
-            seen.used[first:last],
-            seen.points[first:last],
-            seen.informations[first:last],
-            seen.covariances[first:last],
-            seen.arms[first:last],
-            seen.gaps[first:last],
-            seen.rays[first:last],
-            seen.planes[first:last],
-        )
+            seen.used[first:last], seen.points[first:last], seen.informations[first:last],
+            seen.covariances[first:last], seen.arms[first:last], seen.gaps[first:last],
+            seen.rays[first:last], seen.planes[first:last],
+        )  # fmt: skip
         own_outlines = Outlines(
-            outlines.shapes[first:last],
-            outlines.informations[first:last],
-            outlines.normals[first:last],
-            outlines.radius,
-            outlines.cameras,
-        )
+            outlines.shapes[first:last], outlines.informations[first:last],
+            outlines.normals[first:last], outlines.radius, outlines.cameras,
+        )  # fmt: skip
         taught = places[first:last]
         own_images = Images(
-            images.pixels[first:last],
-            images.spreads[first:last],
-            images.shifts,
-            images.ends,
+            images.pixels[first:last], images.spreads[first:last], images.shifts, images.ends,
             images.cameras,
-        )
+        )  # fmt: skip
         # A tracker extrapolates poses from earlier results, so rounding errors accumulate.
         make_rigid(camera_from_body[f])
         for n in range(last - first):

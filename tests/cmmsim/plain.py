@@ -196,25 +196,25 @@ def _decrease(rows, right):
     return right @ right - rest @ rest
 
 
-def agreeing(kept, fewest, seen, rig, radius, places, normals):
+def agreeing(kept, fewest, seen, rig, radius, places, normals, planes):
     """Stickers of ``kept`` that agree, their fit, and the growth of covariances; None when lost."""
     left_out = 0
     while len(kept) >= fewest and len(kept) > left_out:
-        at, points, covariances = (
-            places[seen.index[kept]],
-            seen.points[kept],
-            seen.covariances[kept],
-        )
-        transform, covariance, squared = fitted(at, points, covariances)
+        own = places[seen.index[kept]], seen.points[kept], seen.covariances[kept]
+        transform, covariance, squared = fitted(*own)
         total, freedom = squared.sum(), 3 * len(kept) - 6
-        misfits = place_misfits(transform, covariance, at, points, covariances)
-        misfits = np.array([m / excess(total - m, freedom - 3) for m in misfits])
+        found = place_misfits(transform, covariance, *own)
+        found = np.array([m / excess(total - m, freedom - 3) for m in found])
+        outline = np.zeros(len(kept))
         if seen.outlines is not None:
-            expected = outlines(rig, transform, at, normals[seen.index[kept]], radius)
-            own = seen.outlines.shapes[:, kept], seen.outlines.covariances[:, kept]
-            misfits = np.maximum(misfits, outline_misfits(*own, expected).max(axis=0))
-        growth = excess(total, freedom)
-        if misfits.max() <= LARGEST_MISFIT and growth <= LARGEST_EXCESS:
+            expected = outlines(rig, transform, own[0], normals[seen.index[kept]], radius)
+            shown = seen.outlines.shapes[:, kept], seen.outlines.covariances[:, kept]
+            outline = outline_misfits(*shown, expected).max(axis=0)
+        misfits, growth = np.maximum(found, outline), excess(total, freedom)
+        agreed = misfits.max() <= LARGEST_MISFIT
+        if outline.max() <= LARGEST_MISFIT and not agreed:
+            agreed = slip(transform, *own, planes[seen.index[kept]])[0] > growth * found.max()
+        if agreed and growth <= LARGEST_EXCESS:
             return kept, transform, covariance, growth
         kept, left_out = np.delete(kept, misfits.argmax()), left_out + 1
     return None
@@ -236,7 +236,7 @@ def few_growth(seen, kept, rejected, transform, covariance, places):
 
 def consistent(seen, rig, radius, places, normals, planes):
     """Stickers that agree: their index, camera_from_body and its covariance; None when lost."""
-    scene = seen, rig, radius, places, normals
+    scene = seen, rig, radius, places, normals, planes
     found = agreeing(np.arange(len(seen.index)), FEWEST, *scene)
     if found is None:
         return None

@@ -195,7 +195,7 @@ def test_the_compiled_solver_finds_what_plain_numpy_finds():
         stickers = np.sort(rng.choice(18, rng.integers(4, 19), replace=False))
         seen = seen_from_home(
             *(rng, stickers, 0.4 * (k % 3 == 0), 0.1 * (k % 5 == 0)),
-            slipped=4e-4 * (k % 8 == 0),
+            slipped=(4e-4 if k % 16 else 2e-5) * (k % 8 == 0),
             apart_px=0.03 * (k % 9 == 0),
         )
         seen = seen if k % 4 else replace(seen, outlines=None)
@@ -283,11 +283,11 @@ def test_a_plane_that_slipped_by_a_few_deviations_widens_the_covariance():
     slip = 1.5e-5  # m, along each axis
     either = CAMERA_FROM_BODY, CAMERA_FROM_BODY @ rigid(np.eye(3), np.full(3, slip))
     usual = solved(seen_from_home(np.random.default_rng(0), ALL))[2]
-    found = []
+    found, left_out = [], 0
     for seed in range(20):
         seen = seen_from_home(np.random.default_rng(seed), ALL, slipped=slip)
         used, move, covariance = solved(seen)
-        assert len(used.index) >= 16
+        left_out += 18 - len(used.index)
         for truth in either:
             turn = Rotation.from_matrix(move[:3, :3] @ truth[:3, :3].T).as_rotvec()
             error = np.append(move[:3, 3] - truth[:3, 3], turn)
@@ -295,6 +295,8 @@ def test_a_plane_that_slipped_by_a_few_deviations_widens_the_covariance():
     before, after = (np.sqrt(found) > 6.0).mean(axis=0)
     assert before > 0.5
     assert after < 0.1
+    # The slip explains the worst sticker better than an error of this sticker does.
+    assert left_out <= 1
 
 
 def test_images_that_are_apart_widen_the_covariance_though_each_sticker_agrees():
