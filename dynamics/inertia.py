@@ -19,6 +19,7 @@ nearest positive definite ones.
 `acceleration_changes` measures the effect on the motion of the robot at random states.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +86,31 @@ def physical_inertias(
                 values[index, CENTRED] = _repaired(kind, stated[index, CENTRED])
             changes[body] = _difference(stated[index], values[index])
     return BodyInertias(values, changes)
+
+
+def described_changes(robot: Robot, parameters: np.ndarray) -> list[str]:
+    """Lines on the bodies whose inertias must be changed for parameters (p,), and the effects.
+
+    Each line states how much the change alters the robot's accelerations.
+    """
+    inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
+    if not inertias.changes:
+        return []
+    effects = acceleration_changes(robot, parameters, inertias.values)
+    said = {}
+    for body, change in inertias.changes.items():
+        # A relative effect of at most 1e-9 is rounding.
+        felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
+        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'no effect on the motion'}"
+    return [f"changed {line}" for line in grouped(said)]
+
+
+def warn_of_changes(robot: Robot) -> None:
+    """Warn of the inertias that an export of the nominal parameters changes."""
+    changes = described_changes(robot, robot.nominal_parameters)
+    if changes:
+        # the caller's caller is the code of the user
+        warnings.warn("; ".join(changes), stacklevel=3)
 
 
 def grouped(texts: dict[str, str]) -> list[str]:

@@ -166,7 +166,7 @@ class Robot(RobotDynamics):
         geometry = self.geometry.moved(floats("deviations", deviations, (count,)))
         return Robot(RobotDescription(self.name, geometry, self.parameter_sets), self.functions_of)
 
-    def with_parameters(self, parameters: ArrayLike) -> Robot:
+    def with_parameters(self, parameters: ArrayLike, name: str = "guess") -> Robot:
         """Robot with other nominal parameters, such as identified ones.
 
         Parameters
@@ -174,6 +174,8 @@ class Robot(RobotDynamics):
         parameters : array_like, shape (p + 3,)
             Dynamic parameters, then lp, li, ld of the joint controller. If each joint has its own
             gains, the shape is (p + 3 n,).
+        name : str
+            Name of the parameter set. The set is also `guess`, which each robot has.
 
         Returns
         -------
@@ -195,7 +197,9 @@ class Robot(RobotDynamics):
         count = len(self.parameter_names)
         values = floats("parameters", parameters, (len(self.layout.names),))
         dynamic = self.layout.check(values[:count])
-        sets = {"guess": ParameterSet(dynamic, values[count:])}
+        named = ParameterSet(dynamic, values[count:])
+        # each robot has a guess, whose values are the nominal ones
+        sets = {"guess": named, name: named}
         return Robot(RobotDescription(self.name, self.geometry, sets), self.functions_of)
 
     def with_full_bodies(self, names: Sequence[str]) -> Robot:

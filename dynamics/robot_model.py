@@ -13,6 +13,7 @@ from dynamics.checks import floats, rows
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.urdf import urdf_texts
 from dynamics.errors import ShapeError
+from dynamics.inertia import warn_of_changes
 from dynamics.kinematics.platform import pose_rate_to_twist
 from dynamics.robot import Robot
 
@@ -175,7 +176,8 @@ class RobotModel:
         Parameters
         ----------
         allow_unphysical_inertia : bool
-            True writes a body that breaks Ix + Iy >= Iz with the nearest possible inertia.
+            True writes a body that breaks Ix + Iy >= Iz with the nearest possible inertia, and
+            warns of it.
 
         Returns
         -------
@@ -187,6 +189,8 @@ class RobotModel:
         ParameterError
             If a body breaks Ix + Iy >= Iz and this is not allowed.
         """
+        if allow_unphysical_inertia:
+            warn_of_changes(self.robot)
         return mjcf_text(
             self.robot, allow_unphysical_inertia=allow_unphysical_inertia, source=self.source
         )
@@ -209,6 +213,8 @@ class RobotModel:
         ParameterError
             As for `mjcf`.
         """
+        if allow_unphysical_inertia:
+            warn_of_changes(self.robot)
         return urdf_texts(self.robot, allow_unphysical_inertia=allow_unphysical_inertia)
 
 

@@ -5,6 +5,7 @@ with a frame `seat_...` of the platform, and the YAML lists these pairs of frame
 a floating joint, or a spherical joint on the first leg. The zero of an actuated joint is that of
 its coordinate, and the zero of a passive joint is at home. A universal joint is two revolute joints
 with a hub between them. A spherical joint is written as a revolute joint, and the YAML names it.
+Limits of torque and rate are placeholders, because a robot file states none.
 """
 
 from xml.sax.saxutils import quoteattr
@@ -18,6 +19,9 @@ from dynamics.kinematics.platform import base_from_platform
 from dynamics.pseudo_inertia import about_centre
 from dynamics.robot import Robot
 
+# URDF requires limits of torque or force and of rate, which a robot file does not state.
+NO_LIMITS = 'effort="1e9" velocity="1e9"'
+COMMENT = "effort and velocity are placeholders: the robot file states no limits"
 # Origin (3,), m, and axes (3, 3) of each link, in the axes of the base.
 Places = dict[str, tuple[np.ndarray, np.ndarray]]
 
@@ -81,7 +85,7 @@ def urdf_texts(
             limit = robot.travel_limit
             coordinate = at_home[part.leg]
             more = f'<dynamics friction="{dry[part.leg]!r}" damping="{viscous[part.leg]!r}"/>'
-            more += f'<limit lower="{-limit!r}" upper="{limit!r}" effort="1" velocity="1"/>'
+            more += f'<limit lower="{-limit!r}" upper="{limit!r}" {NO_LIMITS}/>'
         lines.append(_joint(name, kind, before, part.name, places, axis, coordinate, more))
         if part.last:
             # URDF is a tree: a leg ends in a link of its own, which the YAML file joins to a link
@@ -105,7 +109,8 @@ def urdf_texts(
         "joint_name": spherical,
         "joint_type": ["SPHERICAL"] * len(spherical),
     }
-    text = "\n".join([f"<robot name={quoteattr(robot.name)}>", *lines, "</robot>"])
+    opening = f"<robot name={quoteattr(robot.name)}>"
+    text = "\n".join([opening, f"<!-- {COMMENT} -->", *lines, "</robot>"])
     return text, "\n".join(f"{key}: {value}" for key, value in closures.items())
 
 

@@ -221,8 +221,12 @@ def mjcf(
       cmmsim export mjcf rss6 --parameters runs/paper-0/result.json \\
         --allow-unphysical-inertia
     """
+    from dynamics.engines.mjcf import mjcf_text
+
     model, values = _chosen_model(robot, parameters)
-    text = model.mjcf(allow_unphysical_inertia)
+    text = mjcf_text(
+        model.robot, allow_unphysical_inertia=allow_unphysical_inertia, source=model.source
+    )
     path = out or Path(f"{model.robot.name}.xml")
     write_text(path, text, parents=True)
     _tell_export(model.robot, values, [path], quiet)
@@ -239,7 +243,8 @@ def urdf(
     """Write the robot as URDF, with the closures of its loops in a YAML file of the same name.
 
     URDF knows only trees. The YAML file lists the frames that coincide in each closed loop, in the
-    form that cmmsim import urdf reads.
+    form that cmmsim import urdf reads. Effort and velocity of the joints are 1e9, because a robot
+    file states no limits: put in those of your actuators.
 
     Reads a robot file, and the result.json that --parameters names. Writes two files.
 
@@ -247,10 +252,11 @@ def urdf(
     Example:
       cmmsim export urdf ups6 --parameters runs/ups6/result.json --out mine.urdf
     """
+    from dynamics.engines.urdf import urdf_texts
     from identify.files.atomic import write_files
 
     model, values = _chosen_model(robot, parameters)
-    texts = model.urdf(allow_unphysical_inertia)
+    texts = urdf_texts(model.robot, allow_unphysical_inertia=allow_unphysical_inertia)
     path = out or Path(f"{model.robot.name}.urdf")
     paths = [path, path.with_suffix(".yaml")]
     if paths[0] == paths[1]:
@@ -275,27 +281,10 @@ def _chosen_model(robot: str, parameters: str | None) -> "tuple[RobotModel, Arra
 
 def _tell_export(robot: "Robot", parameters: "Array", paths: list[Path], quiet: bool) -> None:
     if not quiet:
-        for line in [*_changes(robot, parameters), *(f"model: {path}" for path in paths)]:
+        from dynamics.inertia import described_changes
+
+        for line in [*described_changes(robot, parameters), *(f"model: {path}" for path in paths)]:
             typer.echo(line)
-
-
-def _changes(robot: "Robot", parameters: "Array") -> list[str]:
-    """Return lines that describe the inertias that the export changed.
-
-    Each line states how much the change alters the robot's accelerations.
-    """
-    from dynamics.inertia import acceleration_changes, grouped, physical_inertias
-
-    inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
-    if not inertias.changes:
-        return []
-    effects = acceleration_changes(robot, parameters, inertias.values)
-    said = {}
-    for body, change in inertias.changes.items():
-        # A relative effect of at most 1e-9 is rounding.
-        felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
-        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'no effect on the motion'}"
-    return [f"changed {line}" for line in grouped(said)]
 
 
 def verify_model(

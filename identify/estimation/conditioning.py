@@ -57,8 +57,10 @@ class Conditioning:
         return (
             f"the record is poorly conditioned: of {self.directions} independent combinations of "
             f"parameters and gains, {self.unshown} are known from the initial guess rather than "
-            f"from the poses (the condition number of the poses' information is {number}); move "
-            "the robot faster (excitation.fundamental_hz), farther "
+            f"from the poses (the condition number of the poses' information is {number}); "
+            "predictions of motions do not suffer if they meet the goals of the validation, but do "
+            "not use the values of single bodies, such as inertias of legs; for these, move the "
+            "robot faster (excitation.fundamental_hz), farther "
             "(excitation.position_amplitude_m, orientation_amplitude_rad) or longer "
             "(excitation.duration_s)",
         )

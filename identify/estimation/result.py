@@ -18,20 +18,19 @@ from dynamics import Robot, RobotModel
 from dynamics.closed_loop.drives import READS, cascade_gains
 from dynamics.parameters import JOINT_PID, ParameterLayout
 from identify.arrays import Array
-from identify.errors import EstimationError
 from identify.estimation.budget import Budget, parameter_budget
 from identify.estimation.common_error_estimates import CommonErrorEstimates
 from identify.estimation.conditioning import Conditioning
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.drive_choice import DriveChoice
 from identify.estimation.explanation import MISFIT, Misfit, Whiteness
+from identify.estimation.given_truth import given_truth
 from identify.estimation.identifiability import RESTS_ON_PRIOR, GroupEstimates
 from identify.estimation.intervals import BoundedEstimate
 from identify.estimation.prior import gains_among
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result
-from identify.loop_parameters import known_value
 from identify.record.stored_common_errors import ASSUMPTIONS
 
 if TYPE_CHECKING:
@@ -135,8 +134,8 @@ class IdentificationResult:
 
     @property
     def robot(self) -> Robot:
-        """Identified robot. Its nominal parameters are the estimate."""
-        return self.nominal.with_parameters(self.estimate)
+        """Identified robot. Its sets `identified` and `guess` both are the estimate."""
+        return self.nominal.with_parameters(self.estimate, "identified")
 
     def model(self) -> RobotModel:
         """Return the identified model: torques, CasADi functions, MJCF and URDF."""
@@ -196,7 +195,7 @@ class IdentificationResult:
         Raises
         ------
         EstimationError
-            The truth lacks a parameter.
+            The truth is neither, lacks a parameter, or is that of a robot with other bodies.
 
         Examples
         --------
@@ -215,20 +214,10 @@ class IdentificationResult:
             "identifiable": self.identifiable,
         }
         if truth is not None:
-            true = self._true_values(truth)
+            true = given_truth(truth, self.names)
             columns["true"] = true
             columns["holds"] = (self.intervals[:, 0] <= true) & (true <= self.intervals[:, 1])
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
-
-    def _true_values(self, truth: xr.Dataset | Mapping[str, float]) -> Array:
-        if isinstance(truth, xr.Dataset):
-            pairs = zip(truth["parameter"].values, truth["parameter_value"].values, strict=True)
-            truth = {str(name): float(value) for name, value in pairs}
-        known = {name: known_value(truth, name) for name in self.names}
-        missing = [name for name, value in known.items() if value is None]
-        if missing:
-            raise EstimationError(f"the truth has no {missing[0]}; {len(missing)} are missing")
-        return np.array(list(known.values()), dtype=float)
 
     def _repr_html_(self) -> str:
         return result_html(self)

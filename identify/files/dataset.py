@@ -65,6 +65,10 @@ def group_names(path: Path | str) -> list[str]:
 
 
 def _read(path: Path | str, group: str | None) -> Content:
+    if Path(path).is_dir():
+        inside = Path(path) / "experiment.nc"
+        record = f"; its record is {inside}" if inside.is_file() else ""
+        raise RecordError(f"{path} is a folder{record}")
     if not Path(path).is_file():
         raise RecordError(f"there is no file {path}")
     try:

@@ -190,3 +190,26 @@ def in_three_hinges(urdf, balls):
             joint.set("type", "revolute")
             Xml.SubElement(joint, "limit", lower="-9", upper="9", effort="1", velocity="1")
     return Xml.tostring(root, encoding="unicode")
+
+
+def test_a_urdf_has_no_limits_that_the_robot_file_does_not_state():
+    urdf, _ = RobotModel(physical("ups6")).urdf()
+    limits = [limit for limit in Xml.fromstring(urdf).iter("limit") if "effort" in limit.attrib]
+    assert len(limits) == 6
+    assert all(float(limit.get(key)) >= 1e6 for limit in limits for key in ("effort", "velocity"))
+    assert "the robot file states no limits" in urdf
+
+
+def test_inertias_that_an_export_changes_are_warned_of():
+    with pytest.warns(UserWarning, match=r"changed platform: Ixx .* 4\.4 %"):
+        RobotModel(
+            load_robot("rss6").with_parameters(load_robot("rss6").parameter_sets["truth"].vector)
+        ).mjcf(allow_unphysical_inertia=True)
+
+
+def test_parameters_of_a_robot_can_be_given_a_name():
+    robot = load_robot("ups6")
+    values = robot.parameter_sets["truth"].vector
+    named = robot.with_parameters(values, "identified")
+    assert "sets: guess, identified" in repr(named)
+    np.testing.assert_array_equal(named.parameter_sets["identified"].vector, values)
