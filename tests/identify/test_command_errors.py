@@ -167,7 +167,7 @@ def test_zeros_and_scale_with_a_prior_are_estimated_and_intervals_hold(method):
 def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
     """The remedy of the diagnosis is the setting that mends it."""
     true = quick(**{"plant.joint_zero_error_rad": [0, 3e-4, 0, 0, 0, 0]})
-    record, _ = run_plant(true, seed=2)
+    record, _ = run_plant(true, seed=2, duration_s=5.0)
     values = rss6().parameter_sets["truth"].vector
     found = diagnosis_from(problem_of([record], quick()), values)
     first = found.findings[0]
@@ -180,7 +180,7 @@ def test_a_model_with_the_prior_explains_what_one_without_is_diagnosed_for():
 
 @pytest.mark.slow
 def test_the_scale_of_the_commands_is_diagnosed_with_its_setting():
-    record, _ = run_plant(quick(**{"plant.command_scale": 1.0017}), seed=3)
+    record, _ = run_plant(quick(**{"plant.command_scale": 1.0017}), seed=3, duration_s=5.0)
     values = rss6().parameter_sets["truth"].vector
     first = diagnosis_from(problem_of([record], quick()), values).findings[0]
     assert first.name == "scale of the commands"

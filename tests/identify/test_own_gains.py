@@ -141,7 +141,7 @@ def test_a_single_gain_that_differs_is_diagnosed_with_its_size_and_the_setting()
     plant = build_plant(scenario, robot)
     assert plant.robot.layout.own_gains
     assert not plant.nominal.layout.own_gains
-    record, _ = run_plant(scenario, seed=3)
+    record, _ = run_plant(scenario, seed=3, duration_s=5.0)
     problem = problem_of([record], scenario)
     found = diagnosis_from(problem, plant.parameters_of(robot.layout))
     first = found.findings[0]
