@@ -12,6 +12,8 @@ information is therefore averaged over one grey value, and the bound holds on av
 positions. For stronger noise, averaging changes nothing.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -84,6 +86,7 @@ def cramer_rao_bound(
         return np.linalg.pinv(fisher, rcond=1e-13, hermitian=True)[:, :2, :2]
 
 
+@lru_cache(maxsize=8)  # of fine grey values, a table takes a second
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
     """Return mean grey values at equal steps, and the information averaged over one grey value.
 

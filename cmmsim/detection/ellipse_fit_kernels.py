@@ -351,7 +351,8 @@ def fit_windows(
         room = windows.shape[1] - size
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
-        part = windows[k, top : top + size, left : left + size]
+        # contiguous, as whole windows are: Numba compiles what takes both only once
+        part = windows[k, top : top + size, left : left + size].copy()
         parameters[k] = 0.0
         start_ellipse(moments(part) if room else spot, size, parameters[k])
         misfits[k] = fit_window(

@@ -232,7 +232,8 @@ def follow_rim(centre_x: float, centre_y: float, shape: Array, cover: Cover) -> 
     ends = (x_u, x_v), (y_u, y_v), (-x_u, -x_v), (-y_u, -y_v)
     columns = np.empty((width + 1, 2))
     rows = np.empty((height + 1, 2))
-    count = 0
+    # not a literal, for which Numba would compile what takes it once more
+    count = int(np.int64(0))
     crossings(centre_x, reach_x, columns)
     crossings(centre_y, reach_y, rows)
     # Each line is crossed at most twice, and each of the four quarters ends with one arc more.

@@ -249,6 +249,8 @@ class CameraNoise:
         """
         normal = rng.standard_normal(radiance.shape, dtype=np.float32)
         empty = np.empty(0, dtype=np.float32)
+        # as the arrays of a pattern are: Numba compiles the kernels once for both
+        empty.setflags(write=False)
         pattern_values = (
             (empty, empty)
             if pattern is None

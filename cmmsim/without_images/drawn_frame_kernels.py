@@ -337,9 +337,11 @@ def measure_frame(
         pose_transform(poses[3 * end], platform)
         multiply(scene.camera_from_base, platform, ends[0, end])
     images = Images(frame.pixels, frame.spreads, np.zeros((1, 2)), ends, scene.assumed_cameras)
+    # not a literal, for which Numba would compile what takes it once more
+    row = int(np.int64(0))
     solve(
         frame.stickers, stickers.taught, outlines, scene.solver_limits, camera_from_platform,
-        covariance, searched, images, 0, np.empty((6, 6)), verdict,
+        covariance, searched, images, row, np.empty((6, 6)), verdict,
     )  # fmt: skip
     if verdict[STATE] == MEASURED:
         multiply(scene.base_from_camera, camera_from_platform, platform)

@@ -30,7 +30,7 @@ def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
     """Compile robots and the loop around them, unless they are compiled already."""
     with progress.stage("compile the robot", 2 * len(robots)) as advance:
         for robot in robots:
-            _ = robot.functions
+            dict(robot.functions)  # asks for all of them
             advance()
             prepare(robot)
             advance()
@@ -71,13 +71,13 @@ def _compile_plant(plant: Plant) -> None:
 
 
 def _compile_sensor(plant: Plant, planned: SensorPlan) -> None:
-    """Teach the sensor and measure some frames, with the planned and the analytic renderer.
+    """Teach the sensor and measure some frames, with the planned renderer and all kernels.
 
     A record also contains the common errors of its poses.
     """
     motion = _nearby(plant)
     rate_hz = plant.runs.timing.frame_rate_hz
-    for renderer in dict.fromkeys((planned.renderer, "analytic")):
+    for renderer in dict.fromkeys((planned.renderer, "statistical", "analytic")):
         plan = replace(planned, renderer=renderer)
         sensor = plan.taught(plant.nominal, 0, SilentProgress())
         eye = SensorInLoop(sensor, plant.robot, 0)

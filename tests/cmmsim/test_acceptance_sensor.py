@@ -201,14 +201,14 @@ def test_same_seed_same_numbers(volume):
 
 @pytest.mark.slow
 def test_latency_and_jitter_of_the_sensor_file_are_found_from_images(volume):
-    found = latency_test(under_test(changes={"timing.latency": 0.0142}), volume, frames=60)
+    found = latency_test(under_test(changes={"timing.latency": 0.0142}), volume, frames=40)
     assert (found.lost, found.stated) == (0, 0.0142)
     low, high = found.latency.interval
     assert low <= 0.0142 <= high
     assert high - low < 5e-6
     assert found.latency.std == pytest.approx(found.latency.resolution, rel=0.3)
     changes = {"timing.latency": 0.014, "timing.latency_jitter": 0.001}
-    jittering = latency_test(under_test(changes=changes), volume, frames=100).latency
+    jittering = latency_test(under_test(changes=changes), volume, frames=60).latency
     assert jittering.mean == pytest.approx(0.014, abs=4e-4)
     assert jittering.std == pytest.approx(0.001, rel=0.25)
     assert jittering.resolution < 1e-4

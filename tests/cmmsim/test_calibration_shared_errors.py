@@ -122,7 +122,7 @@ def test_intervals_hold_although_points_of_a_view_err_alike(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("runs", [100, pytest.param(1000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("runs", [50, pytest.param(1000, marks=pytest.mark.thorough)])
 def test_covariance_of_independent_errors_is_true_and_left_as_it_is(runs):
     """Squared errors of all 24 together as chi-square, 95 % intervals hold 95 %, no bias; only by
     chance is one enlarged."""
@@ -165,9 +165,9 @@ def test_halves_of_the_pictures_agree_as_they_state(kind):
     pairs = KINDS[kind](
         board_poses(24, np.random.default_rng(6), board=BOARD), np.random.default_rng(7)
     )
-    compare = partial(compare_halves, BOARD, size=SIZE, options=CalibrationOptions(), splits=6)
+    compare = partial(compare_halves, BOARD, size=SIZE, options=CalibrationOptions(), splits=3)
     apart = compare(pairs, rng=np.random.default_rng(8))
-    assert apart.squares.shape == (6, 24)
+    assert apart.squares.shape == (3, 24)
     assert 0.6 < apart.mean_square < 1.5
     with pytest.raises(
         CalibrationError, match="each half of 5 pairs of pictures has 2 pairs, fewer than 3"

@@ -67,7 +67,7 @@ def test_light_and_print_that_deceive_leave_poses_right_or_uncertain_or_lost(stu
     and rows or cameras that are not exposed at once.
     """
     kinds = [kind.__name__ for kind in DECEIVING if kind is not slipped]
-    assert wrong_share(studio, [*kinds, "coma"], 8, 3) <= WRONG
+    assert wrong_share(studio, [*kinds, "coma"], 4, 3) <= WRONG
 
 
 @pytest.mark.slow
@@ -76,12 +76,12 @@ def test_groups_and_images_that_have_moved_are_mostly_noticed(studio):
     of the warp and of a second group, two thirds were wrong.
     """
     kinds = [kind.__name__ for kind in MOVED]
-    assert wrong_share(studio, kinds, 8, 3) <= WRONG_IF_MOVED
+    assert wrong_share(studio, kinds, 4, 3) <= WRONG_IF_MOVED
 
 
 @pytest.mark.slow
 def test_clean_frames_lose_nothing(studio):
-    """Eighty are measured with all stickers, and state the error that they have."""
-    found = outcomes(studio, "clean", 80, 2)
+    """Thirty are measured with all stickers, and state the error that they have."""
+    found = outcomes(studio, "clean", 30, 2)
     assert all(m.ok for m, _ in found)
     require_true(np.array([error for _, error in found]) ** 2)

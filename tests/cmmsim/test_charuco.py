@@ -54,7 +54,7 @@ def test_a_board_file_of_another_board_is_told_by_the_number_of_markers(changed,
 @pytest.mark.parametrize(
     ("rig", "count", "psf_px"),
     [
-        pytest.param(PERFECT, 8, 0.0, marks=pytest.mark.slow),
+        pytest.param(PERFECT, 6, 0.0, marks=pytest.mark.slow),
         pytest.param(BENT, 12, 0.4, marks=pytest.mark.thorough),
     ],
 )

@@ -149,7 +149,7 @@ def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(
     """
     changes = {"detection.detector": detector.name}
     sensor = load_sensor("ctrack780", 1, taught=taught, renderer="analytic", changes=changes)
-    path = moving_path(150)
+    path = moving_path(150)[::2]
     found = [sensor.measure(pose) for pose in path]
     assert all(m.ok for m in found)
     # neighbours share places in a pixel
@@ -159,7 +159,7 @@ def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(
     squared = squares(errors, stated)
     assert (
         4.0 < squared.mean() < 8.0
-    )  # the mean scatters by 0.3, and one teaching is in all of them
+    )  # the mean scatters by 0.4, and one teaching is in all of them
     assert squared[0] < 22.5  # 1 in 1,000
 
 

@@ -227,10 +227,13 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("psf_px", "limit"),
-    [(0.2, 1e-7), (0.3, 1e-7), (0.5, 1e-7), (1.0, 1e-6), (1.5, 1e-7), (2.0, 1e-7)],
+    [
+        *((0.2, 1e-7), (1.0, 1e-6), (2.0, 1e-7)),
+        *(pytest.param(one, 1e-7, marks=pytest.mark.thorough) for one in (0.3, 0.5, 1.5)),
+    ],
 )
 def test_blurred_shares_and_their_derivatives_match_brute_force_integration(psf_px, limit):
-    centres, shapes = random_ellipses(np.random.default_rng(0), 3, 20)
+    centres, shapes = random_ellipses(np.random.default_rng(0), 2, 20)
     for centre, shape, share, slopes in zip(
         centres, shapes, *coverage(centres, shapes, 20, psf_px), strict=True
     ):

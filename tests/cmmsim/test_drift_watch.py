@@ -320,13 +320,13 @@ def test_a_drift_over_a_run_of_images_is_noticed_before_it_costs_a_standard_devi
 def test_images_give_no_alarm_for_what_is_no_drift(changes):
     """Rounding alone, a detector with a bias, stickers that smear; in motion and at rest."""
     sensor = exact(changes=changes)
-    watch, poses = sensor.watch_drift(base=True), path(sensor.home, 60)
+    watch, poses = sensor.watch_drift(base=True), path(sensor.home, 36)
     rates = np.gradient(poses, 1.0 / RATE, axis=0)
     for share in (0.0, 1.0):
         sensor.start_run(3)
         for pose, rate in zip(poses, rates, strict=True):
             sensor.measure(sensor.home + share * (pose - sensor.home), pose_rate=share * rate)
-        assert watch.finding.frames == 60
+        assert watch.finding.frames == 36
         assert watch.finding.noticed_s is None
 
 

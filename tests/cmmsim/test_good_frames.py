@@ -60,7 +60,7 @@ def test_little_noise_loses_no_frame(lens, renderer, count, deviation):
 
 @pytest.mark.parametrize(
     "frames",
-    [pytest.param(1000, marks=pytest.mark.slow), pytest.param(100_000, marks=pytest.mark.thorough)],
+    [pytest.param(400, marks=pytest.mark.slow), pytest.param(100_000, marks=pytest.mark.thorough)],
 )
 def test_good_frames_are_not_lost(taught, monkeypatch, record_property, frames):
     """None of them; the one-sided 95 % limit of the share (Clopper and Pearson) is then 3 over
@@ -98,7 +98,7 @@ def test_good_frames_are_not_lost(taught, monkeypatch, record_property, frames):
 
 @pytest.mark.parametrize(
     "frames",
-    [pytest.param(300, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.thorough)],
+    [pytest.param(120, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.thorough)],
 )
 def test_no_frame_of_a_moving_platform_is_lost(frames):
     """Steps of up to 0.2 mm and 0.7 mrad in random directions: a movement never goes on as the

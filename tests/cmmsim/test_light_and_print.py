@@ -224,15 +224,15 @@ def test_poses_of_a_moving_platform_are_as_stated_with_a_rolling_shutter():
     assert all(m.ok for m, _ in found)
     require_true(squared_errors(*zip(*found, strict=True)))
     left = [(m, pose) for m, pose in blind if m.ok]
-    assert len(left) < 20 or squared_errors(*zip(*left, strict=True)).mean() > 4.0 * 6.0
+    assert len(left) < 12 or squared_errors(*zip(*left, strict=True)).mean() > 4.0 * 6.0
 
 
 def followed(sensor, estimator):
-    """Measurements and poses of five platforms in motion, from the frame on at which a tracker
+    """Measurements and poses of three platforms in motion, from the frame on at which a tracker
     knows their speeds.
     """
     found = []
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         rate = np.array([0.05] * 3 + [0.2] * 3) * rng.uniform(-1.0, 1.0, 6)
         tracker = cmmsim.Tracker(estimator)

@@ -62,11 +62,12 @@ def test_centres_of_pyrender_agree_with_their_projection(supersampling, limit):
 @pytest.mark.parametrize(
     ("lens", "supersampling", "count"),
     [
-        ("perfect", SUPERSAMPLING, 10),
-        pytest.param("perfect", SUPERSAMPLING, 40, marks=pytest.mark.slow),
-        pytest.param("perfect", 16, 40, marks=pytest.mark.slow),
-        pytest.param("distorted", SUPERSAMPLING, 10, marks=pytest.mark.slow),
-        pytest.param("all", SUPERSAMPLING, 10, marks=pytest.mark.slow),
+        ("perfect", SUPERSAMPLING, 5),
+        pytest.param("perfect", SUPERSAMPLING, 40, marks=pytest.mark.thorough),
+        pytest.param("perfect", 16, 5, marks=pytest.mark.slow),
+        pytest.param("perfect", 16, 40, marks=pytest.mark.thorough),
+        pytest.param("distorted", SUPERSAMPLING, 10, marks=pytest.mark.thorough),
+        pytest.param("all", SUPERSAMPLING, 4, marks=pytest.mark.slow),
     ],
 )
 def test_both_renderers_agree_in_every_sticker_centre(lens, supersampling, count):
@@ -157,12 +158,13 @@ def test_tracking_needs_no_opengl(taught, moving_path, monkeypatch):
     monkeypatch.setattr(pyrender_renderer, "_shared_atlas", None)  # any call would fail
     sensor, path = (
         cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic"),
-        moving_path(200),
+        moving_path(80),
     )
     found = [sensor.measure(pose) for pose in path]
     errors = 1e6 * (np.array([m.pose for m in found]) - path)
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < [4, 4, 4, 15, 15, 15])
-    assert 5.2 < squared_errors(found, path).mean() < 7.0  # 6, plus the constant error of teaching
+    # 6, plus the constant error of teaching; three deviations of the mean
+    assert abs(squared_errors(found, path).mean() - 6.1) < 3 * np.sqrt(12 / len(path))
 
 
 def test_solid_hides_what_a_ray_caster_says():

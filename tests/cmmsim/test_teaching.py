@@ -64,7 +64,7 @@ def test_teaching_error_is_as_stated(sensor, taught):
 @pytest.mark.parametrize(
     ("seed", "frames"),
     [
-        pytest.param(1, 100, marks=pytest.mark.slow),
+        pytest.param(1, 40, marks=pytest.mark.slow),
         *(pytest.param(seed, 600, marks=pytest.mark.thorough) for seed in (1, 2, 3)),
     ],
 )
@@ -179,16 +179,16 @@ def test_what_is_fitted_holds_a_sticker_that_is_a_fifth_nearer(factor):
 
 @pytest.mark.parametrize("changes", LARGER)
 def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes, moving_path):
-    """150 frames: their mean squared error, normalised by the stated covariances, is 6 with a
-    deviation of 0.28.
+    """60 frames: their mean squared error, normalised by the stated covariances, is 6 with a
+    deviation of 0.45.
     """
-    sensor, path = teaching_itself(changes), moving_path(150)
+    sensor, path = teaching_itself(changes), moving_path(60)
     found = [sensor.measure(pose) for pose in path]
     assert [m.reason for m in found if not m.ok] == []
     assert min(len(m.target_ids) for m in found) >= 17
     spread = np.array([m.single_covariance for m in found])
     squared = squares(np.array([m.pose for m in found]) - path, spread)
-    assert squared.mean() == pytest.approx(6.0, abs=1.0), squared.mean()
+    assert squared.mean() == pytest.approx(6.0, abs=1.35), squared.mean()
 
 
 def test_teaching_names_the_stickers_that_no_image_shows():

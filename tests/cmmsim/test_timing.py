@@ -40,7 +40,7 @@ def test_latencies_are_a_clipped_normal_distribution(jitter):
 @pytest.mark.slow
 def test_frames_drop_out_as_often_as_stated_independently_for_a_reason_and_with_the_same_seed_alike():
     sensor = dropping(0.3)
-    found = [sensor.measure(sensor.home) for _ in range(200)]
+    found = [sensor.measure(sensor.home) for _ in range(120)]
     lost = np.array([not m.ok for m in found])
     assert all("dropped frame" in m.reason for m in found if not m.ok)
     for dropped, probability in ((lost, 0.3), (lost[::2] & lost[1::2], 0.3**2)):
