@@ -177,8 +177,8 @@ class Camera(Section):
     """Noise parameters of both cameras after EMVA 1288.
 
     ``noise = false`` switches off all noise, including the fixed pattern of prnu and dsnu.
-    ``pattern_seed`` is the seed of the fixed pattern. ``grey_noise_percent`` replaces
-    ``dark_noise``.
+    ``pattern_seed`` is the seed of the fixed pattern. ``grey_noise_percent`` is stated
+    in place of ``dark_noise``; a file, or its changes, with both is refused.
     """
 
     electrons_at_white: Electrons = quantity(..., "electrons", "electrons of a white pixel")

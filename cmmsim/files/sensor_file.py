@@ -157,8 +157,30 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
     content = _content(name)
     change(content, changes or {}, source)
+    _refuse_idle_noise(changes or {}, content, source)
+    camera = content.get("camera")
+    if isinstance(camera, dict) and "grey_noise_percent" in camera:
+        # The schema computes it from the percentage, which a complete file may state alone.
+        camera.setdefault("dark_noise", 0.0)
     file = _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
     return with_meshes(file, source)
+
+
+def _refuse_idle_noise(
+    statements: Mapping[str, Any], content: Mapping[str, Any], source: str
+) -> None:
+    """Raise SensorFileError if statements of ``dark_noise`` have no effect.
+
+    ``content`` is the content of a file with the statements. Its ``grey_noise_percent`` replaces
+    every ``dark_noise``, also one that is stated later.
+    """
+    stated = dotted(statements).get("camera.dark_noise")
+    percent = dotted(content).get("camera.grey_noise_percent")
+    if stated is not None and percent is not None:
+        raise SensorFileError(
+            f"{source}: camera.dark_noise = {stated} does nothing beside camera.grey_noise_percent "
+            f"= {percent}, which replaces it; state and vary only one of them"
+        )
 
 
 def sensor_schema() -> dict[str, Any]:
@@ -173,6 +195,8 @@ def sensor_schema() -> dict[str, Any]:
         if "$ref" in one
     }
     needed = {name: schema["$defs"][table].pop("required", []) for name, table in tables.items()}
+    # In place of `dark_noise`, a file can state `grey_noise_percent`.
+    needed["camera"].remove("dark_noise")
     complete = {
         "required": schema["required"],
         "properties": {name: {"required": entries} for name, entries in needed.items() if entries},
@@ -213,6 +237,7 @@ def _content(name: str | Path) -> dict[str, Any]:
     own = _table(name)
     basis = own.get("based_on")
     if not isinstance(basis, str):
+        _refuse_idle_noise(own, own, f"sensor file {name}")
         return own
     basis_file = basis if basis in built_in_names() else Path(name).parent / basis
     try:
@@ -230,6 +255,8 @@ def _content(name: str | Path) -> dict[str, Any]:
         else value
         for key, value in own.items()
     }
+    _refuse_idle_noise(base, base, f"sensor file {basis_file}")
+    _refuse_idle_noise(own, base | merged, f"sensor file {name}")
     return base | merged
 
 

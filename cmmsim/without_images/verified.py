@@ -48,8 +48,9 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
         (not noise.enabled, "camera.noise false", "true: without noise, rounding alone decides"),
         (noise.prnu > 0.0 or noise.dsnu > 0.0, f"camera.prnu {noise.prnu:g}, dsnu {noise.dsnu:g}",
          "0: a fixed pattern is the same in each frame"),
-        (low**2 < NO_SWING, f"noise of {low:.2g} grey values in the dark", "at least "
-                                                                           f"{NO_SWING**0.5:.2g}"),
+        (low**2 < NO_SWING, f"noise of {low:.2g} grey values in the dark",
+         f"at least {NO_SWING**0.5:.2g}, here camera.dark_noise of {_least_dark(noise, low):.3g} "
+         f"electrons in place of {noise.dark_noise:.3g}"),
         (ring < CLIPPED * low or bright > noise.white_level - CLIPPED * high,
          f"rings and stickers of {ring:.0f} and {bright:.0f} grey values",
          f"{CLIPPED:g} standard deviations of noise within 0 to {noise.white_level}"),
@@ -64,6 +65,16 @@ def require_proved(file: SensorFile, noise: CameraNoise, light: Light) -> None:
     for refused, condition, needed in wrong:
         if refused:
             raise CmmError(_not_proved(condition, needed))
+
+
+def _least_dark(noise: CameraNoise, low: float) -> float:
+    """Return the least verified dark noise, electrons, rounded up to three digits.
+
+    ``low`` is the noise on rings, grey values. Shot noise and rounding are parts of it.
+    """
+    least = np.sqrt(max(NO_SWING - low**2, 0.0) / noise.gain**2 + noise.dark_noise**2)
+    digit = 10.0 ** (np.floor(np.log10(least)) - 2)
+    return float(np.ceil(least / digit) * digit)
 
 
 def require_short(longest_px: float) -> None:

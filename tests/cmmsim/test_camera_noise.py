@@ -10,6 +10,7 @@ import trimesh
 from scipy.stats import norm
 
 import cmmsim
+from cmmsim.files.sensor_file import read_sensor_file, sensor_text
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from tests.cmmsim.sensors import NOISE, exact
 
@@ -52,6 +53,22 @@ def test_noise_in_percent_of_white_is_that_of_dark_pixels(bits):
     assert look().std() / white == pytest.approx(0.01, rel=0.05)
     with pytest.raises(cmmsim.CmmError, match="grey_noise_percent"):
         cmmsim.load_sensor("ctrack780", 0, {"camera.grey_noise_percent": -1.0})
+
+
+def test_dark_noise_beside_a_percentage_is_refused_and_one_of_them_suffices(tmp_path):
+    """In a file, in its changes, in both, and in a file that is based on another."""
+    text, both = sensor_text("ctrack780"), tmp_path / "both.toml"
+    both.write_text(text.replace("# grey_noise_percent", "grey_noise_percent"))
+    percent = tmp_path / "percent.toml"
+    percent.write_text(both.read_text().replace("dark_noise = 26.0", ""))
+    based = tmp_path / "based.toml"
+    based.write_text('name = "b"\nbased_on = "percent.toml"\n[camera]\ndark_noise = 9.0\n')
+    dark, grey = {"camera.dark_noise": 9.0}, {"camera": {"grey_noise_percent": 2.0}}
+    for file, changes in ((both, {}), (based, {}), (percent, dark), ("ctrack780", dark | grey)):
+        with pytest.raises(cmmsim.CmmError, match=r"dark_noise = .* does nothing beside"):
+            read_sensor_file(file, changes)
+    assert read_sensor_file(percent).camera.dark_noise == pytest.approx(1.33 / 100 * 255 / GAIN)
+    assert read_sensor_file("ctrack780", grey).camera.dark_noise == pytest.approx(5.1 / GAIN)
 
 
 def test_photon_transfer_gives_gain_and_dark_noise():

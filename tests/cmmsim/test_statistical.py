@@ -287,8 +287,9 @@ def test_it_is_taught_and_measures_with_a_rig_that_drifts():
         ({"camera.noise": False}, "not verified for camera.noise false"),
         ({"camera.prnu": 0.01}, "not verified for camera.prnu 0.01"),
         (
-            {"camera.dark_noise": 1.0},
-            "not verified for noise of .* grey values in the dark, only for at least 1.2",
+            {"camera.dark_noise": 5.79},
+            "not verified for noise of .* grey values in the dark, only for at least 1.2, here "
+            "camera.dark_noise of 5.8 electrons in place of 5.79;",
         ),
         (
             {"camera.electrons_at_white": 2500.0, "camera.full_well": 4000.0},
@@ -304,6 +305,10 @@ def test_it_is_taught_and_measures_with_a_rig_that_drifts():
 def test_what_it_was_not_proved_for_is_refused(changes, message):
     sensor = statistical(changes=changes)
     refused(lambda: sensor.measure(sensor.home), message)
+
+
+def test_the_named_limit_of_dark_noise_is_accepted():
+    assert statistical(changes={"camera.dark_noise": 5.8}).camera
 
 
 def test_images_are_refused():

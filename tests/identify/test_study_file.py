@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cmmsim.files.sensor_file import read_sensor_file
-from identify.errors import IdentifyError, StudyError
+from identify.errors import IdentifyError, ScenarioError, StudyError
 from identify.own_parts import CRITERIA
 from identify.scenario import load_scenario
 from identify.studies.labels import factor_unit
@@ -243,6 +243,12 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
 def test_kinds_keys_and_values_are_checked_before_any_row(entries, evidence):
     message = refusal(StudyError, prepare, study(**entries))
     assert all(word in message for word in evidence), message
+
+
+def test_dark_noise_is_not_varied_beside_a_percentage():
+    chosen = study(changes={"sensor.camera.grey_noise_percent": 1.33})
+    message = refusal(ScenarioError, prepare, chosen)
+    assert "dark_noise = 13.0 does nothing beside camera.grey_noise_percent = 1.33" in message
 
 
 def test_factors_may_be_written_as_dotted_keys_tables_or_quoted_paths():
