@@ -233,8 +233,15 @@ def _content(name: str | Path) -> dict[str, Any]:
     """Return the content of a file, completed from the sensor that ``based_on`` names.
 
     Missing tables, and missing entries of a table, are added; tables within tables are not merged.
+    Raises SensorFileError if only the cameras are described, or for a wrong ``based_on``.
     """
     own = _table(name)
+    if own.keys() == {"rig"}:
+        beside = Path(name).parent / "sensor.toml"
+        whole = f"{beside} is" if beside.is_file() else "cmmsim calibrate --sensor NAME writes"
+        raise SensorFileError(
+            f"sensor file {name} has only the table of the cameras; {whole} the whole file"
+        )
     basis = own.get("based_on")
     if not isinstance(basis, str):
         _refuse_idle_noise(own, own, f"sensor file {name}")

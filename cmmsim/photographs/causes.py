@@ -44,9 +44,12 @@ def cause_of(
     """
     counts = [min(len(one.centres[one.good]) for one in pair) for pair in spots]
     if max(counts) == 0:
+        dark = observer.settings.dark
+        stated, relation = ("dark", "below") if dark else ("bright", "above")
         return (
-            f"no bright spots in both images of any of {len(spots)} pairs, such as {names[0]}: "
-            "stickers must be bright discs in dark rings, or the file must say otherwise"
+            f"no {stated} spots in both images of any of {len(spots)} pairs, such as {names[0]}: "
+            f"the sensor file states {stated} discs, because stickers.sticker_level is {relation} "
+            "stickers.ring_level; are yours the reverse, and do the images show stickers at all?"
         )
 
     def works(pairs: Sequence[Spots]) -> bool:

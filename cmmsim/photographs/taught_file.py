@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cmmsim.errors import CmmError, TeachingError
+from cmmsim.errors import TeachingError
 from cmmsim.geometry.camera import camera_from
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
@@ -79,7 +79,9 @@ def read_taught(path: str | Path) -> Taught:
     try:
         return _taught(content)
     except (KeyError, TypeError, ValueError) as error:
-        said = error if isinstance(error, CmmError) else f"{type(error).__name__} {error}"
+        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        if isinstance(content, dict) and "degrees_of_freedom" in content:
+            said = "it is the calibration.json of `cmmsim calibrate`"
         raise TeachingError(f"{path} is no taught.json of `cmmsim teach`: {said}") from error
 
 

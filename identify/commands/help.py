@@ -43,14 +43,26 @@ class Command(TyperCommand):
 
         The stages of a run have the option --out for its folder, and other commands an argument.
         """
+        typed = list(args)
         try:
             return super().parse_args(ctx, args)
         except UsageError as error:
+            # Only the error of a missing option has its parameter, and an empty message.
+            if not error.message and getattr(error, "param", None) is not None:
+                error.message = self._missing(error.param.name, typed)
+                raise
             said = self._remedy(getattr(error, "option_name", None) or "", error.message)
             if said:
                 error.message += f"; {said}"
                 error.possibilities = None
             raise
+
+    def _missing(self, name: str, typed: list[str]) -> str:
+        """Return the right form of a command that lacks --out for its folder, or nothing."""
+        if name != "out" or any(one.param_type_name == "argument" for one in self.params):
+            return ""
+        folder = typed[0] if typed and not typed[0].startswith("-") else "FOLDER"
+        return f"A folder stands after --out: cmmsim {self.name} --out {folder}"
 
     def _remedy(self, option: str, message: str) -> str:
         """Return the right form of an unknown option or a superfluous argument, or nothing."""

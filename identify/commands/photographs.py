@@ -188,7 +188,8 @@ def measure(
         typer.Option(
             "--pictures",
             metavar="FOLDER",
-            help="Also write a picture of each pair with the stickers that were used.",
+            help="Also write a picture of each pair with the stickers that were used, named as the "
+            "left image, or by number for videos.",
             show_default=False,
         ),
     ] = None,
@@ -237,7 +238,7 @@ def measure(
             table.writerow(one.row)
             if made is not None:
                 picture = cv2.imencode(".png", one.picture())[1].tobytes()
-                write_bytes(made / f"{count:05d}.png", picture)
+                write_bytes(_new_picture(made, one.name, count), picture)
             count += 1
             if not one.measurement.ok:
                 lost.append(f"{one.name}: {one.measurement.reason}")
@@ -248,3 +249,15 @@ def measure(
     print_warnings(lost[:3] + ([f"and {len(lost) - 3} more pairs lost"] if lost[3:] else []))
     if not quiet:
         typer.echo(f"{count - len(lost)} of {count} pairs measured: {out}")
+
+
+def _new_picture(folder: Path, name: str, number: int) -> Path:
+    """Return the new file of a pair with a name, which is that of its left image if it has one."""
+    from cmmsim.files.image_files import SUFFIXES
+
+    left = Path(name.partition(" | ")[0])
+    if left.suffix.lower() not in SUFFIXES:
+        return folder / f"{number:05d}.png"
+    path = folder / f"{left.stem}.png"
+    # Names such as 1.bmp and 1.png differ by their suffix alone.
+    return folder / f"{left.name}.png" if path.exists() else path

@@ -122,9 +122,12 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
         )
         size = content["image_size_px"]
     except (OSError, ValueError, KeyError, TypeError) as error:
+        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        if isinstance(error, KeyError) and "base_from_camera" in content:
+            said = "it is the taught.json of `cmmsim teach`"
         raise ScenarioError(
             f"rig.known = {str(path)!r} is neither exact, calibrated, photographs, nor the "
-            f"calibration.json of `cmmsim calibrate`: {type(error).__name__} {error}"
+            f"calibration.json of `cmmsim calibrate`: {said}"
         ) from None
     if list(names) != list(PARAMETER_NAMES) or matrix.shape != (len(PARAMETER_NAMES),) * 2:
         raise ScenarioError(

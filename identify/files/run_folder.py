@@ -33,6 +33,7 @@ WRITTEN_BY = {
     "report.html": "report",
 }
 
+STUDY = "study.json"  # file that only the folder of a study holds
 # Folder and file that `excite` writes before the scenario. A plan without a scenario is incomplete.
 UNFINISHED = ("geometry", "trajectories.json")
 # Files and folders that the folder of an unfinished run may hold.
@@ -82,9 +83,9 @@ class RunFolder:
 
         The digests of netCDF files are compared before a library opens any of these files.
 
-        Raises OutputFolderError if the folder or a file is missing. The message names the first
-        missing file and the stage that writes it. Raises RecordError if a netCDF file cannot be
-        read, or its digest is wrong.
+        Raises OutputFolderError if the folder or a file is missing, or if the folder is that of a
+        study. The message names the first missing file and the stage that writes it. Raises
+        RecordError if a netCDF file cannot be read, or its digest is wrong.
         """
         if not self.path.is_dir():
             later = any(WRITTEN_BY[name] != "excite" for name in names)
@@ -92,6 +93,8 @@ class RunFolder:
             raise OutputFolderError(
                 f"no run folder {self.path}; make it with: cmmsim {command} --out {self.path}"
             )
+        if (self.path / STUDY).is_file():
+            raise OutputFolderError(f"{self.path} is the folder of a study, and not of a run")
         for name in names:
             if not (self.path / name).is_file():
                 stage = WRITTEN_BY[name]

@@ -27,12 +27,12 @@ from cmmsim.files import read_sensor_file
 from identify.errors import StudyError, StudyInterrupted
 from identify.files.atomic import make_folder, remove_empty_folders, write_text
 from identify.files.lock import LOCK, locked
+from identify.files.run_folder import STUDY
 from identify.files.versions import same_versions, versions
 from identify.studies.study_design import Finished, Shared
 from identify.studies.study_file import Study
 from identify.studies.table import TABLE, study_in, written
 
-STUDY = "study.json"
 JOURNAL = "rows.jsonl"
 VIEW = "study.nc"
 VERSIONS = "versions"

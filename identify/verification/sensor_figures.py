@@ -334,13 +334,13 @@ def teaching_residuals(found: PhotographedTeaching) -> Figure:
     figure = Figure(figsize=(12, 5), layout="constrained")
     panels = figure.subplots(1, 2)
     seen = found.observations
-    sigma = max(found.rms_px, 1e-9)
+    three_sigma = 3.0 * max(found.rms_px, 1e-9)
     figure.suptitle(f"residuals of stickers, rms {found.rms_px:.3g} px")
     for side, axes in enumerate(panels):
         camera = found.bundle.state.rig.cameras[side]
         for moves, colour, body in ((False, "tab:orange", "base"), (True, "tab:blue", "platform")):
             own = seen.moves == moves
-            axes.quiver(
+            arrows = axes.quiver(
                 *seen.pixels[side, own].T,
                 *found.bundle.residuals[side, own].T,
                 angles="xy",
@@ -348,8 +348,9 @@ def teaching_residuals(found: PhotographedTeaching) -> Figure:
                 width=0.0015,
                 color=colour,
                 label=body,
-                scale=3.0 * sigma / (ARROW_SHARE * camera.width),
+                scale=three_sigma / (ARROW_SHARE * camera.width),
             )
+        axes.quiverkey(arrows, 0.85, 1.03, three_sigma, f"{three_sigma:.2g} px")
         rms = np.sqrt(np.mean(found.bundle.residuals[side] ** 2))
         axes.set(
             xlim=(0, camera.width),

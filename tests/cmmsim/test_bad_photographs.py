@@ -196,7 +196,9 @@ def test_a_plane_with_fewer_than_three_stickers_is_named(sensor, good):
 
 def test_images_without_spots_and_a_platform_that_stands_are_reported(sensor, good):
     nothing = without(good[0], good[0][1].centres)
-    assert "no bright spots in both images of any of 3 pairs" in cause(sensor, [nothing] * 3)
+    said = cause(sensor, [nothing] * 3)
+    assert "no bright spots in both images of any of 3 pairs" in said
+    assert "bright discs, because stickers.sticker_level is above stickers.ring_level" in said
     assert "2 pairs, but at least 3 needed" in cause(sensor, good[:2])
     still = spots(sensor, [sensor.home] * 4, sensor.observer)
     assert any("the platform moves by at most 0." in one for one in teach(sensor, still).warnings)

@@ -280,7 +280,7 @@ def test_a_taught_file_with_a_number_that_is_not_finite_is_refused(tmp_path, ent
     name = next(key for key in reversed(entry) if isinstance(key, str))
     refused(
         lambda: cmmsim.read_taught(path),
-        f"no taught.json of `cmmsim teach`: ValueError {name} is not finite",
+        f"no taught.json of `cmmsim teach`: {name} is not finite",
         cmmsim.TeachingError,
     )
 

@@ -147,6 +147,15 @@ def test_a_file_is_read_from_a_path_and_may_change_single_entries_of_the_one_bes
     assert cmmsim.load_sensor(mine).noise.gain == 0.26
 
 
+def test_the_camera_tables_of_a_calibration_are_told_from_the_whole_file(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text("[rig.left]\nfocal_px = [1400.0, 1400.0]\n")
+    said = "has only the table of the cameras; {} the whole file"
+    refused(lambda: read_sensor_file(path), said.format("cmmsim calibrate --sensor NAME writes"))
+    (tmp_path / "sensor.toml").touch()
+    refused(lambda: read_sensor_file(path), said.format(f"{tmp_path / 'sensor.toml'} is"))
+
+
 def test_the_29_hz_sensor_is_labelled_as_assumed_and_differs_in_nothing_but_its_timing():
     slow, usual = read_sensor_file("ctrack780_29hz"), read_sensor_file("ctrack780")
     assert (slow.timing.frame_rate, slow.timing.latency * slow.timing.frame_rate) == (29.0, 1.0)

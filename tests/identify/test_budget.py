@@ -181,6 +181,12 @@ def test_a_run_of_an_older_version_and_parts_that_do_not_sum_up_are_refused(
     assert "no run folder" in one_line(capfd.readouterr().err)
 
 
+def test_the_folder_of_a_study_is_called_one(tmp_path, capfd):
+    (tmp_path / "study.json").write_text("{}")
+    assert command("budget", tmp_path) == 1
+    assert "is the folder of a study, and not of a run" in one_line(capfd.readouterr().err)
+
+
 def test_the_picture_has_the_identified_parameters_alone_most_of_the_main_source_first():
     noise = np.array([1.0, 2.0, 9.0, 5.0])
     names = ("pose.x", "a", "b", "hidden")

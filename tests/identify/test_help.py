@@ -161,6 +161,8 @@ ROW_TIME = "set sensor_changes.timing.row_time"
     ("typed", "said"),
     [
         ("identify runs/x", "cmmsim identify --out runs/x"),
+        ("record runs/x", "cmmsim record --out runs/x"),
+        ("report", "cmmsim report --out FOLDER"),
         ("budget --out runs/x", "cmmsim budget FOLDER"),
         ("run quick --sensor x", "--set sensor=VALUE"),
         ("replay runs/x", "cmmsim run quick --out runs/x"),

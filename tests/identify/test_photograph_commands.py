@@ -4,14 +4,20 @@ import csv
 import json
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.quiver import QuiverKey
 
 import cmmsim
 from dynamics import load_robot
+from identify.commands.photographs import _new_picture
+from identify.errors import ScenarioError
+from identify.experiment.rig_as_known import stated_covariance
 from identify.record.csv_record import columns_of
+from identify.verification.sensor_figures import teaching_residuals
 from tests.cmmsim.photographed import folders, photographed, spread_poses
 from tests.identify.commands import command, one_line
 
@@ -79,8 +85,50 @@ def test_folders_of_images_become_a_table_of_poses_as_accurate_as_stated(picture
     exchanged = (measuring[0], measuring[2], measuring[1], *measuring[3:])
     assert command(*exchanged, "--quiet") == 1
     assert "000.png: left and right are exchanged" in one_line(capfd.readouterr().err)
-    picture = cv2.imread(str(tmp_path / "found" / "00000.png"))
+    drawn = sorted((tmp_path / "found").iterdir())
+    assert [path.name for path in drawn] == [row["pair"] for row in rows]
+    picture = cv2.imread(str(drawn[0]))
     assert picture.shape == (1536, 4096, 3)
+
+
+def test_the_arrows_of_residuals_have_a_key_in_px():
+    rig = cmmsim.load_sensor("ctrack780", renderer="statistical").rig
+    residuals = np.full((2, 4, 2), 0.02)
+    bundle = SimpleNamespace(state=SimpleNamespace(rig=rig), residuals=residuals)
+    seen = SimpleNamespace(pixels=np.full((2, 4, 2), 500.0), moves=np.arange(4) % 2 == 0)
+    figure = teaching_residuals(SimpleNamespace(rms_px=0.02, observations=seen, bundle=bundle))
+    for axes in figure.axes:
+        (key,) = [one for one in axes.artists if isinstance(one, QuiverKey)]
+        assert (key.U, key.label) == (pytest.approx(0.06), "0.06 px")
+
+
+def test_a_picture_of_a_pair_has_the_name_of_its_left_image_and_replaces_none(tmp_path):
+    names = ["a.png", "l_1.BMP | r_1.BMP", "a.jpg", "frame 3"]
+    for number, name in enumerate(names):
+        _new_picture(tmp_path, name, number).touch()
+    made = sorted(path.name for path in tmp_path.iterdir())
+    assert made == ["00003.png", "a.jpg.png", "a.png", "l_1.png"]
+
+
+def test_the_files_of_teaching_and_of_calibration_are_told_apart(tmp_path, capfd):
+    wrong = tmp_path / "wrong.json"
+    measuring = ("measure", "left", "right", "--sensor", "ctrack780", "--taught", wrong)
+    rig = cmmsim.load_sensor("ctrack780", renderer="statistical").rig
+    for content, said in [
+        ({}, "it lacks 'setup'"),
+        ({"degrees_of_freedom": 9}, "it is the calibration.json of `cmmsim calibrate`"),
+    ]:
+        wrong.write_text(json.dumps(content))
+        assert command(*measuring) == 1
+        line = one_line(capfd.readouterr().err)
+        assert f"wrong.json is no taught.json of `cmmsim teach`: {said}" in line
+    for content, said in [
+        ({}, "it lacks 'covariance'"),
+        ({"base_from_camera": []}, "it is the taught.json of `cmmsim teach`"),
+    ]:
+        wrong.write_text(json.dumps(content))
+        with pytest.raises(ScenarioError, match=f"calibration.json of `cmmsim calibrate`: {said}"):
+            stated_covariance(wrong, rig)
 
 
 def linked(pictures, folder):
@@ -122,10 +170,6 @@ def test_a_pair_without_a_pose_has_a_row_that_says_why(pictures, taught, tmp_pat
     assert "none of 1 pairs has a pose; the first is 999.png: 0 bright spots" in said
     assert not out.exists()
     assert not (tmp_path / "found").exists()
-    wrong = tmp_path / "taught.json"
-    wrong.write_text("{}")
-    assert command(*measuring, "--taught", wrong, "--out", out) == 1
-    assert "taught.json is no taught.json of `cmmsim teach`" in one_line(capfd.readouterr().err)
 
 
 @pytest.mark.parametrize(
