@@ -209,12 +209,18 @@ def tell(
         say()
 
 
+BRACKETS = {
+    "[": ("list", "]"),
+    "{": ("table", "}"),
+}  # first letter: kind and last letter of a value
+
+
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     """Return overrides from ``KEY=VALUE`` texts.
 
     A value is read as TOML. If that fails, it is a string.
 
-    Raises ScenarioError for a text without ``=``.
+    Raises ScenarioError for a text without ``=``, and for a list or table that is not TOML.
     """
     overrides = {}
     for text in settings or []:
@@ -223,7 +229,17 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
             raise ScenarioError(
                 f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30"
             )
-        overrides[key.strip()] = _toml_or_text(value.strip())
+        overrides[key.strip()] = value = _toml_or_text(value.strip())
+        if isinstance(value, str) and value[:1] in BRACKETS:
+            what, closing = BRACKETS[value[0]]
+            raise ScenarioError(
+                f"--set {text!r}: "
+                + (
+                    f"{value!r} is not TOML; put texts within it in double quotes"
+                    if value.endswith(closing)
+                    else f"a {what} needs its closing bracket {closing}"
+                )
+            )
     return overrides
 
 

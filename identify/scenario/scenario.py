@@ -373,12 +373,12 @@ def _of_sensor(paths: Iterable[str]) -> str:
 
     for path in paths:
         key = path.removeprefix("sensor.")
-        if not _has(Scenario, path) and _has(SensorFile, key):
+        if not has_field(Scenario, path) and has_field(SensorFile, key):
             return f"; {key!r} is a key of the sensor file: set sensor_changes.{key}"
     return ""
 
 
-def _has(model: Any, path: str) -> bool:
+def has_field(model: Any, path: str) -> bool:
     """Return whether a model has the field at the end of a dotted path."""
     for part in path.split("."):
         fields = getattr(model, "model_fields", {})

@@ -352,6 +352,13 @@ def _check_law(law: Law, study: Study, figures: list[str]) -> None:
         raise StudyError(
             f"factor = {law.factor!r} is not varied by the study; {_nearest(law.factor, known)}"
         )
+    if law.factor not in study.factors and len(study.factors) > 1:
+        ratio = f'per = "{law.factor}", factor = "{next(iter(study.factors))}", exponent = 0.0'
+        raise StudyError(
+            f"a law against the figure {law.factor!r} needs a study of one factor, but "
+            f"{', '.join(study.factors)} are varied"
+            + (f"; state a constant ratio instead: {ratio}" if law.exponent == 1.0 else "")
+        )
     values = study.factors.get(law.factor)
     unknown = [
         value for value in law.order or [] if isinstance(values, list) and value not in values

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from dynamics.files import Name
 from identify.errors import StudyError
-from identify.scenario.scenario import SCENARIOS
+from identify.scenario.scenario import SCENARIOS, Scenario, has_field
 from identify.scenario.section import Section
 from identify.scenario.settings_file import SettingsFiles, one_line
 
@@ -22,15 +22,19 @@ from identify.scenario.settings_file import SettingsFiles, one_line
 class Law(Section):
     """Statement about the rms of a figure over rows, with all other factors fixed.
 
-    A law has one of three forms. ``exponent``: the rms is proportional to ``factor ** exponent``
-    of a numeric factor. ``equals``: the rms equals the rms of another figure. ``order``: the rms
-    grows along these values of a factor. ``tolerance`` is the allowed error of the exponent, or of
-    the logarithm of a ratio.
+    A law has one of three forms. ``exponent``: the rms is proportional to ``factor ** exponent`` of
+    a numeric factor, or of another figure in a study of one factor. ``equals``: the rms equals the
+    rms of another figure. ``order``: the rms grows along these values of a factor. ``tolerance`` is
+    the allowed error of the exponent, or of the logarithm of a ratio.
     """
 
     figure: str = Field(description="figure of the rows; the law is about its rms over rows")
     per: str | None = Field(None, description="divisor: another figure of the same row")
-    factor: str | None = Field(None, description="factor by dotted path")
+    factor: str | None = Field(
+        None,
+        description="factor by dotted path; for exponent in a study of one factor, also a figure "
+        "of the rows",
+    )
     exponent: float | None = Field(
         None, ge=-100, le=100, description="the rms is proportional to this power of the factor"
     )
@@ -204,9 +208,11 @@ class Study(Section):
                 else:
                     data[table][name] = value
             else:
+                meant = _with_root(path)
                 raise StudyError(
-                    f"unknown key {path!r} of study {self.name!r}; valid names: "
-                    f"{', '.join(single)}, and scenario.*, "
+                    f"unknown key {path!r} of study {self.name!r}; "
+                    + (f"did you mean {meant}? Other " if meant else "")
+                    + f"valid names: {', '.join(single)}, and scenario.*, "
                     "sensor.* and options.* for factors and changes"
                 )
         return STUDIES.from_dict(data, f"study {self.name!r}")
@@ -275,6 +281,14 @@ def _factor(path: str, value: Any) -> Any:
         return Range.model_validate(value)
     except ValidationError as error:
         raise ValueError(f"{path}: {one_line(error, Range)}") from error
+
+
+def _with_root(path: str) -> str:
+    """Return a key of a scenario or a sensor file with the root that it lacks, or no text."""
+    from cmmsim.files import SensorFile
+
+    models = (("scenario", Scenario), ("sensor", SensorFile))
+    return next((f"{root}.{path}" for root, model in models if has_field(model, path)), "")
 
 
 def _without(values: dict[str, Any], path: str) -> dict[str, Any]:

@@ -300,8 +300,6 @@ def _other_columns(law: Law, study: Study, frame: pd.DataFrame) -> Array:
     For a grid they are an indicator for each setting of the other factors. For a sample they are a
     constant, and the covariates of each other factor.
     """
-    if law.factor not in study.factors and len(study.factors) > 1:
-        raise StudyError(f"a law against the figure {law.factor!r} needs a study of one factor")
     others = [path for path in study.factors if path != law.factor and law.factor in study.factors]
     if not others:
         return np.ones((len(frame), 1))

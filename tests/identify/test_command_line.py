@@ -3,6 +3,7 @@ what all refuse.
 """
 
 import io
+import re
 import shlex
 import subprocess
 import sys
@@ -283,6 +284,13 @@ def test_settings_are_toml_or_text_behind_a_key():
     assert [*parsed] == [f"x{number}" for number in range(len(texts))]
     with pytest.raises(ScenarioError, match="KEY=VALUE"):
         parse_settings(["=30"])
+    for text, remedy in (
+        ("[26,", "a list needs its closing bracket ]"),
+        ("{low = 1", "a table needs its closing bracket }"),
+        ("[planes]", "put texts within it in double quotes"),
+    ):
+        with pytest.raises(ScenarioError, match=re.escape(remedy)):
+            parse_settings([f"x={text}"])
 
 
 @pytest.mark.slow

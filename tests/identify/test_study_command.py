@@ -142,6 +142,11 @@ def test_a_file_is_shown_and_single_entries_are_replaced(mine, capsys):
             "sensor.camera.darkness=2",
             "unknown key 'sensor.camera.darkness'; the nearest are sensor.camera.dark_noise",
         ),
+        (
+            "renderer=statistical",
+            "unknown key 'renderer' of study 'mine'; did you mean scenario.rend",
+        ),
+        ("lens.psf_px=0.5", "did you mean sensor.lens.psf_px? Other valid names: name, title"),
         ("repeats=many", "repeats = 'many': input should be a valid integer"),
         (
             "scenario.timing.latency_s=late",

@@ -366,12 +366,15 @@ def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refus
 ):
     """Figures of a kind of one's own are not known before its rows, but its factors are."""
     right = Law(**LAW)
-    prepare(study(kind="static_pose", theory=[right, Law(**LAW | {"factor": "pixel_noise_grey"})]))
+    one = {"factors": {DARK: FACTORS[DARK]}}
+    against = Law(**LAW | {"factor": "pixel_noise_grey"})
+    prepare(study(kind="static_pose", theory=[right, against], **one))
     message = refusal(
         StudyError, prepare, study(kind="static_pose", theory=[right, Law(**LAW | law)])
     )
     assert all(word in message for word in ["[[theory]] 2", *evidence]), message
-    prepare(study(theory=[Law(**LAW | {"figure": "any_um"}), Law(**LAW | {"factor": "any_m"})]))
+    mine = [Law(**LAW | {"figure": "any_um"}), Law(**LAW | {"factor": "any_m"})]
+    prepare(study(theory=mine, **one))
     message = refusal(
         StudyError, prepare, study(theory=[Law(**LAW | {"factor": "sensor.camera.drk_noise"})])
     )

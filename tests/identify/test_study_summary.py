@@ -214,6 +214,14 @@ def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refus
         summary.write(tmp_path, own, made_table(own))
 
 
+def test_a_law_against_a_figure_is_refused_before_any_row_if_two_factors_are_varied():
+    law = Law(figure=POSITION, factor="pixel_noise_grey", exponent=1.0)
+    prepare(made_study(theory=[law], factors={DARK: [10.0, 20.0]}))
+    ratio = f'state a constant ratio instead: per = "pixel_noise_grey", factor = "{DARK}", exponent'
+    with pytest.raises(StudyError, match=f"needs a study of one factor, but {DARK}, .*; {ratio}"):
+        prepare(made_study(theory=[law]))
+
+
 def test_long_title_stays_within_the_figure_of_a_single_law():
     study = made_study(
         title="How far the measured position is from the true one against the noise of the pixels"

@@ -37,7 +37,9 @@ class SensorOptions(Section):
     """Options of the sensor."""
 
     sensor: Literal["drawn", "images"] = Field(
-        "drawn", description="drawn: noise of the stated covariance; images: rendered images"
+        "drawn",
+        description="drawn: noise of the stated covariance; images: measured by the scenario's "
+        "renderer",
     )
 
 
