@@ -151,7 +151,10 @@ def budget(
         "budget.png": drawn(lambda: budget_figure(found, known)),
         "budget.json": found.to_dict(),
     }
-    files["budget.csv"] = found.to_dataframe().to_csv(index=False)
+    table = found.to_dataframe()
+    # Poses and predictions have no entry.
+    table["identified"] = table["quantity"].map(known)
+    files["budget.csv"] = table.to_csv(index=False)
     save_files(folder, files)
     identified = [name for name, shown in known.items() if shown]
     tell(found.to_dict(), json, quiet, lambda: _print_budget(found, identified, folder))
@@ -162,7 +165,10 @@ GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
 
 
 def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
-    """Print what each source adds to poses and identified parameters, the largest first."""
+    """Print what each source adds to poses and identified parameters.
+
+    The order is that of the predicted positions, or without them of the shares.
+    """
     import numpy as np
 
     columns = []
@@ -172,7 +178,8 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
             columns.append(1e6 * np.sqrt(np.maximum(found.variances[index : index + 3].mean(0), 0)))
     shares = 100 * found.shares[[found.quantities.index(name) for name in identified]]
     means = shares.mean(axis=0) if identified else np.zeros(len(found.sources))
-    order = np.argsort(-(columns[-2] if len(columns) == 4 else means), kind="stable")
+    main, ranked = (columns[-2], "predicted um") if len(columns) == 4 else (means, "share")
+    order = np.argsort(-main, kind="stable")
     rows = []
     for source in order:
         most = identified[int(np.argmax(shares[:, source]))] if means[source] else ""
@@ -186,7 +193,7 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
         header,
         rows,
         ("source", "most in"),
-        "what each source adds to the standard uncertainty",
+        f"what each source adds to the standard uncertainty, the largest {ranked} first",
         "the squares sum up to that of the combined one; poses: root mean square of three axes; "
         "share: mean share of the variances of identified parameters",
     )

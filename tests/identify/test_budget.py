@@ -87,12 +87,17 @@ def test_the_squares_sum_up_to_every_variance_that_is_stated(identified):
 def test_the_command_writes_table_picture_and_numbers_that_agree(identified, capfd):
     assert command("budget", identified.path) == 0
     said = capfd.readouterr().out
+    assert "the largest predicted um first" in " ".join(said.split())
     assert "drives: zeros of the joints" in said
     assert "combined" in said
     folder = RunFolder(identified.path).budget
     whole = json.loads((folder / "budget.json").read_text())
     with (folder / "budget.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
+    entries = load_result(identified.result)["identification"]["parameters"]
+    for row in rows:
+        known = entries.get(row["quantity"], {"identifiable": ""})["identifiable"]
+        assert row["identified"] == str(known)
     for name, entry in whole.items():
         own = [row for row in rows if row["quantity"] == name]
         squares = sum(float(row["added"]) ** 2 for row in own)
