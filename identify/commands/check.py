@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands.kinds_of_files import check_kind
 from identify.commands.options import (
     STANDARD_OUTPUT,
     JsonFile,
@@ -13,7 +14,6 @@ from identify.commands.options import (
     Settings,
     chosen_scenario,
     completion,
-    named,
     tell,
 )
 from identify.errors import VerificationError
@@ -29,11 +29,11 @@ OF_ROBOTS = ("--scenario", "--parameters", "--set")
 def check(
     robot: Annotated[
         str,
-        named(
-            "robot",
-            "Built-in robot, or the path of a robot file; or a record of your own: a netCDF file, "
-            "or a log with its TOML file.",
+        typer.Argument(
+            help="Built-in robot, or the path of a robot file; or a record of your own: a netCDF "
+            "file, a log with its TOML file, or a TOML file that names its log.",
             metavar="ROBOT|RECORD",
+            autocompletion=completion("robot"),
         ),
     ],
     scenario: Annotated[
@@ -100,6 +100,7 @@ def check(
                 )
         _check_record(path, page or Path(f"{path.stem}-check.html"), json, quiet)
         return
+    check_kind("robot", robot)
     if page is not None:
         raise typer.BadParameter(f"{robot} is a robot, and has no page", param_hint="--page")
     from dynamics import load_robot

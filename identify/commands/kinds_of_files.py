@@ -15,7 +15,8 @@ KEYS = {
 }
 # Commands that use a file of a kind.
 USES = {
-    "description of a log": "cmmsim identify --record LOG, where LOG is the log beside it",
+    "description of a log": "cmmsim check LOG, and cmmsim identify --record LOG, where LOG is the "
+    "log beside it, or {0} if it names its log",
     "robot": "cmmsim check {0}, and cmmsim run quick --robot {0}",
     "sensor": "cmmsim acceptance {0}, and cmmsim run quick --set sensor={0}",
     "study": "cmmsim study {0}",

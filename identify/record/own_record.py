@@ -7,7 +7,7 @@ are used. Its additional table `[record]` holds further measurements, and `[colu
 names of the columns of a log.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,7 +133,8 @@ def read_telemetry(path: Path, about: Description, robot: Robot) -> Telemetry:
     if path.suffix == ".toml" or is_bag(path):
         raise RecordError(
             f"{description_file(path)} must name the columns of its log in [{COLUMNS}], and for "
-            "another file columns.measured.file; cmmsim new record --from FILE proposes them"
+            "another file columns.measured.file; cmmsim new record --from FILE proposes them; a "
+            "log beside its TOML file is given by its own name"
         )
     return read_table(path, robot).telemetry()
 
@@ -146,19 +147,23 @@ def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
 def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: Robot) -> list[str]:
     """Return what is likely wrong with a log, as sentences.
 
-    They name the convention of rotations with which the log would fit, if there is one.
+    They name the unit of angles or the convention of rotations with which the log would fit, if
+    there is one.
     """
     found = suspicions(telemetry, robot)
     columns = about.columns
     if columns is None:
         return found
 
-    def others() -> Iterator[tuple[str, Telemetry]]:
-        for convention in columns.measured.other_conventions:
-            measured = columns.measured.model_copy(update={"convention": convention})
-            tried = replace(about, columns=columns.model_copy(update={"measured": measured}))
+    def tried(key: str, values: Iterable[str]) -> Iterator[tuple[str, Telemetry]]:
+        for value in values:
+            measured = columns.measured.model_copy(update={key: value})
+            other = replace(about, columns=columns.model_copy(update={"measured": measured}))
             with suppress(RecordError):
-                yield convention, read_telemetry(path, tried, robot)
+                yield value, read_telemetry(path, other, robot)
+
+    def others() -> Iterator[tuple[str, Telemetry]]:
+        return tried("convention", columns.measured.other_conventions)
 
     # A wrong order also changes signs and correlations of joints, so the order is judged first.
     if columns.measured.convention in EULER_ORDERS:
@@ -167,10 +172,17 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
             fractions = {convention: unexplained(one, robot) for convention, one in others()}
             if said := better_order(fraction, fractions):
                 return [said]
-    if found:
-        fitting = (convention for convention, one in others() if fits(one, robot))
-        if convention := next(fitting, ""):
-            found[-1] += f"; with convention = {convention!r} of the poses it would fit"
+    # Where the poses fit as stated, such as with commands in a wrong unit, no other ones are tried.
+    if found and not fits(telemetry, robot):
+        units = [unit for unit in ("rad", "deg") if unit != columns.measured.angle_unit]
+        for key, values in (
+            ("angle_unit", units if len(columns.measured.orientation) == 3 else []),
+            ("convention", columns.measured.other_conventions),
+        ):
+            fitting = (value for value, one in tried(key, values) if fits(one, robot))
+            if value := next(fitting, ""):
+                found[-1] += f"; with {key} = {value!r} of the poses it would fit"
+                break
     return found
 
 

@@ -28,7 +28,9 @@ def test_a_file_of_another_kind_is_refused_with_the_commands_that_use_it(tmp_pat
         (["run", robot], f"cmmsim run quick --robot {robot}"),
         (["run", "quick", "--robot", sensor], f"cmmsim run quick --set sensor={sensor}"),
         (["check", sensor], f"cmmsim acceptance {sensor}"),
-        (["check", take], "cmmsim identify --record LOG"),
+        (["workspace", take], "cmmsim identify --record LOG"),
+        # A description is checked as a record, but this one names no log.
+        (["check", take], "a log beside its TOML file is given by its own name"),
         (["study", robot], f"cmmsim check {robot}"),
     ]:
         assert command(*words) == 1

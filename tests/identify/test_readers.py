@@ -335,7 +335,35 @@ def test_a_quaternion_of_the_other_order_is_named(record, tmp_path):
         read_own_records([path])
 
 
-def test_a_description_alone_names_its_log(record, tmp_path):
+def test_degrees_taken_for_rad_are_named_where_angles_wrap(record, tmp_path):
+    """A pitch beyond a quarter turn of rad is another rotation, so scaled angles cannot fit."""
+    path = as_table(tmp_path, record)
+    table = pd.read_csv(path)
+    names = [name for name in table if name.startswith("measured_")][:6]
+    ok = record["measured_ok"].values == 1
+    tilted = Rotation.from_euler("Y", 0.05)  # rad, almost three degrees
+    ours = poses(record, "measured")[ok]
+    table.loc[ok, names[:3]] = tilted.apply(ours[:, :3])
+    turned = tilted * Rotation.from_euler("XYZ", ours[:, 3:])
+    table.loc[ok, names[3:]] = turned.as_euler("XYZ", degrees=True)
+    table.to_csv(path, index=False)
+    change(
+        path.with_suffix(".toml"),
+        "[columns.reference]",
+        "base_from_frame = [0, 0, 0, 0, -0.05, 0]\n[columns.reference]",
+    )
+    with pytest.raises(RecordError, match="; with angle_unit = 'deg' of the poses it would fit"):
+        read_own_records([path])
+
+
+def test_commands_in_a_wrong_unit_do_not_put_the_convention_in_doubt(record, tmp_path):
+    path = as_table(tmp_path, record)
+    change(path.with_suffix(".toml"), 'unit = "rad"', 'unit = "deg"')
+    with pytest.raises(RecordError, match=r"are in rad and not degrees \(columns.command.unit\)$"):
+        read_own_records([path])
+
+
+def test_a_description_alone_names_its_log(record, tmp_path, capfd):
     """Bags are folders with dots in their names, and one description can name several files."""
     path = as_motive(tmp_path, record)
     text = path.with_suffix(".toml").read_text()
@@ -344,6 +372,10 @@ def test_a_description_alone_names_its_log(record, tmp_path):
     )
     found = telemetry_of(tmp_path / "whole.toml")
     np.testing.assert_array_equal(found.poses.pose, telemetry_of(path).poses.pose)
+    # The check takes this file, too, and reads its log.
+    change(tmp_path / "whole.toml", 'file = "take.csv"', 'file = "none.csv"')
+    assert command("check", tmp_path / "whole.toml") == NOT_DONE
+    assert "none.csv" in one_line(capfd.readouterr().err)
 
 
 def test_a_mapped_table_is_the_record_that_our_own_table_is(record, tmp_path):
@@ -485,6 +517,10 @@ def motive_row(old, new, line=12):
         (
             described_as('time_unit = "ms"', 'time_unit = "ms"\ntime_offset_s = 1e9'),
             "the clocks do not overlap; columns.command.time_offset_s is added .* -1000000000 s more",
+        ),
+        (
+            described_as('"t_ms"\ntime_unit = "ms"', '"t_ms"\ntime_offset_s = 1e9'),
+            r"last 1.983 s, and .* 1983 s: the unit .* factor of 1000; state it by time_unit",
         ),
         (described_as("[columns.command]", "[columns.commands]"), "command is missing"),
         (described_as('time = "t_ms"', 'topic = "x"'), "command.time must name the column"),

@@ -39,6 +39,9 @@ from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, T
 UNIT_LENGTH = 0.01
 # Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones may be degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
+# Largest distance of the ratio of two durations from a power of 1000, in powers, at which the unit
+# of one is likely wrong. It is a factor of 2.
+ALIKE = 0.1
 ZEROS_REMEDY = 'lost = "zeros" in [columns.measured] takes them as lost'
 
 
@@ -375,6 +378,15 @@ def _check_overlap(poses: PoseLog, commands: CommandLog) -> None:
     first, last = commands.time[0], commands.time[-1]
     if first <= poses.time[-1] and last >= 0:
         return
+    spans = float(np.ptp(poses.time)), float(np.ptp(commands.time))
+    powers = float(np.log10(max(spans[0], 1e-9) / max(spans[1], 1e-9))) / 3
+    if round(powers) and abs(powers - round(powers)) < ALIKE:
+        raise RecordError(
+            f"the poses of {poses.rows.source} last {spans[0]:.4g} s, and the commands of "
+            f"{commands.rows.source} {spans[1]:.4g} s: the unit of one of their times seems wrong "
+            f"by a factor of {1000 ** abs(round(powers)):g}; state it by time_unit in "
+            "[columns.measured] or [columns.command]"
+        )
     raise RecordError(
         f"the commands of {commands.rows.source} run from {first:.12g} to {last:.12g} s after the "
         f"first pose, and the poses of {poses.rows.source} to {poses.time[-1]:.9g} s: the clocks "
