@@ -63,7 +63,7 @@ class DaskExecutor:
         self._seen = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches in the order in which they finish.
+        """Yield batches in the order in which they finish, and an empty list after a vain wait.
 
         Raises StudyError if the scheduler is gone, if there has been no worker for
         WORKERLESS_SECONDS, or if a worker cannot run this program.
@@ -73,7 +73,7 @@ class DaskExecutor:
                 finished = self._next()
                 if finished:
                     batches.update_row_time(finished)
-                    yield finished
+                yield finished
         except OSError as error:
             raise scheduler_lost(error) from error
 

@@ -122,7 +122,7 @@ def _figures(
         yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
     if study.sample is None and len(grid) >= 2:
-        yield "map", map_figure(study, done, (grid[0], grid[1]), shown[:2])
+        yield "map", map_figure(study, done, (grid[0], grid[1]), shown)
     laws = [
         (law, verdict)
         for law, verdict in zip(study.theory, verdicts, strict=True)
@@ -234,7 +234,13 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 
 
 def _title(figure: Figure, text: str) -> None:
-    """Write a title above all panels, in as many lines as the width of the figure needs."""
+    """Write a title above all panels, in as many lines as the width of the figure needs.
+
+    The title says if data lie beyond the frame of a panel, see WIDEST_BAND.
+    """
+    drawn = [(axes.get_ylim(), line.get_ydata()) for axes in figure.axes for line in axes.lines]
+    if any(np.min(values) < low or np.max(values) > high for (low, high), values in drawn):
+        text += "; what lies beyond the frame is cut"
     figure.suptitle(
         "\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9
     )

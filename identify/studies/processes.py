@@ -80,7 +80,7 @@ class ProcessExecutor:
         self._looked = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches in the order in which they finish.
+        """Yield batches in the order in which they finish, and an empty list after each wait.
 
         Raises StudyError if processes cannot be started, or repeatedly die before they are ready.
         """
@@ -91,6 +91,7 @@ class ProcessExecutor:
                 for worker in self._wait():
                     if finished := self._collect(worker, batches, suspects):
                         yield finished
+                yield []
                 self._start_missing()
         finally:
             # After an error, processes can still compute rows that nobody will read.

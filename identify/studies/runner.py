@@ -51,7 +51,8 @@ class Outcome:
         return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
-# Function that computes all batches, and yields the rows of each batch when it finishes.
+# Function that computes all batches, and yields the rows of each batch when it finishes. It also
+# yields empty lists, so that the progress is shown while the first rows take long.
 Executor = Callable[[Shared, "Batches"], Iterator[list[Finished]]]
 # Function that returns an executor as a context. The workers live as long as the context.
 Workers = Callable[[], AbstractContextManager[Executor]]
@@ -154,9 +155,11 @@ def _compute_pending(
     raise_interrupt()
     with workers() as execute, progress.stage(f"rows of {name}", missing) as advance:
         for finished in execute(shared, batches):
-            journal.append(finished)
+            if finished:
+                journal.append(finished)
             advance(len(finished))
-            shown()
+            if finished:
+                shown()
 
 
 # Intended duration of a batch, s. It is long enough that sending costs little. A process that is

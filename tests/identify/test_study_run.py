@@ -3,6 +3,7 @@ and their table.
 """
 
 import errno
+import io
 import json
 import os
 import warnings
@@ -16,13 +17,15 @@ import pyarrow.parquet as pq
 import pytest
 import xarray as xr
 from filelock import FileLock
+from rich.console import Console
 
 from identify.errors import StudyError
 from identify.files.versions import OtherVersionsWarning, versions
-from identify.progress import SilentProgress
+from identify.progress import RichProgress, SilentProgress
 from identify.scenario import load_scenario
 from identify.studies import runner
 from identify.studies.dask_cluster import check_workers
+from identify.studies.processes import ProcessExecutor
 from identify.studies.runner import BATCH_SECONDS, LARGEST_BATCH, Batches, compute, run_study
 from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE, VIEW
 from identify.studies.study_design import Case, Finished
@@ -55,6 +58,23 @@ def stop(folder, rows, error=KeyboardInterrupt, **entries):
     with pytest.raises((StudyError, SystemError)) as caught:
         run_study(small_study(**entries), folder, SilentProgress(), lambda: nullcontext(execute))
     return str(caught.value)
+
+
+def test_a_study_says_where_it_is_before_its_first_row_ends(tmp_path, monkeypatch):
+    """Workers report now and then that nothing has finished."""
+    monkeypatch.setattr("identify.progress.LINE_S", 0.0)
+    executor, said = ProcessExecutor(1), io.StringIO()
+    for name, answer in (("start_missing", None), ("assign_batches", True), ("wait", [])):
+        monkeypatch.setattr(executor, f"_{name}", lambda *_, answer=answer: answer)
+
+    def execute(setup, batches):
+        yield next(executor(setup, batches))
+        raise KeyboardInterrupt
+
+    progress = RichProgress(Console(file=said, width=100))
+    with pytest.raises(StudyError, match="0 of 18 rows"):
+        run_study(small_study(), tmp_path / "a", progress, lambda: nullcontext(execute))
+    assert said.getvalue().startswith("rows of mine: 0 of 18 in 0.0 s")
 
 
 @pytest.mark.parametrize(("row_seconds", "workers"), [(1e-5, 1), (0.004, 2), (0.1, 8), (30.0, 3)])

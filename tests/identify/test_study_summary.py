@@ -214,6 +214,22 @@ def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refus
         summary.write(tmp_path, own, made_table(own))
 
 
+def test_the_map_shows_all_figures_and_the_title_says_if_bands_are_cut(tmp_path, monkeypatch):
+    """With bands of 2 rows that differ by a factor of 1.01 or 20."""
+    maps, study = [], made_study(repeats=2, theory=[])
+    monkeypatch.setattr(
+        figures_of_studies, "map_figure", lambda *arguments: maps.append(arguments[3])
+    )
+    shown = [POSITION, ORIENTATION, "lost_frames"]
+    list(figures_of_studies._figures(study, made_table(study), shown, [], []))
+    assert maps == [shown]
+    for ratio, cut in ((1.01, False), (20.0, True)):
+        frame = made_table(study, figures=lambda *_: {POSITION: 1.0})
+        frame.loc[frame["repeat"] == 1, POSITION] = ratio
+        title = factor_figure(study, frame, DARK, [POSITION]).texts[0].get_text()
+        assert ("beyond the frame is cut" in " ".join(title.split())) == cut
+
+
 def test_a_law_against_a_figure_is_refused_before_any_row_if_two_factors_are_varied():
     law = Law(figure=POSITION, factor="pixel_noise_grey", exponent=1.0)
     prepare(made_study(theory=[law], factors={DARK: [10.0, 20.0]}))
