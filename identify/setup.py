@@ -34,6 +34,7 @@ from identify.experiment.plant import (
     with_springs,
     with_uneven_friction,
 )
+from identify.experiment.rig_as_known import warn_of_ignored_covariance
 from identify.experiment.run import excitation_run
 from identify.experiment.sensor_in_loop import SensorPlan, teach
 from identify.experiment.true_robot import true_parameters, true_robot, with_true_bodies
@@ -190,9 +191,11 @@ class Setup:
     def sensor_plan(self) -> SensorPlan:
         """Description of the sensor to be made."""
         scenario = self.scenario
+        file = scenario.sensor_file()
+        warn_of_ignored_covariance(scenario.rig, file, scenario.sensor)
         return SensorPlan(
             name=scenario.sensor,
-            file=scenario.sensor_file(),
+            file=file,
             renderer=scenario.renderer,
             method=scenario.pose_method,
             rig=scenario.rig,

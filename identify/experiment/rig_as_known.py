@@ -5,7 +5,9 @@ The covariance comes from a calibration file, or from a calibration with fifteen
 true cameras are always those of the sensor file.
 """
 
+import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,22 @@ def known_rig(
         else stated_covariance(Path(section.known), rig)
     )
     return KnownRig.drawn(rig, stated, rng, exposure)
+
+
+def warn_of_ignored_covariance(section: Rig, file: SensorFile, name: str) -> None:
+    """Warn once if the sensor file ``name`` states a covariance of its cameras that is not used."""
+    if section.known == "exact" and file.rig.covariance is not None:
+        _warn_of_ignored(name)
+
+
+@cache
+def _warn_of_ignored(name: str) -> None:
+    # The stages of one run make several setups, and its user needs one warning.
+    warnings.warn(
+        f"sensor file {name} states a covariance of its cameras, and rig.known = exact ignores it: "
+        "set rig.known to the calibration.json that cmmsim calibrate wrote beside it",
+        stacklevel=3,
+    )
 
 
 def calibrated_rig(

@@ -1,5 +1,6 @@
 """The door from Python: what a person types in a notebook, against the rooms behind it."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,19 @@ def test_a_setup_runs_the_experiment_that_one_call_does_and_runs_it_again(setup,
     )):  # fmt: skip
         for name in record.data_vars:
             np.testing.assert_array_equal(other[name].values, record[name].values)
+
+
+def test_cameras_with_a_covariance_that_are_taken_as_exact_are_warned_of(tmp_path):
+    path = tmp_path / "mine.toml"
+    matrix = np.diag(np.full(24, 1e-8)).tolist()
+    text = f'name = "mine"\nbased_on = "ctrack780"\n[rig.covariance]\nmatrix = {matrix}\n'
+    path.write_text(text)
+    scenario = identify.load_scenario("quick", sensor=str(path))
+    with pytest.warns(UserWarning, match=r"covariance of its cameras, and rig\.known = exact"):
+        _ = identify.set_up(scenario).sensor_plan
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _ = identify.set_up(scenario.with_overrides({"rig.known": "photographs"})).sensor_plan
 
 
 def test_a_record_finds_its_own_truth_and_no_other(setup, record, tmp_path):
