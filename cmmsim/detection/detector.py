@@ -129,6 +129,8 @@ def find_detector(name: str) -> Detector:
     return find("detector", name, DETECTORS, Detector, _check_centres)
 
 
+ROUNDING = 1e-9  # largest negative eigenvalue that counts as rounding, as a fraction of the other
+
 _WARNED: set[str] = set()  # users' detectors that this process has already warned of
 
 
@@ -144,6 +146,13 @@ def _check_centres(part: str, result: object, spots: SpotWindows) -> None:
     good = np.asarray(getattr(result, "good"))  # noqa: B009
     if good.dtype != bool or good.shape != (count,):
         raise CmmError(f"{part} must return good ({count},) of bool, got {good.dtype} {good.shape}")
+    found = np.asarray(result.covariances)[good]  # type: ignore[attr-defined]
+    least, largest = np.linalg.eigvalsh(found).T
+    if (least < -ROUNDING * np.abs(largest)).any():
+        raise CmmError(
+            f"{part} must return covariances without a negative eigenvalue where good, got "
+            f"{least.min():.3g} px²"
+        )
     centres = np.asarray(result.centres)[good]  # type: ignore[attr-defined]
     fault, certain = likely_fault(spots.windows[good], spots.corners[good], centres)
     if fault and not certain and part not in _WARNED:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cmmsim.errors import SensorFileError
-from cmmsim.files.rig_and_bodies import MarkedBody, marked_body
+from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.schema import Body, SensorFile, StickerPlane, unit
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array
@@ -31,7 +31,6 @@ SMALLEST_SIZE_RATIO = 0.3
 # Largest depth of a sticker below the surface, m. Up to this depth, the body does not hide the
 # sticker's dark ring.
 LARGEST_DEPTH = 0.0002
-REMEDY = "; {}.drop = true moves the planes of stickers onto the surface"
 # A line may miss a triangle by this fraction of the triangle's size, so that no line passes between
 # two triangles.
 EDGE_TOLERANCE = 1e-6
@@ -95,8 +94,7 @@ def with_meshes(file: SensorFile, source: str) -> SensorFile:
             mesh = read_mesh(section, name)
             require_size(mesh, section, name)
             on_mesh = _dropped(mesh, section, name) if section.drop else section
-            remedy = "" if section.drop else REMEDY.format(name)
-            _require_on_surface(mesh, marked_body(name, on_mesh), file.stickers.radius, remedy)
+            _require_on_surface(mesh, on_mesh, name, file.stickers.radius)
         except SensorFileError as error:
             raise SensorFileError(f"{source}: {error}") from error
         changes[name] = on_mesh
@@ -175,23 +173,45 @@ def _dropped(mesh: trimesh.Trimesh, section: Body, name: str) -> Body:
 
 
 def _require_on_surface(
-    mesh: trimesh.Trimesh, body: MarkedBody, radius: float, remedy: str
+    mesh: trimesh.Trimesh, section: Body, name: str, radius: float, advise: bool = True
 ) -> None:
     """Raise SensorFileError unless all stickers lie on the surface of a mesh.
 
     A sticker must not be deeper than LARGEST_DEPTH below the surface, nor farther than ``radius``
-    from it. The message names a sticker, and ends with ``remedy``.
+    from it. The message names a sticker and, with ``advise``, what would mend it.
     """
     from trimesh.proximity import closest_point_naive  # needs no R-tree
 
+    body = marked_body(name, section)
     heights = surface_heights(mesh, body.nominal, body.sticker_normals)
-    for sticker, place, height in zip(body.sticker_ids, body.nominal, heights, strict=True):
+    for k, (sticker, place, height) in enumerate(
+        zip(body.sticker_ids, body.nominal, heights, strict=True)
+    ):
         # below a sticker that juts out over an edge there is no surface, but the edge is near
         away = float(closest_point_naive(mesh, place[None])[1][0])
         deep = height > LARGEST_DEPTH
         if deep or away > radius:
             words = f"{height:.4g} m below" if deep else f"{away:.4g} m away from"
             raise SensorFileError(
-                f"{body.name}: sticker {sticker} lies {words} the surface of its mesh, but at most "
-                f"{LARGEST_DEPTH if deep else radius:g} m is possible{remedy}"
+                f"{name}: sticker {sticker} lies {words} the surface of its mesh, but at most "
+                f"{LARGEST_DEPTH if deep else radius:g} m is possible"
+                + (_remedy(mesh, section, name, radius, k) if advise else "")
             )
+
+
+def _remedy(mesh: trimesh.Trimesh, section: Body, name: str, radius: float, sticker: int) -> str:
+    """Return what would bring a sticker, given by its index, onto the surface of a mesh."""
+    body = marked_body(name, section)
+    place, normal = body.nominal[[sticker]], body.sticker_normals[[sticker]]
+    plane = f"{name}.planes.{PLANE_NAMES[body.plane_index[sticker]]}"
+    front = float(surface_heights(mesh, place, normal)[0])
+    back = float(surface_heights(mesh, place, -normal)[0])
+    if abs(back) <= radius and not abs(front) <= radius:
+        return f"; {plane}.normal points into the body: it must point outwards"
+    try:
+        _require_on_surface(mesh, _dropped(mesh, section, name), name, radius, advise=False)
+    except SensorFileError:
+        if np.isnan(front):
+            return f"; {plane}.normal meets no surface: it lies beyond the edge of the mesh"
+        return f"; neither the mesh nor {plane} fits the other, also with {name}.drop = true"
+    return f"; {name}.drop = true moves the planes of stickers onto the surface"

@@ -319,7 +319,8 @@ def _print_scores(scores: list["Score"], sensor: str) -> None:
             "noise\n%",
             "psf\npx",
             "bound",
-            *(name.replace("_", " ") for name in names),
+            # The name of a user's own detector is that of its module.
+            *(name if ":" in name else name.replace("_", " ") for name in names),
         ),
         map(_cells, together),
         (),

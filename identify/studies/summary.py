@@ -188,10 +188,18 @@ def _markdown(
         lines += [f"- {count} x {reason}" for reason, count in entry["failures"]["reasons"].items()]
         lines += [
             "",
-            f"The first: {', '.join(str(one['row']) for one in entry['failures']['first'])}.",
+            f"{_rows_text([one['row'] for one in entry['failures']['first']], rows['failed'])}.",
         ]
     lines += ["", "## Points", "", _bands_text(points), "", *_table(study, points, shown)]
     return "\n".join(lines) + "\n"
+
+
+def _rows_text(named: list[int], count: int) -> str:
+    """Return the numbers of rows, of which there are `count` in all."""
+    if len(named) < count:
+        return f"Rows {', '.join(map(str, named))} and {count - len(named)} more"
+    *others, last = map(str, named)
+    return f"Rows {', '.join(others)} and {last}" if others else f"Row {last}"
 
 
 def _law_row(verdict: Verdict) -> str:

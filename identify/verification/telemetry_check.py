@@ -35,6 +35,8 @@ BEFORE_S = 0.1  # largest time, s, by which the motion can seem to precede its c
 CLOCK = 0.05  # largest offset of the clocks, in frames, in addition to STDS
 STDS = 3.0  # largest offset and drift of the clocks in stated standard deviations
 SHOWN_GROUPS = 0.5  # smallest fraction of the groups of parameters that the motion must show
+# Decimals of times, s, in rounded logs, by the name of their step, the coarsest first.
+ROUNDED = {"milliseconds": 3, "0.1 ms": 4, "0.01 ms": 5, "microseconds": 6}
 LISTED = 5  # largest number of names or times in a finding
 
 
@@ -81,7 +83,7 @@ def _rates(logged: LoggedRun) -> Iterator[Finding]:
         f"times between rows differ from whole frames by {1e3 * float(off.max()):.3g} ms at "
         f"most, {1e3 * _rms(off):.3g} ms RMS"
     )
-    for name, digits in (("milliseconds", 3), ("microseconds", 6)):
+    for name, digits in ROUNDED.items():
         if np.allclose(time, np.round(time, digits), rtol=0, atol=1e-9):
             text += f"; times are rounded to {name}"
             break

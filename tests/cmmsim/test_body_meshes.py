@@ -122,6 +122,11 @@ def without_a_face(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False)
 
 
+def tilted(mesh):
+    turn = trimesh.transformations.rotation_matrix(0.2, [1.0, 0.0, 0.0])
+    return mesh.copy().apply_transform(turn)
+
+
 def shifted(move):
     def shift(mesh):
         return mesh.copy().apply_translation(move)
@@ -147,7 +152,13 @@ def shifted(move):
             "sticker A1 lies 0.004 m away from .*at most 0.003 m",
         ),
         (shifted([0.0, 0.0, 0.001]), "", 1.0, "sticker A1 lies 0.001 m below .*drop = true"),
-        (shifted([0.0, 0.5, 0.0]), "", 1.0, "sticker A1 lies 0\\.\\d+ m away"),
+        (
+            shifted([0.0, 0.5, 0.0]),
+            "",
+            1.0,
+            r"sticker A1 lies 0\.\d+ m away .*planes.A.normal meets no surface: it lies beyond",
+        ),
+        (tilted, "", 1.0, "sticker A.* neither the mesh nor platform.planes.A"),
         (shifted([0.0, 5.0, 0.0]), "drop = true", 1.0, "no sticker of plane A can be dropped"),
     ],
 )
@@ -159,6 +170,14 @@ def test_a_mesh_that_cannot_be_right_is_refused_in_one_line(
         read_sensor_file(file)
     assert "\n" not in str(refused.value)
     assert str(file) in str(refused.value)
+
+
+def test_a_normal_that_points_inwards_is_named_and_drop_is_not(tmp_path, platform):
+    file = sensor_file(tmp_path, platform)
+    inwards = [-part for part in read_sensor_file("ctrack780").platform.planes.A.normal]
+    changes = WIDE | {"platform.planes.A.normal": inwards}
+    with pytest.raises(cmmsim.SensorFileError, match=r"A1 lies 0.\d+ m below .*outwards$"):
+        read_sensor_file(file, changes)
 
 
 @pytest.mark.parametrize(

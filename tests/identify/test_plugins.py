@@ -97,6 +97,33 @@ def test_rows_of_a_study_run_where_its_command_allowed_their_kind(stranger, monk
     assert compute(pickle.loads(sent), [Case(0, 0, {})])[0].figures == {"figure": 1.0}
 
 
+ROWS = """
+def three(scenario, seed):
+    return 3.0
+def words(scenario, seed):
+    return {"a": "three"}
+def listed(scenario, seed, options):
+    return {"a": [1.0]}
+def divides(scenario, seed):
+    return {"a": 1 / 0}
+"""
+
+
+def test_a_row_that_returns_no_figures_or_raises_is_named(stranger):
+    stranger.write_text(ROWS)
+    module = stranger.stem
+    allow_plugin(module)
+    for name, said in (
+        ("three", "must return its figures as a dict of numbers by name, returned float"),
+        ("words", "must return a number as figure 'a', returned 'three'"),
+        ("listed", "must return a number as figure 'a', returned [1.0]"),
+        ("divides", f"raised ZeroDivisionError: division by zero ({stranger.name}, line 9)"),
+    ):
+        setup = prepare(Study(name="own", kind=f"{module}:{name}", scenario="quick"))
+        (row,) = compute(setup, [Case(0, 0, {})])
+        assert row.error == f"StudyError: kind '{module}:{name}' {said}"
+
+
 def test_a_function_that_tells_what_it_raises_reaches_other_processes():
     told = pickle.loads(pickle.dumps(PluginFunction("detector", int, ScenarioError)))
     assert told("3") == 3
@@ -109,6 +136,15 @@ class Bad:
     def __call__(self, spots):
         found = find_detector("grey_centroid").detect(spots)
         found.centres[0, 0] = np.nan
+        return found
+
+
+class Sure(Bad):
+    """A detector with a covariance of a negative eigenvalue, whose diagonal is positive."""
+
+    def __call__(self, spots):
+        found = find_detector("grey_centroid").detect(spots)
+        found.covariances[0] = [[1e-4, 2e-4], [2e-4, 1e-4]]
         return found
 
 
@@ -127,7 +163,11 @@ biased.bias_px = "much"
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("Bad", "finite centres (36, 2), got nan"), ("short", "good (36,) of bool, got bool (35,)")],
+    [
+        ("Bad", "finite centres (36, 2), got nan"),
+        ("Sure", "without a negative eigenvalue where good, got -0.0001 px²"),
+        ("short", "good (36,) of bool, got bool (35,)"),
+    ],
 )
 def test_a_detector_that_returns_what_is_none_is_named(name, said):
     changes = {"detection.detector": f"{__name__}:{name}"}

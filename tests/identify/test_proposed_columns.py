@@ -159,6 +159,17 @@ def test_a_proposal_for_a_table_finds_poses_references_and_commands(record, tmp_
     )
 
 
+def test_rounded_times_give_the_mean_rate_and_a_mark_is_a_comment(record, tmp_path):  # noqa: F811
+    path = as_table(tmp_path, record)
+    table = pd.read_csv(path).assign(valid=1)
+    table["time_s"] = table["time_s"].round(4)  # most steps are then 16.7 ms, 59.88 a second
+    table.rename(columns=lambda name: name.replace("measured_", "tcp_")).to_csv(path, index=False)
+    proposed(path, path)
+    text = path.with_suffix(".toml").read_text()
+    assert "frame_rate_hz = 60.0" in text
+    assert '# ok = "valid"  # if it is 1' in text
+
+
 @pytest.mark.parametrize("form", ["{}_ref", "{}Ref", "desired_{}"])
 def test_desired_poses_are_proposed_by_a_word_before_or_after_their_axis(form, record, tmp_path):  # noqa: F811
     """Beside a pose of which only the position names the body."""

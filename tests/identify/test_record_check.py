@@ -79,6 +79,10 @@ def test_what_is_wrong_with_the_poses_is_found_with_its_size(record):
     assert "the first at 6.6833 s" in found["frozen poses"].text
     assert "at 5.0000" in found["jumps"].text
     assert "times the stated 15 um" in found["position noise"].text
+    assert "times are rounded" not in found["pose jitter"].text
+    log = replace(sound.poses, time=np.round(sound.poses.time, 4))
+    jitter = findings(replace(sound, poses=log))["pose jitter"]
+    assert jitter.text.endswith("times are rounded to 0.1 ms")
 
 
 def test_rows_that_are_missing_are_told_from_commands_that_changed(record):

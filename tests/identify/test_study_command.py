@@ -61,7 +61,7 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
         ([], "spread_um", 0.0, 0, ""),
         ([], "spread_um", 3.0, BEYOND_LIMIT, "1 of 1 laws failed; failed: spread_um ~"),
         ([], "error_um", 1.0, 0, ""),
-        ([1], "spread_um", 0.0, ROWS_FAILED, "1 of 8 rows failed; row 1: ValueError: row 1 has no"),
+        ([1], "spread_um", 0.0, ROWS_FAILED, "8 rows failed; row 1: StudyError: kind 'tests."),
         ([1], "spread_um", 9.0, ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )

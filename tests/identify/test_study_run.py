@@ -31,7 +31,7 @@ from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE, VIEW
 from identify.studies.study_design import Case, Finished
 from identify.studies.table import figure_names, read_table, tidy_table, to_xarray, write_view
 from tests.identify.commands import refusal
-from tests.identify.study_rows import DARK, METHOD, journal, row, same_numbers, small_study
+from tests.identify.study_rows import DARK, KIND, METHOD, journal, row, same_numbers, small_study
 
 
 def run(folder, **entries):
@@ -198,11 +198,12 @@ def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go
 ):
     """Nor may a figure hide a column of the table."""
     outcome = run(tmp_path / "a", options={"fails": [2, 11], "odd": 5, "exits": [7]})
+    raised = f"StudyError: kind '{KIND}' raised"
     assert outcome.failures == [
-        "row 2: ValueError: row 2 has no answer",
+        f"row 2: {raised} ValueError: row 2 has no answer (study_rows.py, line 51)",
         "row 5: ArithmeticError: error_um is nan",
-        "row 7: SystemExit: bye",
-        "row 11: ValueError: row 11 has no answer",
+        f"row 7: {raised} SystemExit: bye (study_rows.py, line 53)",
+        f"row 11: {raised} ValueError: row 11 has no answer (study_rows.py, line 51)",
     ]
     failed = outcome.frame["error"] != ""
     assert (

@@ -146,7 +146,7 @@ def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_fail
     for words in (
         "93 rows done, 3 failed, 0 missing",
         "2 x LostError: only 1 stickers",
-        "The first: 4, 7, 9.",
+        "Rows 4, 7 and 9.",
     ):
         assert words in text
     assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in text

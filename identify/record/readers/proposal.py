@@ -18,6 +18,7 @@ from identify.errors import RecordError
 from identify.record.columns import ASKED, FRAMES
 from identify.record.columns import TIMES as SECONDS
 from identify.record.csv_record import columns_of
+from identify.record.frame_times import mean_rate
 from identify.record.readers.csv_exports import FRAME
 from identify.record.readers.header_names import (
     COMMANDED,
@@ -38,6 +39,7 @@ from identify.record.readers.streams import Header, LoggedFile, Stream
 TIMES = ("time", "t", "timestamp", "stamp", "secs")  # words for times
 
 LOG_TIME = "log_time"
+MARKS = ("ok", "valid", "tracked", "visible")  # words for columns that mark measured poses
 
 # Conventions of three angles whose names tell no axes.
 EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz about fixed axes"
@@ -133,13 +135,18 @@ def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, ro
     if len(body.orientation) == 3:
         unit = _unit(header, body.orientation, ("rad", "deg"))
         made.add(table, "angle_unit", unit, f"rad or deg; {_range(cells, body.orientation)}")
+    flags = [name for name in header.names if is_own and name in ("ok", *own["ok"].names)]
     if is_own and table == "measured":
-        flags = [name for name in header.names if name in ("ok", *own["ok"].names)]
         made.lines += [f"ok = {_text(name)}" for name in flags]
         covariance = list(own["covariance"].names)
         if set(covariance) <= set(header.names):
             made.lines += [f"covariance = {_text(covariance)}", 'covariance_of = "angles"']
     if table == "measured":
+        made.lines += [
+            f"# ok = {_text(name)}  # if it is 1 where the pose was measured, and 0 where lost"
+            for name in header.names
+            if has_word(name, MARKS) and not flags
+        ]
         made.lines.append(
             '# lost = "zeros"  # or "repeated", where the cells of lost poses are not empty'
         )
@@ -211,11 +218,14 @@ def _propose_rows(
     cells = place.numbers.read(place.part, [*times[:1], *names])
     if times:
         unit = _unit(header, times[:1], tuple(SECONDS))
-        steps = np.diff(cells.numbers(times[0]))
+        moments = cells.numbers(times[0])
+        moments = moments[np.isfinite(moments)]
+        steps = np.diff(moments)
         step = float(np.median(steps)) if len(steps) else 0.0
         made.add(table, "time_unit", unit, f"s, ms, us, ns or frames; the steps are {step:.6g}")
         if table == "measured" and made.rate_hz is None and unit is not None and step > 0:
-            made.rate_hz = float(f"{1 / (float(SECONDS[unit]) * step):.4g}")
+            # Times that are rounded have the right rate in the mean only.
+            made.rate_hz = float(f"{mean_rate(moments) / float(SECONDS[unit]):.4g}")
     return cells
 
 

@@ -8,11 +8,15 @@ Workers must be able to import the module.
 """
 
 import inspect
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, SupportsFloat
 
-from identify.errors import StudyError
-from identify.own_parts import is_plugin_name, own_function
+import numpy as np
+
+from cmmsim.errors import CmmError
+from dynamics.errors import DynamicsError
+from identify.errors import IdentifyError, StudyError
+from identify.own_parts import PluginFunction, is_plugin_name, own_function
 from identify.studies.rows.calibrated import CALIBRATION
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.estimators import ESTIMATION
@@ -54,20 +58,37 @@ def find_kind(name: str) -> Kind:
 
 
 def _own(name: str, function: Callable[..., Any]) -> Kind:
-    """Make a kind from a function of (scenario, seed, options), or of (scenario, seed)."""
+    """Make a kind from a function of (scenario, seed, options), or of (scenario, seed).
+
+    Its errors name the function, and the file and line that raised an exception.
+    """
+    known = (CmmError, DynamicsError, IdentifyError)
+    told = PluginFunction(f"kind {name!r}", function, StudyError, known, _check_figures)
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # functions written in C can lack a signature
-        return Kind(name, function)
+        return Kind(name, told)
     for count in (3, 2):
         try:
             signature.bind(*range(count))
         except TypeError:
             continue
         if count == 3:
-            return Kind(name, function)
-        return Kind(name, lambda scenario, seed, _: function(scenario, seed), takes_options=False)
+            return Kind(name, told)
+        return Kind(name, lambda scenario, seed, _: told(scenario, seed), takes_options=False)
     raise StudyError(
         f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, "
         "seed, options)"
     )
+
+
+def _check_figures(part: str, row: object, *_: object) -> None:
+    """Raise StudyError unless a user's function returned numbers by name."""
+    if not isinstance(row, Mapping):
+        raise StudyError(
+            f"{part} must return its figures as a dict of numbers by name, returned "
+            f"{type(row).__name__}"
+        )
+    for name, value in row.items():
+        if not isinstance(name, str) or np.ndim(value) or not isinstance(value, SupportsFloat):
+            raise StudyError(f"{part} must return a number as figure {name!r}, returned {value!r}")
