@@ -30,9 +30,11 @@ from identify.record.readers.bags import is_bag
 from identify.record.readers.mapped import read_mapped
 from identify.record.recording import read
 from identify.record.suspicions import (
+    EQUAL,
     EXPLAINED,
     better_order,
     fits,
+    lag_of,
     suspicions,
     unexplained,
 )
@@ -155,21 +157,12 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
     if columns is None:
         return found
 
-    def tried(key: str, values: Iterable[str]) -> Iterator[tuple[str, Telemetry]]:
-        for value in values:
-            measured = columns.measured.model_copy(update={key: value})
-            other = replace(about, columns=columns.model_copy(update={"measured": measured}))
-            with suppress(RecordError):
-                yield value, read_telemetry(path, other, robot)
-
-    def others() -> Iterator[tuple[str, Telemetry]]:
-        return tried("convention", columns.measured.other_conventions)
-
     # A wrong order also changes signs and correlations of joints, so the order is judged first.
     if columns.measured.convention in EULER_ORDERS:
         fraction = unexplained(telemetry, robot)
         if fraction > EXPLAINED:
-            fractions = {convention: unexplained(one, robot) for convention, one in others()}
+            others = _tried(path, about, robot, "convention", columns.measured.other_conventions)
+            fractions = {convention: unexplained(one, robot) for convention, one in others}
             if said := better_order(fraction, fractions):
                 return [said]
     # Where the poses fit as stated, such as with commands in a wrong unit, no other ones are tried.
@@ -179,11 +172,38 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
             ("angle_unit", units if len(columns.measured.orientation) == 3 else []),
             ("convention", columns.measured.other_conventions),
         ):
-            fitting = (value for value, one in tried(key, values) if fits(one, robot))
+            tried = _tried(path, about, robot, key, values)
+            fitting = (value for value, one in tried if fits(one, robot))
             if value := next(fitting, ""):
                 found[-1] += f"; with {key} = {value!r} of the poses it would fit"
                 break
     return found
+
+
+def equal_orders(path: Path, about: Description, telemetry: Telemetry, robot: Robot) -> list[str]:
+    """Return other orders of Euler angles with which a log fits as well as with the stated one."""
+    columns = about.columns
+    if columns is None or columns.measured.convention not in EULER_ORDERS:
+        return []
+    names = [name for name in EULER_ORDERS if name != columns.measured.convention]
+    # The lag of a wrong order, which fits nowhere, would be searched over the whole record.
+    lag = lag_of(telemetry, robot).seconds
+    most = EQUAL * unexplained(telemetry, robot, lag)
+    others = _tried(path, about, robot, "convention", names)
+    return [name for name, one in others if unexplained(one, robot, lag) <= most]
+
+
+def _tried(
+    path: Path, about: Description, robot: Robot, key: str, values: Iterable[str]
+) -> Iterator[tuple[str, Telemetry]]:
+    """Yield values of a key of the measured columns, each with the log as it is read with it."""
+    columns = about.columns
+    assert columns is not None
+    for value in values:
+        measured = columns.measured.model_copy(update={key: value})
+        other = replace(about, columns=columns.model_copy(update={"measured": measured}))
+        with suppress(RecordError):
+            yield value, read_telemetry(path, other, robot)
 
 
 def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:

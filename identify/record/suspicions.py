@@ -88,18 +88,18 @@ def fits(telemetry: Telemetry, robot: Robot) -> bool:
     return bool(np.diagonal(_correlations(held, coordinates)).min() > FITS)
 
 
-def unexplained(telemetry: Telemetry, robot: Robot) -> float:
+def unexplained(telemetry: Telemetry, robot: Robot, lag_s: float | None = None) -> float:
     """Return the fraction of the joints' motion that the commands do not explain.
 
     Each joint follows its own command through a linear filter with the taps `FILTER_S` about the
     lag of the motion. The result is the unexplained fraction of the variance, averaged over the
-    joints. It is 1 if too few poses are in reach.
+    joints. It is 1 if too few poses are in reach. Without `lag_s`, the lag is determined here.
     """
     poses = telemetry.poses
     if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
         return 1.0
     time, coordinates = joint_motion(telemetry, robot)
-    lag = lag_of(telemetry, robot).seconds
+    lag = lag_of(telemetry, robot).seconds if lag_s is None else lag_s
     held = np.stack([_commands_at(telemetry, time - lag + later) for later in FILTER_S], axis=-1)
     fractions = []
     for commands, motion in zip(np.moveaxis(held, 1, 0), coordinates.T, strict=True):

@@ -28,6 +28,7 @@ from identify.record.delays import MotionLag, ServoDelay, servo_delay
 from identify.record.frame_times import GAP, mean_rate
 from identify.record.own_record import (
     description_file,
+    equal_orders,
     is_log,
     log_suspicions,
     read_description,
@@ -49,11 +50,12 @@ MOST_FRAMES = 10_000  # largest number of frames for which the model runs
 class LoggedRun:
     """Telemetry, and what its experimenter states about it.
 
-    telemetry    Poses and commands.
-    side         Robot and loop as the estimator knows them.
-    settings     Settings of the identification: its prior and its scale anchor.
-    stated (6,)  Stated standard deviations of a measured pose, m and rad. None if none are stated.
-    suspicions   Likely errors in the units, frames and joints.
+    telemetry     Poses and commands.
+    side          Robot and loop as the estimator knows them.
+    settings      Settings of the identification: its prior and its scale anchor.
+    stated (6,)   Stated standard deviations of a measured pose, m and rad. None if none are stated.
+    suspicions    Likely errors in the units, frames and joints.
+    equal_orders  Other orders of Euler angles with which the log fits as well.
     """
 
     telemetry: Telemetry
@@ -61,6 +63,7 @@ class LoggedRun:
     settings: Identification
     stated: Array | None
     suspicions: tuple[str, ...]
+    equal_orders: tuple[str, ...] = ()
 
     @property
     def time(self) -> Array:
@@ -196,6 +199,7 @@ def read_logged_run(path: Path) -> LoggedRun:
         telemetry = read_telemetry(path, about, robot)
         _check_unit_of_times(telemetry.poses.time, scenario.timing.frame_rate_hz, path)
         suspected = log_suspicions(path, about, telemetry, robot)
+        orders = [] if suspected else equal_orders(path, about, telemetry, robot)
         measured = about.measured
         stds = [measured.position_std_m, measured.orientation_std_rad]
         stated = None if None in stds else np.repeat(np.array(stds, dtype=float), 3)
@@ -206,12 +210,18 @@ def read_logged_run(path: Path) -> LoggedRun:
         telemetry = recorded_telemetry(record, str(path))
         _check_unit_of_times(telemetry.poses.time, scenario.timing.frame_rate_hz, path)
         suspected = suspicions(telemetry, robot)
+        orders = []
         stated = None
     if telemetry.poses.covariance is not None:
         covariance = telemetry.poses.covariance[telemetry.poses.ok]
         stated = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
     return LoggedRun(
-        telemetry, model_side(robot, scenario), scenario.identification, stated, tuple(suspected)
+        telemetry,
+        model_side(robot, scenario),
+        scenario.identification,
+        stated,
+        tuple(suspected),
+        tuple(orders),
     )
 
 

@@ -238,6 +238,11 @@ def _saturation(logged: LoggedRun) -> Iterator[Finding]:
 def _plausible(logged: LoggedRun) -> Iterator[Finding]:
     if not logged.suspicions:
         text = "nothing contradicts the units, axes, directions and zeros of the robot file"
+        if logged.equal_orders:
+            text += (
+                "; the motion is too small to tell the stated order of the Euler angles from "
+                f"{', '.join(logged.equal_orders)}"
+            )
         yield Finding("units and frames", True, 0, text, limit=0)
     for one in logged.suspicions:
         count = len(logged.suspicions)

@@ -22,6 +22,7 @@ from identify.record.own_record import (
 )
 from identify.record.readers.bags import Bag
 from identify.record.recording import poses, write
+from identify.verification.logged_run import read_logged_run
 from tests.identify.commands import command, one_line
 from tests.identify.log_files import (
     FIRST_FRAME,
@@ -354,6 +355,29 @@ def test_degrees_taken_for_rad_are_named_where_angles_wrap(record, tmp_path):
     )
     with pytest.raises(RecordError, match="; with angle_unit = 'deg' of the poses it would fit"):
         read_own_records([path])
+
+
+def test_orders_of_angles_that_a_small_motion_cannot_tell_are_named(record, tmp_path):
+    """In a frame that is turned by a radian the order changes the motion, and none is equal."""
+    path = as_table(tmp_path, record)
+    change(path.with_suffix(".toml"), 'convention = "euler_XYZ"', 'convention = "euler_xyz"')
+    assert "euler_XYZ" in read_logged_run(path).equal_orders
+    table = pd.read_csv(path)
+    names = [name for name in table if name.startswith("measured_")][:6]
+    ok = record["measured_ok"].values == 1
+    frame = [0.5, 0.6, -0.7]  # alpha, beta, gamma, rad
+    turned = Rotation.from_euler("XYZ", frame).inv()
+    ours = poses(record, "measured")[ok]
+    table.loc[ok, names[:3]] = turned.apply(ours[:, :3])
+    seen = turned * Rotation.from_euler("XYZ", ours[:, 3:])
+    table.loc[ok, names[3:]] = seen.as_euler("xyz")
+    table.to_csv(path, index=False)
+    change(
+        path.with_suffix(".toml"),
+        "[columns.reference]",
+        f"base_from_frame = [0, 0, 0, {', '.join(map(str, frame))}]\n[columns.reference]",
+    )
+    assert read_logged_run(path).equal_orders == ()
 
 
 def test_commands_in_a_wrong_unit_do_not_put_the_convention_in_doubt(record, tmp_path):

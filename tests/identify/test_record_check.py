@@ -29,9 +29,9 @@ def record():
     return found.assign(command_time=("time", found["time"].values + 0.004))
 
 
-def findings(telemetry, stated=SIGMA):
+def findings(telemetry, stated=SIGMA, orders=()):
     found = tuple(suspicions(telemetry, rss6()))
-    logged = LoggedRun(telemetry, side_of(SCENARIO), SCENARIO.identification, stated, found)
+    logged = LoggedRun(telemetry, side_of(SCENARIO), SCENARIO.identification, stated, found, orders)
     return {one.check: one for one in check_telemetry(logged)}
 
 
@@ -81,8 +81,9 @@ def test_what_is_wrong_with_the_poses_is_found_with_its_size(record):
     assert "times the stated 15 um" in found["position noise"].text
     assert "times are rounded" not in found["pose jitter"].text
     log = replace(sound.poses, time=np.round(sound.poses.time, 4))
-    jitter = findings(replace(sound, poses=log))["pose jitter"]
-    assert jitter.text.endswith("times are rounded to 0.1 ms")
+    found = findings(replace(sound, poses=log), orders=("euler_xyz",))
+    assert found["pose jitter"].text.endswith("times are rounded to 0.1 ms")
+    assert found["units and frames"].text.endswith("order of the Euler angles from euler_xyz")
 
 
 def test_rows_that_are_missing_are_told_from_commands_that_changed(record):
