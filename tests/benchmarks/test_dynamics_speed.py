@@ -10,6 +10,7 @@ import pytest
 
 import dynamics
 from dynamics import simulate_batch
+from dynamics.closed_loop import Reference
 from tests.benchmarks.timing import (
     FREE,
     WHOLE_SECOND_CORE,
@@ -56,6 +57,30 @@ def test_sensitivities_against_the_plain_run_and_it_against_real_time(loop, reco
     record_property("sensitivities_plain_runs", ratio)
     record_property("times_real_time", FRAMES / 60 / best["plain"])
     judge(ratio <= 15, f"sensitivities cost {ratio:.1f} plain runs, goal 15", load)
+
+
+@pytest.mark.parametrize("name", ["rss6", "delta3", "rrr3", "rus6", "pss6", "pus6", "ups6"])
+def test_a_run_with_full_bodies_against_one_with_centred_ones(name, record_property):
+    """At most 1.6 times its time, friction and stops of the joints included."""
+
+    def run(one):
+        loop = Loop(one, one.parameter_sets["truth"].vector)
+        free = one.geometry.chart.basis
+        whole = loop.reference(FRAMES)
+        motion = Reference(
+            one.home_pose + (whole.poses - one.home_pose) @ free @ free.T,
+            whole.rates @ free @ free.T,
+        )
+        return lambda: loop.run(motion)
+
+    centred = dynamics.load_robot(name)
+    rounds = {"centred": run(centred), "full": run(centred.with_full_bodies(["all"]))}
+    fastest(rounds, 1)  # compiles
+    with OtherLoad() as load:
+        best = fastest(rounds, 12)
+    ratio = best["full"] / best["centred"]
+    record_property("full_over_centred", ratio)
+    judge(ratio <= 1.6, f"full bodies cost {ratio:.2f} times the time of centred ones", load)
 
 
 def test_a_batch_uses_both_cores(loop, record_property):
