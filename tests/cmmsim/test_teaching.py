@@ -62,20 +62,20 @@ def test_teaching_error_is_as_stated(sensor, taught):
 
 @pytest.mark.rendering
 @pytest.mark.parametrize(
-    ("seed", "frames"),
+    ("seed", "frames", "step"),  # larger steps than six lead where the tracker does not look
     [
-        pytest.param(1, 40, marks=pytest.mark.slow),
-        *(pytest.param(seed, 600, marks=pytest.mark.thorough) for seed in (1, 2, 3)),
+        pytest.param(1, 40, 6, marks=pytest.mark.slow),
+        *(pytest.param(seed, 600, 1, marks=pytest.mark.thorough) for seed in (1, 2, 3)),
     ],
 )
-def test_teaching_is_repeatable_and_unbiased(seed, frames, moving_path):
+def test_teaching_is_repeatable_and_unbiased(seed, frames, step, moving_path):
     sensor = cmmsim.load_sensor("ctrack780", seed=seed)
     steps: list[tuple[int, int]] = []
     sensor.teach(lambda done, total: steps.append((done, total)))
     assert steps[0][0] == 0
     assert steps[-1][0] == steps[-1][1]
     require_stated_error(sensor, sensor.taught)
-    path = moving_path(600)[:: 600 // frames]
+    path = moving_path(step * frames)[::step]
     errors = np.array([sensor.measure(pose).pose for pose in path]) - path
     assert np.all(np.isfinite(errors))
     assert np.all(np.abs(errors.mean(axis=0)) * 1e6 < [2, 2, 2, 10, 10, 10])
