@@ -23,7 +23,7 @@ from identify.commands.options import (
     RobotArgument,
     built_in_names,
     completion,
-    of_kind,
+    robot_option,
 )
 from identify.errors import OutputFolderError
 
@@ -131,17 +131,7 @@ def robot(
 def sensor(
     file: File,
     like: Annotated[str, _like("sensor")] = "ctrack780",
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            "--robot",
-            metavar="NAME|FILE",
-            help="Robot that the sensor is to see.",
-            show_default="none",
-            autocompletion=completion("robot"),
-            callback=of_kind("robot"),
-        ),
-    ] = None,
+    robot: Annotated[str | None, robot_option("Robot that the sensor is to see.", "none")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a sensor file: timing, cameras, light and stickers of a built-in sensor, under a name

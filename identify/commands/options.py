@@ -92,19 +92,23 @@ def repeatable(what: str, default: str) -> Any:
     return typer.Option(help=f"{what}; repeatable.", show_default=default)
 
 
+def robot_option(what: str, default: str) -> Any:
+    """Return the option for a robot. Help shows `default` as the default value."""
+    return typer.Option(
+        "--robot",
+        metavar="NAME|FILE",
+        help=what,
+        show_default=default,
+        autocompletion=completion("robot"),
+        callback=of_kind("robot"),
+    )
+
+
 RobotArgument = Annotated[str, named("robot")]
 SensorArgument = Annotated[str, named("sensor")]
 ScenarioArgument = Annotated[str, named("scenario")]
 RobotOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robot",
-        metavar="NAME|FILE",
-        help="Robot in place of the scenario's robot.",
-        show_default="scenario's",
-        autocompletion=completion("robot"),
-        callback=of_kind("robot"),
-    ),
+    str | None, robot_option("Robot in place of the scenario's robot.", "scenario's")
 ]
 NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
 RunFolderOption = Annotated[
