@@ -8,8 +8,6 @@ from identify.scenario import load_scenario, scenario_names
 
 # Built-in scenario of the paper, with which scenarios without a built-in name are compared.
 BUILT_IN_PAPER = "paper"
-# Words in the meaning of a setting that was changed after the record was made.
-SET_ANEW = "when the record was made"
 
 
 class Setting(NamedTuple):
@@ -33,16 +31,8 @@ def changed_settings(
     estimator  Settings of the identification by dotted key. A user can change them after the record
                was made, so that they replace those of the record.
     """
-    ours = _settings(recorded)
-    name = ours["name"].value if "name" in ours else ""
-    # A user's own scenario may have any name.
-    base = name if name in scenario_names() else BUILT_IN_PAPER
-    theirs = _settings(load_scenario(base).to_toml())
-    for key, value in (estimator or {}).items():
-        before = ours.get(key) or _Stated(None, theirs[key].meaning if key in theirs else "")
-        if value != before.value:
-            when = f"{SET_ANEW}: {_shown(before.value)}"
-            ours[key] = _Stated(value, f"{before.meaning}; {when}" if before.meaning else when)
+    base, ours, theirs = _compared(recorded)
+    ours |= _set_anew(ours, theirs, estimator)
     absent = _Stated(None, "")
     changed = []
     # A set would lose the order of the file.
@@ -56,11 +46,48 @@ def changed_settings(
     return base, changed
 
 
+def settings_set_anew(
+    recorded: str, estimator: Mapping[str, Any] | None
+) -> list[tuple[str, str, str]]:
+    """Return key, value and meaning of each setting that was changed after the record was made.
+
+    The arguments are those of `changed_settings`.
+    """
+    _, ours, theirs = _compared(recorded)
+    anew = _set_anew(ours, theirs, estimator)
+    return [(key, _shown(one.value), one.meaning) for key, one in anew.items()]
+
+
 class _Stated(NamedTuple):
     """Value of a setting, or None if the scenario lacks it, and the meaning of the setting."""
 
     value: Any
     meaning: str
+
+
+def _compared(recorded: str) -> tuple[str, dict[str, _Stated], dict[str, _Stated]]:
+    """Return the built-in scenario for a recorded one, and the settings of the record and of it."""
+    ours = _settings(recorded)
+    name = ours["name"].value if "name" in ours else ""
+    # A user's own scenario may have any name.
+    base = name if name in scenario_names() else BUILT_IN_PAPER
+    return base, ours, _settings(load_scenario(base).to_toml())
+
+
+def _set_anew(
+    ours: Mapping[str, _Stated], theirs: Mapping[str, _Stated], estimator: Mapping[str, Any] | None
+) -> dict[str, _Stated]:
+    """Return the settings of the identification that differ from those of the record, `ours`.
+
+    Their meanings say what the record had.
+    """
+    anew = {}
+    for key, value in (estimator or {}).items():
+        before = ours.get(key) or _Stated(None, theirs[key].meaning if key in theirs else "")
+        if value != before.value:
+            when = f"when the record was made: {_shown(before.value)}"
+            anew[key] = _Stated(value, f"{before.meaning}; {when}" if before.meaning else when)
+    return anew
 
 
 def _settings(text: str) -> dict[str, _Stated]:

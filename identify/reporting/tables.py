@@ -20,7 +20,7 @@ from identify.reporting import paper
 from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals, explanation_goals, unseen
 from identify.reporting.number_format import number, significant, with_deviation
-from identify.reporting.settings import SET_ANEW, changed_settings
+from identify.reporting.settings import changed_settings, settings_set_anew
 
 AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
@@ -274,8 +274,7 @@ def seconds_table(result: dict[str, Any]) -> Table:
 
 def estimator_table(result: dict[str, Any], recorded: str) -> Table:
     """Return the settings of the estimator that differ from the recorded scenario (TOML)."""
-    _, changed = changed_settings(recorded, result.get("settings"))
-    rows = tuple((one.key, one.value, one.meaning) for one in changed if SET_ANEW in one.meaning)
+    rows = tuple(settings_set_anew(recorded, result.get("settings")))
     return Table("What was set anew for the identification", ("key", "value", "meaning"), rows)
 
 

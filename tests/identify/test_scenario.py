@@ -19,7 +19,7 @@ from identify.record.recording import read
 from identify.reporting.report_sections import provenance_section
 from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
-from identify.reporting.settings import changed_settings
+from identify.reporting.settings import changed_settings, settings_set_anew
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import ESTIMATOR_SECTIONS, scenario_schema
 from identify.setup import Setup
@@ -477,6 +477,16 @@ def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_
     assert not recorded_folder.result.exists()
     listed = {key.partition(".")[0] for key in SHORT.estimator_settings()}
     assert listed == set(ESTIMATOR_SECTIONS) < set(Scenario.model_fields)
+
+
+def test_a_setting_is_named_as_set_anew_also_where_the_built_in_scenario_has_its_value():
+    recorded = SHORT.with_overrides(DRIVEN).to_toml()
+    settings = SHORT.with_overrides(DRIVEN).estimator_settings()
+    assert settings_set_anew(recorded, settings) == []
+    settings |= {"identification.method": "closed_loop"}
+    ((key, value, meaning),) = settings_set_anew(recorded, settings)
+    assert (key, value) == ("identification.method", "closed_loop")
+    assert meaning.endswith("when the record was made: command_driven")
 
 
 def test_the_report_says_what_differs_from_the_built_in_scenario_and_what_was_set_anew(run_folder):
