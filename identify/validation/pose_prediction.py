@@ -32,6 +32,9 @@ NEIGHBOURS = 5  # number of frames over which the covariance due to noise is ave
 # Weight of the mean over the motion in a frame's covariance due to noise. Without it, the
 # covariance would be zero while the platform still rests at the start.
 SHRINKAGE = 0.02
+# Variance, in units of those of the coordinates, up to which a direction counts as one in which the
+# platform does not move. Rounding leaves some 1e-15.
+LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -70,16 +73,28 @@ class PosePrediction:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
 
     def normalised_squared_error(self, true: Array) -> float:
-        """Return the mean over the frames of e^T P^-1 e / m.
+        """Return the mean of e^T P^-1 e / m over the frames.
 
         The error e of the true poses (N, 6) is expressed in the m coordinates of the platform. The
         result is near one if the covariance P is right. Errors of parameters last for the whole
         motion, so the result of a single run scatters widely about one.
+
+        While joints stick, the platform moves along fewer than m directions. P is then singular,
+        and only the directions with a variance count. The result is NaN if P is.
         """
         free = self.chart.basis
         errors = (true - self.poses) @ free
-        weighted = np.linalg.solve(free.T @ self.covariance @ free, errors[..., None])[..., 0]
-        return float(np.mean(np.sum(errors * weighted, axis=1))) / free.shape[1]
+        covariance = free.T @ self.covariance @ free
+        if np.isnan(covariance).any():
+            return np.nan
+        # In units of the standard deviations, metres and radians are comparable.
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        unit = np.where(std > 0, std, 1.0)
+        variances, axes = np.linalg.eigh(covariance / (unit[:, :, None] * unit[:, None, :]))
+        along = np.einsum("nij,ni->nj", axes, errors / unit)
+        moving = variances > LEAST_VARIANCE
+        squared = np.divide(along**2, variances, out=np.zeros_like(along), where=moving)
+        return float(squared.sum() / max(moving.sum(), 1))
 
 
 def predict_poses(

@@ -383,6 +383,20 @@ def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
     np.testing.assert_allclose(prediction.std[7], np.sqrt(np.diag(root @ root.T)))
 
 
+def test_the_normalised_squared_error_counts_only_directions_in_which_the_platform_moves():
+    """As while four of six joints stick. Coordinates have units of their own: some are small."""
+    rng = np.random.default_rng(1)
+    root = 1e-7 * rng.normal(size=(6, 2)) * np.logspace(0, 2, 6)[:, None]
+    draws = rng.normal(size=(300, 2))
+    covariance = np.broadcast_to(root @ root.T, (300, 6, 6)).copy()
+    covariance[:100] = 0.0  # at rest
+    draws[:100] = 0.0
+    prediction = PosePrediction(rss6().geometry.chart, np.zeros((300, 6)), covariance)
+    assert prediction.normalised_squared_error(draws @ root.T) == pytest.approx(
+        np.mean(draws[100:] ** 2), rel=1e-6
+    )
+
+
 def test_where_nothing_can_be_predicted_nothing_is_said():
     """Too many frames lost to know the sensor's noise; and a model whose loop is unstable: the
     starting guess, which has no friction, at 29 Hz with a frame of latency."""
