@@ -44,7 +44,7 @@ def check_origin(record: xr.Dataset, robot: Robot, timing: Timing, servo: ServoG
     """Check that a record is complete, of this robot, and made with the model's timing and servo.
 
     Raises RecordError if the record is not complete, or does not state its scenario. Raises
-    EstimationError if robot, joints, timing or servo differ, or frames are missing.
+    EstimationError if robot, joints, timing, servo or frame rate differ, or frames are missing.
     """
     check_record(record, "the record")
     check_robot(record, robot)
@@ -187,8 +187,8 @@ def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.
 def checked_covariance(covariances: Array, ok: NDArray[np.bool_], times: Array) -> Array:
     """Return the mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,).
 
-    times (N,): times of the frames, s, which messages name. Raises EstimationError unless they are
-    symmetric and the mean is positive definite.
+    times (N,): times of the frames, s, which messages name. Raises EstimationError unless the
+    covariances are symmetric and their mean is positive definite.
     """
     _check_symmetry(covariances[ok], times[ok])
     mean = covariances[ok].mean(axis=0)
@@ -220,9 +220,9 @@ REST_RATE = 0.05  # largest initial rate of a reference at rest, as a fraction o
 # Largest distance of the first measured pose from the reference, as a fraction of the largest
 # travel of the reference's positions, or of its angles.
 REST_POSE = 0.1
-# The same for all other measured poses. It is also the largest distance of commands from the joint
-# coordinates of the reference, or of the measured motion of a timed record, as a multiple of the
-# largest travel of these coordinates.
+# Largest distance of every other measured pose from the reference, as a multiple of that travel. It
+# is also the largest distance of commands from the joint coordinates of the reference, or of the
+# measured motion of a timed record, as a multiple of the largest travel of these coordinates.
 TRAVELS = 2.0
 # Distance of commands from these joint coordinates that is always allowed, as a fraction of the
 # joints' travel limit, because the real geometry differs from the robot file.

@@ -1,7 +1,7 @@
 """Records as CSV tables: their columns, their rules, and reading them.
 
-Each row is a frame. Each column is a number, and the name of the column ends with the unit. Lines
-that begin with # are comments. Error messages name the line of the file, counted from 1.
+Each row has a time, and can hold a measured pose and a command. The names of most columns end with
+their unit. Lines that begin with # are comments. Error messages name the line, counted from 1.
 """
 
 import csv
@@ -17,7 +17,7 @@ from dynamics.files import read_bytes
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.lost_frames import check_zeros
+from identify.record.lost_pose_marks import check_zeros
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 
 # Rules for users' tables, which templates and the documentation show.
@@ -115,10 +115,10 @@ class Table:
     lines: tuple[int, ...]
 
     def telemetry(self) -> Telemetry:
-        """Return the logs of the table. They share the times of its rows that hold a command.
+        """Return the logs of the table. The log of commands has only rows that hold a command.
 
-        Raises RecordError with the line if the times do not increase, `measured_ok` is wrong, or
-        the first row holds no command.
+        Raises RecordError with the line if the times do not increase, `measured_ok` is wrong, lost
+        poses are zeros, a command lacks joints, or the first row holds no command.
         """
         start = self.groups["time"][0, 0]
         time = self.groups["time"][:, 0] - start

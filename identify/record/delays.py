@@ -20,12 +20,12 @@ from identify.filtering import interpolated
 from identify.record.smoothness import windows_of
 from identify.record.telemetry import Telemetry
 
-# Smallest step, s, of the lags that are tried. The best is then refined by a parabola.
+# Smallest step, s, of the lags that are tried. A parabola then refines the lag that is chosen.
 FINEST_S = 1e-3
 # Largest lag, s, that is tried first. Larger lags can be wrong by a period of the motion.
 CLOSE_S = 1.0
-# Difference of correlations up to which the smaller lag is taken. Five times this is the distance
-# of a good correlation from one.
+GOOD = 0.9  # correlation above which no lags larger than CLOSE_S are tried
+# Difference from the highest correlation up to which a lag nearer to zero is taken.
 ALIKE = 0.02
 FEWEST = 8  # smallest number of poses that overlap with commands
 
@@ -58,8 +58,7 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
         scores = np.array(
             [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
         )
-        # If a lag near zero has a good correlation, larger lags are not tried.
-        if len(scores) and scores.max() > 1 - 5 * ALIKE:
+        if len(scores) and scores.max() > GOOD:
             break
     if not len(scores) or scores.max() <= 0:
         return MotionLag(0.0, 0.0)
@@ -82,17 +81,13 @@ def _correlation(time: Array, coordinates: Array, command_time: Array, command: 
     inside = (time >= command_time[0]) & (time <= command_time[-1])
     if inside.sum() < FEWEST:
         return 0.0
-    held = interpolated(time[inside], command_time, command)
-    one, other = held - held.mean(axis=0), coordinates[inside] - coordinates[inside].mean(axis=0)
-    scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
-    moving = scale > 0
-    if not moving.any():
-        return 0.0
-    return float(((one * other).sum(axis=0)[moving] / scale[moving]).mean())
+    commanded = interpolated(time[inside], command_time, command)
+    followed = coordinates[inside]
+    return _mean_correlation(commanded - commanded.mean(axis=0), followed - followed.mean(axis=0))
 
 
 REACH_S = 0.5  # largest delay, s, of either sign that is tried
-PARTS = 4  # number of tried delays per time between two poses
+PARTS = 4  # number of delays that are tried within the usual time between two poses
 # Correlation below which no delay is stated, in standard deviations of the correlation of
 # independent noises.
 CERTAIN = 6.0
@@ -106,9 +101,10 @@ class ServoDelay:
                  latency.
     drift        Growth of the delay, s per s.
     spread       Median deviation from the delay and its drift, s.
-    correlation  Correlation of the noise of poses and commands, as joint coordinates.
-    resolution   Time between two rows of the commands, s. If there are more commands than poses, a
-                 command can have been written earlier than its first row by up to this time.
+    correlation  Correlation of the noise in the commands with that of the poses, in joint
+                 coordinates.
+    resolution   Usual time between two rows of commands, s. If most rows only repeat the command
+                 before, a command can have been written up to this time before its first row.
     """
 
     seconds: float
@@ -139,7 +135,7 @@ def servo_delay(telemetry: Telemetry, robot: Robot) -> ServoDelay | None:
     delays = step * (np.arange(-reach, reach + 1) + 0.5)
     correlations = np.array(
         [
-            _correlation_of_noises(
+            _mean_correlation(
                 noise, windows.deviations(_held(telemetry, rows, moments, time + delay)[1])
             )
             for delay in delays
@@ -181,9 +177,9 @@ def _held(
     return rows[first[newest]], command[newest]
 
 
-def _correlation_of_noises(one: Array, other: Array) -> float:
-    """Return the mean correlation of the n columns of two noises (K, n)."""
-    product = (one * other).sum(axis=0)
-    scale = np.sqrt((one**2).sum(axis=0) * (other**2).sum(axis=0))
+def _mean_correlation(first: Array, second: Array) -> float:
+    """Return the mean correlation of the n columns of two arrays (K, n) with mean zero."""
+    product = (first * second).sum(axis=0)
+    scale = np.sqrt((first**2).sum(axis=0) * (second**2).sum(axis=0))
     moving = scale > 0
     return float((product[moving] / scale[moving]).mean()) if moving.any() else 0.0

@@ -23,7 +23,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.record.checks import begins_at_rest
 from identify.record.frame_times import GAP, frame_grid, likelier_times, mean_rate, missing_rows
-from identify.record.lost_frames import repeated_note
+from identify.record.lost_pose_marks import repeated_note
 from identify.record.recording import build_record
 from identify.record.smoothness import wrong_poses
 from identify.record.telemetry import TIME_ROUNDING, CommandLog, PoseLog, ReferenceLog, Telemetry
@@ -270,7 +270,7 @@ def _event_times(telemetry: Telemetry, timing: Timing) -> tuple[Array, Array, li
 
 
 def _new_commands(commands: CommandLog) -> NDArray[np.bool_]:
-    """Return the rows (M,) that issue a command.
+    """Return which rows (M,) issue a command.
 
     An empty row issues none. If a logger is faster than the controller, most rows repeat the
     previous command, and only rows with another command issue one. Raises RecordError if no row

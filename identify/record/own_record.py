@@ -165,7 +165,7 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
             fractions = {convention: unexplained(one, robot) for convention, one in others}
             if said := better_order(fraction, fractions):
                 return [said]
-    # Where the poses fit as stated, such as with commands in a wrong unit, no other ones are tried.
+    # If the poses fit as stated, the commands are wrong, and no other units of poses are tried.
     if found and not fits(telemetry, robot):
         units = [unit for unit in ("rad", "deg") if unit != columns.measured.angle_unit]
         for key, values in (
@@ -196,7 +196,7 @@ def equal_orders(path: Path, about: Description, telemetry: Telemetry, robot: Ro
 def _tried(
     path: Path, about: Description, robot: Robot, key: str, values: Iterable[str]
 ) -> Iterator[tuple[str, Telemetry]]:
-    """Yield values of a key of the measured columns, each with the log as it is read with it."""
+    """Yield values of a key of the measured columns with which the log can be read, and the log."""
     columns = about.columns
     assert columns is not None
     for value in values:

@@ -84,8 +84,8 @@ def fits(telemetry: Telemetry, robot: Robot) -> bool:
     if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
         return False
     time, coordinates = joint_motion(telemetry, robot)
-    held = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
-    return bool(np.diagonal(_correlations(held, coordinates)).min() > FITS)
+    commanded = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    return bool(np.diagonal(_correlations(commanded, coordinates)).min() > FITS)
 
 
 def unexplained(telemetry: Telemetry, robot: Robot, lag_s: float | None = None) -> float:
@@ -100,9 +100,11 @@ def unexplained(telemetry: Telemetry, robot: Robot, lag_s: float | None = None) 
         return 1.0
     time, coordinates = joint_motion(telemetry, robot)
     lag = lag_of(telemetry, robot).seconds if lag_s is None else lag_s
-    held = np.stack([_commands_at(telemetry, time - lag + later) for later in FILTER_S], axis=-1)
+    commanded = np.stack(
+        [_commands_at(telemetry, time - lag + later) for later in FILTER_S], axis=-1
+    )
     fractions = []
-    for commands, motion in zip(np.moveaxis(held, 1, 0), coordinates.T, strict=True):
+    for commands, motion in zip(np.moveaxis(commanded, 1, 0), coordinates.T, strict=True):
         taps = np.column_stack([commands, np.ones(len(motion))])
         residual = motion - taps @ np.linalg.lstsq(taps, motion, rcond=None)[0]
         fractions.append(residual.var() / max(motion.var(), np.finfo(float).tiny))
@@ -148,11 +150,11 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
         yield _out_of_reach(telemetry, robot, reached)
         return
     time, coordinates = joint_motion(telemetry, robot)
-    held = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
-    moving = (np.ptp(held, axis=0) > 0) & (np.ptp(coordinates, axis=0) > 0)
+    commanded = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    moving = (np.ptp(commanded, axis=0) > 0) & (np.ptp(coordinates, axis=0) > 0)
     if not moving.all():
         return
-    alike = np.diagonal(_correlations(held, coordinates))
+    alike = np.diagonal(_correlations(commanded, coordinates))
     order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates)
     sure = np.flatnonzero(np.abs(alike) > FITS)
     hint = ""
@@ -163,7 +165,7 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
         hint = _fitting(telemetry, robot, alike.mean())
     if not hint:
         # A joint whose drive does not follow says nothing about its own zero.
-        yield from _of_joints(sure, held, coordinates, alike, robot, order)
+        yield from _of_joints(sure, commanded, coordinates, alike, robot, order)
     else:
         yield (
             "the measured motion is not that of the commands (correlations of the joints from "
@@ -184,7 +186,7 @@ def _other_order(telemetry: Telemetry, time: Array, coordinates: Array) -> str:
 
 def _of_joints(
     joints: NDArray[np.intp],
-    held: Array,
+    commanded: Array,
     coordinates: Array,
     alike: Array,
     robot: Robot,
@@ -208,7 +210,7 @@ def _of_joints(
             + (f"; or {order}" if order else "")
         )
         return
-    slopes = alike * coordinates.std(axis=0) / held.std(axis=0)
+    slopes = alike * coordinates.std(axis=0) / commanded.std(axis=0)
     slope = float(np.median(slopes[joints]))
     for factor, said in (LENGTHS_TRIED if prismatic else ANGLES_TRIED).items():
         if said and abs(np.log(slope / factor)) < np.log(SCALE):
@@ -217,7 +219,7 @@ def _of_joints(
                 f"are {said.partition(' ')[2]} (columns.command.unit)"
             )
             return
-    offsets = np.median(coordinates - held, axis=0)
+    offsets = np.median(coordinates - commanded, axis=0)
     for joint, offset in zip(joints, offsets[joints], strict=True):
         turns = 0 if prismatic else round(offset / (2 * np.pi))
         text = (
@@ -257,7 +259,7 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
     poses = telemetry.poses
     rows = np.flatnonzero(poses.ok)
     rows = rows[:: -(-len(rows) // TRIED)]
-    held = [_commands_at(telemetry, poses.time[rows] - lag) for lag in LAGS_S]
+    commanded = [_commands_at(telemetry, poses.time[rows] - lag) for lag in LAGS_S]
     best = max(alike, FITS - 0.1)
     found = ""
     for said, other in _other_poses(poses.pose[rows]):
@@ -266,7 +268,7 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
         if reached.mean() < FITS:
             continue
         joints = robot.inverse_kinematics(tried[reached])
-        score = max(np.diagonal(_correlations(one[reached], joints)).mean() for one in held)
+        score = max(np.diagonal(_correlations(one[reached], joints)).mean() for one in commanded)
         # Smaller changes are tried first. Only a better fit replaces them.
         if score > best + 0.02:
             best = score
@@ -335,10 +337,10 @@ def _reached(poses: Array, robot: Robot) -> NDArray[np.bool_]:
     return np.asarray((robot.reach_margin(poses) > 0).all(axis=-1))
 
 
-def _correlations(held: Array, coordinates: Array) -> Array:
+def _correlations(commanded: Array, coordinates: Array) -> Array:
     """Return the correlations (n, n) of the commands with the joint coordinates, both (N, n)."""
-    one = held - held.mean(axis=0)
-    other = coordinates - coordinates.mean(axis=0)
-    scale = np.sqrt(np.outer((one**2).sum(axis=0), (other**2).sum(axis=0)))
+    wanted = commanded - commanded.mean(axis=0)
+    moved = coordinates - coordinates.mean(axis=0)
+    scale = np.sqrt(np.outer((wanted**2).sum(axis=0), (moved**2).sum(axis=0)))
     # A joint that does not move correlates with none.
-    return np.asarray((one.T @ other) / np.where(scale > 0, scale, 1.0))
+    return np.asarray((wanted.T @ moved) / np.where(scale > 0, scale, 1.0))

@@ -1,7 +1,7 @@
 """Logs of a run: poses, commands and the reference, each with times of its own.
 
 Readers of files make a Telemetry, whatever the columns are called in a file. Units are m, rad and
-s, and the conventions are those of records. Times count from the first pose of the record. Commands
+s, and the conventions are those of records. Times count from the first row of the poses. Commands
 can be logged at another rate than poses, and begin before them.
 """
 

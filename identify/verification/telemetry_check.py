@@ -18,7 +18,7 @@ from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
 from identify.record.frame_times import mean_rate
 from identify.record.from_telemetry import MOST_GROSS
-from identify.record.lost_frames import REPEATED_REMEDY
+from identify.record.lost_pose_marks import REPEATED_REMEDY
 from identify.record.suspicions import joint_motion
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun

@@ -9,7 +9,7 @@ import pytest
 
 from identify.errors import RecordError
 from identify.record.from_telemetry import reading_notes
-from identify.record.lost_frames import repeated_note
+from identify.record.lost_pose_marks import repeated_note
 from identify.record.own_record import read_own_records
 from identify.record.recording import poses
 from tests.identify.test_own_record import mine, record  # noqa: F401

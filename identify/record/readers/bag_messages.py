@@ -43,8 +43,8 @@ def read_messages(
 ) -> tuple[list[int], list[list[Entry]]]:
     """Return the numbers, from 1, of the messages that have any of the columns, and the columns.
 
-    If columns other than times are read, a message must have one of these. Times are seconds, as
-    text with all their digits. Raises the exceptions of rosbags.
+    A message that has only the times among them is left out, unless only times are read. Times are
+    seconds, as text with all their digits. Raises the exceptions of rosbags.
     """
     paths = [_steps(name) for name in names]
     # Every message has a time, so times do not show whether the message has an entry.

@@ -41,7 +41,10 @@ class LoggedTable:
 
     @cached_property
     def parts(self) -> Mapping[str, Part]:
-        """Parts by the titles of their sections. Raises RecordError if there is no header."""
+        """Parts by the titles of their sections.
+
+        Raises RecordError if the file cannot be read or has no header.
+        """
         lines = list(lines_of(self.path, SEPARATORS))
         if not lines:
             raise RecordError(f"{self.path} has no lines")

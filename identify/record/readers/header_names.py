@@ -49,12 +49,12 @@ OTHERWISE = (
 
 @dataclass(frozen=True)
 class Place:
-    """Part of a file that has columns."""
+    """Part of a file that has columns. The topic is None if the file has no other part."""
 
     file: str
     topic: str | None
     header: Header
-    numbers: LoggedFile
+    log: LoggedFile
     part: str
 
 
@@ -123,7 +123,7 @@ def bodies_of(place: Place) -> Iterator[Body]:
 
 
 def _pose_words(name: str) -> list[str]:
-    """Return the words of a name, with a word for desired poses first: x_ref, xRef and ref_x."""
+    """Return the words of a name, those for desired poses first: x_ref has the words of ref_x."""
     words = words_of(name)
     parts = [part for word in words for part in re.findall("[A-Z]?[a-z0-9]+|[A-Z]+", word)]
     wanted = [part.lower() for part in parts if part.lower() in WANTED]

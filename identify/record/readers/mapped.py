@@ -29,7 +29,7 @@ from identify.record.columns import (
     PoseColumns,
 )
 from identify.record.csv_record import symmetric
-from identify.record.lost_frames import check_zeros, lost_rows
+from identify.record.lost_pose_marks import check_zeros, lost_rows
 from identify.record.readers.bags import Bag, is_bag
 from identify.record.readers.csv_exports import LoggedTable
 from identify.record.readers.streams import LoggedFile, Stream, checked_topic
@@ -39,8 +39,8 @@ from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, T
 UNIT_LENGTH = 0.01
 # Largest plausible Euler angle, or entry of a rotation vector, rad. Larger ones may be degrees.
 MOST_RADIANS = 2 * np.pi + 0.1
-# Largest distance of the ratio of two durations from a power of 1000, in powers, at which the unit
-# of one is likely wrong. It is a factor of 2.
+# Largest factor, as an exponent of 1000, between the ratio of two durations and a power of 1000, at
+# which the unit of one duration is likely wrong. The factor is 2.
 ALIKE = 0.1
 ZEROS_REMEDY = 'lost = "zeros" in [columns.measured] takes them as lost'
 
@@ -309,7 +309,7 @@ def _rotations(cells: Array, log: PoseColumns, rows: Rows) -> Rotation:
 
 
 def _from_matrices(matrices: Array, named: str, rows: Rows) -> Rotation:
-    """Return the rotations nearest to matrices (N, 3, 3). Raises RecordError for other matrices."""
+    """Return the rotations of matrices (N, 3, 3). Raises RecordError if one is no rotation."""
     deviation = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     wrong = np.flatnonzero(deviation > UNIT_LENGTH)
     if len(wrong):

@@ -15,10 +15,10 @@ import numpy as np
 
 from dynamics import Robot
 from identify.errors import RecordError
-from identify.record.columns import ASKED, FRAMES
-from identify.record.columns import TIMES as SECONDS
+from identify.record.columns import ASKED, FRAMES, TIMES
 from identify.record.csv_record import columns_of
 from identify.record.frame_times import mean_rate
+from identify.record.readers.bag_messages import LOG_TIME
 from identify.record.readers.csv_exports import FRAME
 from identify.record.readers.header_names import (
     COMMANDED,
@@ -36,9 +36,7 @@ from identify.record.readers.header_names import (
 )
 from identify.record.readers.streams import Header, LoggedFile, Stream
 
-TIMES = ("time", "t", "timestamp", "stamp", "secs")  # words for times
-
-LOG_TIME = "log_time"
+TIME_WORDS = ("time", "t", "timestamp", "stamp", "secs")  # words for times
 MARKS = ("ok", "valid", "tracked", "visible")  # words for columns that mark measured poses
 
 # Conventions of three angles whose names tell no axes.
@@ -47,7 +45,10 @@ EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz abo
 
 @dataclass
 class Proposal:
-    """Text of the tables of a description, and the keys that are left to the user."""
+    """Text of the tables of a description, the keys left to the user, and the rate of the poses.
+
+    The rate is None if neither the file nor the times of the poses tell it.
+    """
 
     lines: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
@@ -78,7 +79,8 @@ def propose(
     robot           Robot whose joints are commanded.
     body, commands  Body of the platform and group of commands, to choose between several.
 
-    Raises RecordError if there are no poses or commands, or several; the message names them.
+    Raises RecordError if there are no poses or commands, or several and no valid choice is given.
+    The message lists the possible choices.
     """
     places = [
         Place(name, topic if len(file.headers) > 1 else None, header, file, topic)
@@ -96,65 +98,68 @@ def propose(
         f"commands of {robot.layout.joints} joints",
         "--commands",
     )
-    made = Proposal(rate_hz=measured.place.header.rate_hz)
-    _propose_body(made, "measured", measured, None, robot)
-    _propose_joints(made, joints, measured.place, robot)
+    proposal = Proposal(rate_hz=measured.place.header.rate_hz)
+    _propose_body(proposal, "measured", measured, None, robot)
+    _propose_joints(proposal, joints, measured.place, robot)
     reference = [one for one in wanted if body is None or one.label != measured.label]
     if len(reference) == 1:
-        _propose_body(made, "reference", reference[0], measured.place, robot)
+        _propose_body(proposal, "reference", reference[0], measured.place, robot)
     else:
         listed = ", ".join(one.label for one in reference)
-        made.lines += [
+        proposal.lines += [
             "",
             "# [columns.reference] has the keys of [columns.measured], for desired poses;",
             f"# in this log {f'are several: {listed}' if listed else 'none is found'}",
         ]
-    return made
+    return proposal
 
 
-def _propose_body(made: Proposal, table: str, body: Body, rows: Place | None, robot: Robot) -> None:
-    """Add the table of a pose. rows: place of the measured poses, None if this is their table."""
+def _propose_body(
+    proposal: Proposal, table: str, body: Body, shared: Place | None, robot: Robot
+) -> None:
+    """Add the table of a pose. `shared` is the place of the measured poses, None for these."""
     header = body.place.header
-    made.lines += ["", f"[columns.{table}]"]
-    cells = _propose_rows(made, table, body.place, rows, [*body.position, *body.orientation])
-    made.lines.append(f"position = {_text(list(body.position))}")
-    made.add(
+    proposal.lines += ["", f"[columns.{table}]"]
+    columns = (*body.position, *body.orientation)
+    cells = _propose_source(proposal, table, body.place, shared, columns)
+    proposal.lines.append(f"position = {_text(list(body.position))}")
+    proposal.add(
         table,
         "position_unit",
         _unit(header, body.position, ("m", "mm", "cm", "um")),
         f"m, mm, cm or um; {_range(cells, body.position)}",
     )
-    made.lines.append(f"orientation = {_text(list(body.orientation))}")
+    proposal.lines.append(f"orientation = {_text(list(body.orientation))}")
     stated = f"; the file says {header.rotation}" if header.rotation else ""
     why = f"{_choices(body.orientation)}{stated}"
-    # The names in a record of our own also determine the convention of its poses.
+    # Poses in columns that are named as in a record have the convention of records.
     own = columns_of(robot)
-    is_own = (*body.position, *body.orientation) == own[table].names
+    is_own = columns == own[table].names
     convention = "euler_XYZ" if is_own else body.convention
-    made.add(table, "convention", convention, "" if convention else why)
+    proposal.add(table, "convention", convention, "" if convention else why)
     if len(body.orientation) == 3:
         unit = _unit(header, body.orientation, ("rad", "deg"))
-        made.add(table, "angle_unit", unit, f"rad or deg; {_range(cells, body.orientation)}")
+        proposal.add(table, "angle_unit", unit, f"rad or deg; {_range(cells, body.orientation)}")
     flags = [name for name in header.names if is_own and name in ("ok", *own["ok"].names)]
     if is_own and table == "measured":
-        made.lines += [f"ok = {_text(name)}" for name in flags]
+        proposal.lines += [f"ok = {_text(name)}" for name in flags]
         covariance = list(own["covariance"].names)
         if set(covariance) <= set(header.names):
-            made.lines += [f"covariance = {_text(covariance)}", 'covariance_of = "angles"']
+            proposal.lines += [f"covariance = {_text(covariance)}", 'covariance_of = "angles"']
     if table == "measured":
-        made.lines += [
+        proposal.lines += [
             f"# ok = {_text(name)}  # if it is 1 where the pose was measured, and 0 where lost"
             for name in header.names
             if has_word(name, MARKS) and not flags
         ]
-        made.lines.append(
+        proposal.lines.append(
             '# lost = "zeros"  # or "repeated", where the cells of lost poses are not empty'
         )
     if header.kind == "Motive":
-        made.lines.append(
+        proposal.lines.append(
             '# axes = ["x", "-z", "y"]  # where y is up in the log, as Motive exports by default'
         )
-    made.lines += [
+    proposal.lines += [
         "# base_from_frame = [0, 0, 0, 0, 0, 0]  # pose of the log's frame in the robot's base",
         "# body_from_platform = [0, 0, 0, 0, 0, 0]  # pose of the platform in the tracked body",
     ]
@@ -174,63 +179,65 @@ def _choices(orientation: Sequence[str]) -> str:
     )
 
 
-def _propose_joints(made: Proposal, joints: Joints, rows: Place, robot: Robot) -> None:
-    made.lines += ["", "[columns.command]"]
-    cells = _propose_rows(made, "command", joints.place, rows, joints.names)
-    made.lines.append(f"names = {_text(list(joints.names))}")
+def _propose_joints(proposal: Proposal, joints: Joints, shared: Place, robot: Robot) -> None:
+    proposal.lines += ["", "[columns.command]"]
+    cells = _propose_source(proposal, "command", joints.place, shared, joints.names)
+    proposal.lines.append(f"names = {_text(list(joints.names))}")
     units = ("m", "mm", "cm", "um") if robot.layout.prismatic else ("rad", "deg", "turn")
     unit = _unit(joints.place.header, joints.names, units)
     if "JointState" in joints.place.header.kind:
         unit = robot.layout.joint_unit
     listed = f"{', '.join(units[:-1])} or {units[-1]}, or a number"
-    made.add("command", "unit", unit, f"{listed}; {_range(cells, joints.names)}")
+    proposal.add("command", "unit", unit, f"{listed}; {_range(cells, joints.names)}")
     ones = ", ".join("1" for _ in joints.names)
     noughts = ", ".join("0" for _ in joints.names)
-    made.lines += [
+    proposal.lines += [
         f"# signs = [{ones}]  # -1 where a joint counts against the robot file",
         f"# zeros = [{noughts}]  # values at the zeros of the robot file, in this unit",
     ]
 
 
-def _propose_rows(
-    made: Proposal, table: str, place: Place, rows: Place | None, names: Sequence[str]
+def _propose_source(
+    proposal: Proposal, table: str, place: Place, shared: Place | None, names: Sequence[str]
 ) -> Stream:
-    """Add file, topic and time of a table, unless it shares the `rows` of the measured poses.
+    """Add file, topic and time of a table, unless its place is `shared` with the measured poses.
 
     Returns the columns of the table.
     """
-    if place is rows:
-        return place.numbers.read(place.part, names)
+    if place is shared:
+        return place.log.read(place.part, names)
     entries = {"file": place.file, "topic": place.topic}
-    made.lines += [f"{key} = {_text(value)}" for key, value in entries.items() if value is not None]
+    proposal.lines += [
+        f"{key} = {_text(value)}" for key, value in entries.items() if value is not None
+    ]
     header = place.header
-    found = [name for name in header.names if has_word(without_unit(name), TIMES)]
+    found = [name for name in header.names if has_word(without_unit(name), TIME_WORDS)]
     if table == "measured":
         found = [name for name in found if not has_word(name, COMMANDED)]
     # The time in a message is that of the pose. Its log time is when it was written to the bag.
     times = [name for name in found if name != LOG_TIME] or found
     if not times and FRAME in header.names:
-        made.lines += [f"time = {_text(FRAME)}", f"time_unit = {_text(FRAMES)}"]
-        return place.numbers.read(place.part, names)
+        proposal.lines += [f"time = {_text(FRAME)}", f"time_unit = {_text(FRAMES)}"]
+        return place.log.read(place.part, names)
     sure = len(times) == 1 or (bool(times) and header.kind != "CSV")
     why = "" if len(times) == 1 else f"one of {', '.join(times or header.names)}"
-    made.add(table, "time", times[0] if sure else None, why)
-    cells = place.numbers.read(place.part, [*times[:1], *names])
+    proposal.add(table, "time", times[0] if sure else None, why)
+    cells = place.log.read(place.part, [*times[:1], *names])
     if times:
-        unit = _unit(header, times[:1], tuple(SECONDS))
+        unit = _unit(header, times[:1], tuple(TIMES))
         moments = cells.numbers(times[0])
         moments = moments[np.isfinite(moments)]
         steps = np.diff(moments)
         step = float(np.median(steps)) if len(steps) else 0.0
-        made.add(table, "time_unit", unit, f"s, ms, us, ns or frames; the steps are {step:.6g}")
-        if table == "measured" and made.rate_hz is None and unit is not None and step > 0:
-            # Times that are rounded have the right rate in the mean only.
-            made.rate_hz = float(f"{mean_rate(moments) / float(SECONDS[unit]):.4g}")
+        proposal.add(table, "time_unit", unit, f"s, ms, us, ns or frames; the steps are {step:.6g}")
+        if table == "measured" and proposal.rate_hz is None and unit is not None and step > 0:
+            # If times are rounded, only their mean step gives the right rate.
+            proposal.rate_hz = float(f"{mean_rate(moments) / float(TIMES[unit]):.4g}")
     return cells
 
 
 def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> Any:
-    """Return the only entry, or the entry with a label. Raises RecordError with all labels."""
+    """Return the only entry, or the entry with a label. Raises RecordError if there is none."""
     labels = [one.label for one in found]
     if label is None and len(found) == 1:
         return found[0]

@@ -58,7 +58,7 @@ class Stream:
         return Stream(columns, Rows(self.rows.source, numbers, self.rows.word))
 
     def numbers(self, name: str) -> Array:
-        """Return a column (N,), NaN where empty. Raises RecordError with the row of other text."""
+        """Return a column (N,), NaN where empty. Raises RecordError if a cell is no number."""
         cells = self.columns[name]
         values = np.empty(len(cells))
         for row, cell in enumerate(cells):
@@ -126,11 +126,11 @@ class LoggedFile(Protocol):
         """Headers by topic, or by section of an export. A table has one header named ``""``."""
 
     def read(self, topic: str, names: Sequence[str]) -> Stream:
-        """Read columns of a topic. Raises RecordError if one is missing, and lists the others."""
+        """Read columns of a topic. Raises RecordError with all columns if one is missing."""
 
 
 def checked_topic(headers: Mapping[str, Header], topic: str | None, source: str) -> str:
-    """Return the topic, or the only one if it is None.
+    """Return the topic, or for None the only topic.
 
     Raises RecordError, with all topics, if there is no such topic, or several for None.
     """

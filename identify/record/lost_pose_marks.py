@@ -1,6 +1,7 @@
 """Lost frames that a log holds as zeros, or as the pose of the row before, and not as empty cells.
 
-The names of both forms are values of the key `lost` of ``[columns.measured]``.
+The names of both forms are values of the key `lost` of ``[columns.measured]``. Residuals leave lost
+frames out (`model.output_error_residuals`), and the sensor in a model loses them (`loop_model`).
 """
 
 import numpy as np
@@ -12,17 +13,16 @@ from identify.record.telemetry import PoseLog, Rows
 
 ZEROS = "zeros"
 REPEATED = "repeated"
-# Smallest ratio of the distance between zeros and the positions beside them to the largest usual
-# distance of two successive positions, with which the zeros count as lost frames.
+# Distance of zeros from the positions beside them above which the zeros count as lost frames, as a
+# multiple of the largest usual distance of two successive positions.
 FAR = 3.0
 USUAL = 99.0  # percentile of the distances of successive positions that counts as the largest one
-# Smallest fraction of poses that repeat the one before while the platform moves, with which a note
-# says so.
+# Fraction of poses that repeat the last one while the platform moves, above which a note says so.
 MANY = 0.01
 
 
 def zero_rows(position: Array, orientation: Array) -> NDArray[np.bool_]:
-    """Return which rows (N,) have zeros, or the identity as rotation.
+    """Return which rows (N,) have position zero, and orientations of only zeros and ones.
 
     position (N, 3), orientation (N, k): cells of the log.
     """
@@ -36,7 +36,7 @@ def repeated_rows(cells: Array) -> NDArray[np.bool_]:
 
 
 def lost_rows(lost: str, position: Array, orientation: Array) -> NDArray[np.bool_]:
-    """Return which rows (N,) hold a lost pose in the form `lost`, beside empty cells."""
+    """Return which rows (N,) hold a lost pose in the form `lost`, other than as empty cells."""
     if lost == ZEROS:
         return zero_rows(position, orientation)
     if lost == REPEATED:
