@@ -31,7 +31,6 @@ from tests.identify.synthetic import SIGMA, quick, run_plant, truth
 from tests.identify.test_interval_coverage import CHANGES, EXPERIMENTS
 
 DEFAULT = "pyrender"  # renderer of a run where it can draw
-UNSEEN = ("position_um", "orientation_urad")
 COVERAGE_KEPT = "2026-11-26"  # date of .readme/answers/interval_coverage.json, which states none
 
 ROOT = Path(__file__).parent.parent
@@ -146,19 +145,29 @@ def test_the_headline_figures_are_those_of_kept_runs():
 
 
 def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
-    result, thorough = kept("result"), kept("thorough")
+    result, short, thorough = kept("result"), kept("quick"), kept("thorough")
     noise = result["identification"]
+    assert (short["scenario"], short["seed"], short["date"]) == ("quick", 0, result["date"])
 
-    def worst(against):
-        runs = [run[against] for run in result["validation"]]
-        um, urad = (
+    def worst(against, content):
+        runs = [run[against] for run in content["validation"]]
+        return (
             max(max(run[f"{what}_rms_{unit}"]) for run in runs)
             for what, unit in (("position", "um"), ("orientation", "urad"))
         )
-        return f"| {um:.2f} µm, {urad:.2f} µrad |"
 
-    robots, _ = figures(thorough, "test_families.py")
-    quick_um, quick_urad = (robots[f"unseen_{what}_rss6"] for what in UNSEEN)
+    def both(against):
+        pairs = (worst(against, content) for content in (result, short))
+        return f"| {' | '.join(f'{um:.2f} µm, {urad:.2f} µrad' for um, urad in pairs)} |"
+
+    short_um, short_urad = worst("true", short)
+    runs = [f"`{one['scenario']}`, {len(one['validation'])} runs" for one in (result, short)]
+    stds = [
+        {name: one["std"] for name, one in found["identification"]["parameters"].items()}
+        for found in (result, short)
+    ]
+    shown = [name for name, one in noise["parameters"].items() if one["identifiable"]]
+    widths = np.median([stds[0][name] / stds[1][name] for name in shown])
     proved, proved_on = figures(thorough, "test_interval_coverage.py")
     covered = f"{100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} %"
     entries = thorough["tests"].values()
@@ -183,8 +192,11 @@ def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
             f"with images, {covered} of the 95 % intervals contained the truth",
             f"In each case {reached} of 25 searches end in the same optimum",
             f"{passed} of {len(entries)} passed, the latest on {latest}",
-            worst("measured"),
-            f"{worst('true')} {quick_um:.2f} µm, {quick_urad:.2f} µrad |",
+            f"| {' | '.join(runs)} |",
+            *map(both, ("measured", "true", "predicted")),
+            f"images by `{DEFAULT}` and one record, on {result['date']}",
+            f"{widths:.1f} times as wide (median of the identified parameters)",
+            f"on {short['date']} above came to {short_um:.2f} µm and {short_urad:.1f} µrad",
             f"comes to {result['sensor']['stereo_frames_per_second']:.0f} frames per second",
             f"computed {min(faster):.0f} to {max(faster):.0f} times as fast",
         ],
@@ -193,6 +205,7 @@ def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
             f"{reached} of 25 searches end in the same optimum",
         ],
     }
+    assert f"as those of `{short['scenario']}`" in " ".join(README.split()) and widths < 0.5
     missing = [
         f"{name}: {sentence}"
         for name, sentences in wanted.items()
@@ -207,25 +220,23 @@ def test_the_error_of_the_model_alone_is_that_of_the_kept_estimates():
     """With an ideal sensor, on the motions of the kept run: the initial model errs there as it did
     in the run. No kept file has these errors, so the runs are repeated.
     """
-    result, scenario = kept("result"), load_scenario("paper")
-    robot = dynamics.load_robot(scenario.robot)
-    entries = result["identification"]["parameters"]
+    alone = []
+    for result in (kept("result"), kept("quick")):
+        scenario = load_scenario(result["scenario"])
+        robot = dynamics.load_robot(scenario.robot)
+        entries = result["identification"]["parameters"]
 
-    def rms(which):
-        values = [entries[name][which] for name in robot.layout.names]
-        errors = identify.unseen_errors(values, robot, scenario, result["seed"])
-        return 1e6 * np.sqrt(np.mean(errors**2, axis=1))
+        def rms(which, entries=entries, robot=robot, scenario=scenario, seed=result["seed"]):
+            values = [entries[name][which] for name in robot.layout.names]
+            errors = identify.unseen_errors(values, robot, scenario, seed)
+            return 1e6 * np.sqrt(np.mean(errors**2, axis=1))
 
-    runs = [run["initial_true"] for run in result["validation"]]
-    seen = [run["position_rms_um"] + run["orientation_rms_urad"] for run in runs]
-    np.testing.assert_allclose(rms("initial"), seen, rtol=0.02)
-    alone = rms("estimate")
-    um, urad = alone[:, :3].max(), alone[:, 3:].max()
-    quick_um, quick_urad = (
-        figure.value
-        for figure in read_saved(ACCURACY).figures
-        if figure.name.startswith("identified model on unseen motion")
-    )
+        runs = [run["initial_true"] for run in result["validation"]]
+        seen = [run["position_rms_um"] + run["orientation_rms_urad"] for run in runs]
+        np.testing.assert_allclose(rms("initial"), seen, rtol=0.02)
+        found = rms("estimate")
+        alone += [found[:, :3].max(), found[:, 3:].max()]
+    um, urad, quick_um, quick_urad = alone
     for text, words in (
         (README, f"| {um:.1f} µm, {urad:.1f} µrad | `rss6`, ideal sensor, 1 record |"),
         (README, f"off by {um:.1f} µm, and that of `quick` by {quick_um:.1f} µm"),

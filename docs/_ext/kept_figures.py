@@ -61,7 +61,8 @@ def excitation_errors(folder: Path) -> str:
 
 def accuracy(folder: Path) -> str:
     """This project's own accuracy figures, in the units and words of the pages."""
-    text = str(markdown_table(read_saved(folder / "accuracy.json").figures))
+    saved = read_saved(folder / "accuracy.json")
+    text = str(markdown_table(saved.figures))
     words = {
         "95% interval": "95 % interval",
         "| um |": "| µm |",
@@ -73,7 +74,8 @@ def accuracy(folder: Path) -> str:
     }
     for old, new in words.items():
         text = text.replace(old, new)
-    return re.sub(r"(\d)% \|", r"\1 % |", text)
+    text = re.sub(r"(\d)% \|", r"\1 % |", text)
+    return f"{text.rstrip()}\n\nMeasured {saved.created[:10]}.\n"
 
 
 def sensor_speed(folder: Path) -> str:
