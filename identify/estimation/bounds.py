@@ -9,9 +9,9 @@ moments of its mass along its axes, J_x = integral of x^2 dm and so on,
 
 and the triangle inequality of the moments is equivalent to J >= 0. A search in J instead of I
 therefore needs only bounds, see Traversaro et al., "Identification of fully physical consistent
-inertial parameters" (IROS 2016). A full body is possible if its pseudo-inertia is positive
-definite; it has all ten inertial parameters. The search then uses log-Cholesky coordinates of the
-body (see `dynamics.pseudo_inertia`). A bound keeps it from becoming so flat that changes of these
+inertial parameters" (IROS 2016). A full body, which has all ten inertial parameters, is possible if
+its pseudo-inertia is positive definite. The search then uses log-Cholesky coordinates of the body
+(see `dynamics.pseudo_inertia`). A bound keeps the body from becoming so flat that changes of these
 coordinates no longer change it.
 """
 

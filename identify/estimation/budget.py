@@ -6,7 +6,7 @@ is what the source adds to the standard uncertainty of the quantity. The squares
 up to the square of the combined standard uncertainty. If sources are correlated, the effect of
 their covariances has a separate row, whose variance can be negative (GUM, section 5.2).
 
-The parts come from the matrices of the covariance itself, see `covariance`.
+`covariance` computes the part of each source as a matrix. The covariance is the sum of these parts.
 """
 
 from __future__ import annotations
@@ -103,9 +103,10 @@ class Budget:
         return np.divide(self.variances, total, out=np.zeros_like(self.variances), where=total > 0)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return the table, with a row for each source of each quantity, the largest first.
+        """Return the table, with a row for each source of each quantity.
 
-        Sources that add nothing are left out. The column `added` is the standard uncertainty that
+        Of each quantity, the source that adds most comes first, and sources that add nothing are
+        left out. The column `added` is the standard uncertainty that
         the source adds, and `share` its fraction of the variance. Both are negative in the row of
         covariances if these make the quantity better known. `combined` and `expanded` are the
         uncertainties of the quantity from all sources.
@@ -115,16 +116,12 @@ class Budget:
         added = np.sign(self.variances) * np.sqrt(np.abs(self.variances))
         rows = []
         for k, name in enumerate(self.quantities):
-            for source in np.argsort(-self.variances[k], kind="stable"):
-                if self.variances[k, source]:
-                    words, evaluation = SOURCES[self.sources[source]]
-                    rows.append(
-                        (
-                            *(name, self.units[k], words, evaluation),
-                            *(added[k, source], self.shares[k, source]),
-                            *(self.std[k], COVERAGE * self.std[k]),
-                        )
-                    )
+            combined = self.std[k]
+            for index in np.argsort(-self.variances[k], kind="stable"):
+                if self.variances[k, index]:
+                    source = SOURCES[self.sources[index]]
+                    effect = added[k, index], self.shares[k, index], combined, COVERAGE * combined
+                    rows.append((name, self.units[k], *source, *effect))
         columns = ["quantity", "unit", "source", "evaluation", "added", "share"]
         return pd.DataFrame(rows, columns=[*columns, "combined", "expanded"])
 
@@ -172,7 +169,7 @@ def parameter_budget(
     return budget_of(names, units, parts, np.diag(covariance)[: len(names)])
 
 
-def together(budgets: Sequence[Budget]) -> Budget:
+def joined_budget(budgets: Sequence[Budget]) -> Budget:
     """Return one budget with the quantities and the sources of all budgets."""
     sources = [key for key in SOURCES if any(key in one.sources for one in budgets)]
     rows = [

@@ -25,7 +25,7 @@ def common_scale(result: IdentificationResult) -> dict[str, Any] | None:
 
     The entry has the gain, the relative standard deviation of the scale, and for each identified
     parameter that shares the scale the relative standard deviation that is left without it. Returns
-    None if no law of the drives acted, the gain is unidentified, or none shares the scale.
+    None if no law of the drives acted, the gain is unidentified, or no parameter shares the scale.
     """
     gain = result.layout.joint_pid.start
     if not (result.drive.in_loop and result.identifiable[gain]):

@@ -331,8 +331,8 @@ def _repeated(
         repeated: Sequence[ClosedLoopRun], draws: np.random.Generator
     ) -> tuple[Array, float]:
         noise = [
-            one.missed + run.whiten(run.measured - made.measured)
-            for run, one, made in zip(problem.runs, found, repeated, strict=True)
+            one.missed + run.whiten(run.measured - repeat.measured)
+            for run, one, repeat in zip(problem.runs, found, repeated, strict=True)
         ]
         drawn = [
             run.without_common(residual + one.modes @ draws.standard_normal(one.modes.shape[2]))

@@ -24,7 +24,7 @@ LEAST_GROWTH = 1.05
 """Ratio of consecutive windows up to which a window that the model misses is not shortened."""
 
 MOST_WINDOWS = 30
-"""Largest number of windows that are searched. Then the search ends within the record."""
+"""Largest number of windows that are searched, even if they do not reach the end of the record."""
 
 MISSED = 2.0
 """Mean squared residual above which the model misses a window."""

@@ -97,10 +97,10 @@ def identify(
         A record is incomplete, for example without a scenario or scale anchor, or has an invalid
         value, such as a seed that is not a whole number.
     EstimationError
-        An argument has the wrong type, or there is no record. A record is of another robot, timing
-        or servo, or is not suitable for an identification. The scale anchor is a payload, and all
-        records have the same load. No stable model is found from the initial guess or the warm
-        start.
+        An argument has the wrong type, or there is no record. A record is of another robot, or is
+        not suitable for an identification. The first record has another timing or servo than the
+        scenario. The scale anchor is a payload, and all records have the same load. No stable model
+        is found from the initial guess or the warm start.
     ScenarioError
         The robot lacks the parameter set that the scenario names, or the initial guess is not
         valid for the model.
@@ -238,8 +238,9 @@ def output_error_problem(
     The scale anchor is read from the first record.
 
     Raises RecordError if the first record has no scale anchor, or a record has no measured poses.
-    Raises EstimationError if a record is of another robot, timing or servo, or is not suitable for
-    an identification, or if the scale anchor is a payload and all records have the same load.
+    Raises EstimationError if a record is of another robot or is not suitable for an identification,
+    if the first record has another timing or servo, or if the scale anchor is a payload and all
+    records have the same load.
     Raises ScenarioError if there is no parameter set for the initial guess, or the guess is not
     valid for the model.
     """

@@ -6,9 +6,9 @@ loop (eq. 17 and 31), so that poses alone do not determine this factor. One of t
     platform_mass   the platform was weighed
     joint_gain      the proportional gain of the joint PID is known (that of the first joint, if
                     each joint has its own)
-    payload         a second run with a known load on the platform (`identify.record.conditions`);
-                    the record of that run states the standard deviations of the load, which widen
-                    the intervals (`covariance`)
+    payload         a second run with a known load on the platform (`identify.record.load`); the
+                    record of that run states the standard deviations of the load, which widen the
+                    intervals (`covariance`)
     prior           only the initial guess, with its standard deviations
 """
 

@@ -111,8 +111,8 @@ def body_modes(run: "LoopModel", parameters: Array) -> dict[int, Array | float]:
     by_index: dict[int, Array | float] = {first + int(k): 0.0 for k in np.flatnonzero(~moving)}
     if run.settings.drives.torques:
         return by_index
-    made, changes = differentiated(run, parameters, run.bodies[moving].transpose(1, 2, 0))
-    run.known_runs.add(parameters, made)
+    found, changes = differentiated(run, parameters, run.bodies[moving].transpose(1, 2, 0))
+    run.known_runs.add(parameters, found)
     indices = first + np.flatnonzero(moving)
     return by_index | {int(index): changes[:, :, k] for k, index in enumerate(indices)}
 

@@ -57,7 +57,7 @@ def with_recorded_errors(
     record         Record of the run, with the errors of its poses and of the geometry.
     side           Kinds of errors, and the standard deviations of the errors of the loop and of
                    bodies.
-    motion (N, 6)  Poses of the run, at which the effect of errors of the geometry is evaluated.
+    motion (N, 6)  Poses of the run, which show which errors of the geometry are noticeable.
     own            Standard deviations of further errors in the loop, by name.
 
     Raises RecordError if the record states errors that are not valid. Raises EstimationError if

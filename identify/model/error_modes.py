@@ -86,10 +86,10 @@ def _measuring(
     groups = np.split(noises, range(LANES, len(noises), LANES))
     runs_by_group = in_threads(lambda group: run.simulate_repeats(parameters, group), groups)
     poses = []
-    for made_run in chain.from_iterable(runs_by_group):
-        if isinstance(made_run, LoopFailure):
-            raise made_run
-        poses.append(shown(made_run))
+    for repeated in chain.from_iterable(runs_by_group):
+        if isinstance(repeated, LoopFailure):
+            raise repeated
+        poses.append(shown(repeated))
     return poses
 
 
@@ -104,6 +104,6 @@ def differentiated(
     most = most_directions(run.moving(parameters, run.robot)[0], run.groups)
     parts = np.split(directions, range(most, directions.shape[2], most), axis=2)
     runs = [run.along(parameters, part) for part in parts]
-    slopes = [made.command_sensitivity for made in runs if made.command_sensitivity is not None]
+    slopes = [one.command_sensitivity for one in runs if one.command_sensitivity is not None]
     empty = np.zeros((*run.measured.shape, 0))
     return runs[0], np.concatenate([empty, *slopes], axis=2)

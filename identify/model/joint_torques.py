@@ -49,7 +49,7 @@ def equivalent_commands(
 def _while_commands_act(values: Array, latencies: Array, timing: FrameTiming) -> Array:
     """Return values (N, ...) of the frames for the time in which the command of each frame acts.
 
-    For a held command, it is the mean of the values, and for a ramp, the value at its end.
+    For a held command, this is their mean over that time, and for a ramp, the value at its end.
     """
     period = 1.0 / timing.frame_rate_hz
     times = np.arange(len(values)) * period

@@ -3,11 +3,10 @@
 Under logged torques the model has no feedback, and a deviation from the robot grows by a factor of
 about e^7 per second. Over a span of half a second, this factor is small. For every set of
 parameters, the coordinates and rates at the start of each span are fitted to the measured poses of
-the span by Gauss-Newton.
-The poses of a run are the poses of the fitted spans. Their derivatives with respect to the
-parameters account for the fit of the starts (variable projection in Kaufman's form; BIT 15, 1975).
-Prior knowledge of a start is negligible. For m coordinates of the platform, the fit of a start
-therefore uses 2 m degrees of freedom of the residuals of its span.
+the span by Gauss-Newton. The poses of a run are the poses of the fitted spans. Their derivatives
+with respect to the parameters account for the fit of the starts (variable projection in Kaufman's
+form; BIT 15, 1975). Prior knowledge of a start is negligible. For m coordinates of the platform,
+the fit of a start therefore uses 2 m degrees of freedom of the residuals of its span.
 """
 
 from dataclasses import dataclass, field, fields, replace

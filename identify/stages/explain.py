@@ -14,7 +14,7 @@ from identify.arrays import Array
 from identify.diagnosis.cause import Cause
 from identify.diagnosis.diagnose import diagnosis_from
 from identify.diagnosis.diagnosis import Diagnosis
-from identify.estimation.budget import Budget, budget_of, parameter_budget, together
+from identify.estimation.budget import Budget, budget_of, joined_budget, parameter_budget
 from identify.estimation.covariance import NOISE
 from identify.estimation.explanation import LITTLE, MISFIT, SUSPICIOUS, Misfit, needs_cause
 from identify.estimation.identification import output_error_problem
@@ -153,7 +153,7 @@ def error_budget(folder: Path | str) -> Budget:
                 continue
         if runs:
             budgets.insert(1, _prediction_budget(runs))
-    return together(budgets)
+    return joined_budget(budgets)
 
 
 def pose_budget(record: xr.Dataset, side: ModelSide) -> Budget:

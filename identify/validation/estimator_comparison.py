@@ -83,9 +83,9 @@ class ComparisonTruth:
         )
 
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
-        """Return the RMS pose error of the worst axis and run, um and urad.
+        """Return the RMS errors of position, um, and angles, urad, of the worst axis and run.
 
-        It is NaN if the model's loop is unstable, or if no model can have the parameters, for
+        Both are NaN if the model's loop is unstable, or if no model can have the parameters, for
         example a gain of zero.
         """
         errors = []

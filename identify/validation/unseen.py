@@ -123,7 +123,7 @@ def model_on_record(side: ModelSide, parameters: Array, record: xr.Dataset) -> A
     made under the servo, the model simulates the servo. Otherwise the logged commands drive the
     model. A model that begins in motion gets the starts and the clock that fit the record best.
 
-    Raises the errors of `model_run`.
+    Raises the errors of `model_run` and `predicting_model`.
     """
     if recorded_law(record) == SERVO and not is_timed(record):
         latencies = logged_latencies(record, side.timing)

@@ -41,10 +41,7 @@ class LoggedTable:
 
     @cached_property
     def parts(self) -> Mapping[str, Part]:
-        """Parts by the titles of their sections.
-
-        Raises RecordError if the file cannot be read or has no header.
-        """
+        """Parts by the titles of their sections. Raises RecordError for a file without a header."""
         lines = list(lines_of(self.path, SEPARATORS))
         if not lines:
             raise RecordError(f"{self.path} has no lines")

@@ -45,10 +45,7 @@ EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz abo
 
 @dataclass
 class Proposal:
-    """Text of the tables of a description, the keys left to the user, and the rate of the poses.
-
-    The rate is None if neither the file nor the times of the poses tell it.
-    """
+    """Tables of a description, keys left to the user, and rate of the poses, None if unknown."""
 
     lines: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
