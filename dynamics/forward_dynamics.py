@@ -88,11 +88,14 @@ def fast_forward_dynamics(
 
 
 def _refuse(pose: object, twist: object, torque: object, joints: int) -> None:
-    """Raise ShapeError for the first argument that is not a float64 array of the right shape."""
+    """Raise ShapeError, which names the first argument that is no float64 array of its shape."""
     arguments = {"pose": (pose, 6), "twist": (twist, 6), "torque": (torque, joints)}
     for name, (value, size) in arguments.items():
         if floats(name, value, (size,), finite=False) is not value:
             raise ShapeError(
                 f"{name} must be a float64 array of shape ({size},), got {shown(value)}"
             ) from None
-    raise ShapeError(f"pose and twist (6,) and torque ({joints},) must be float64 arrays") from None
+    # a memoryview also refuses a float64 array that is not aligned in memory
+    raise ShapeError(
+        f"pose and twist (6,) and torque ({joints},) must be aligned float64 arrays"
+    ) from None

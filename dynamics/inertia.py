@@ -32,7 +32,8 @@ from dynamics.robot import Robot
 from dynamics.spatial_inertia import FULL_INERTIAL, MOMENTS
 from dynamics.workspace import measure
 
-# Smallest mass and inertia. Engines refuse a moving body without them; MuJoCo's limit is 1e-15.
+# Smallest mass, kg, and moment of inertia, kg m^2. Engines refuse moving bodies with zero; the
+# limit of MuJoCo is 1e-15.
 SMALLEST = 1e-12
 
 # Relative margin by which changed moments obey the rule. Otherwise, the sum of two rounded moments

@@ -102,7 +102,7 @@ def nearby_functions(nominal: RobotGeometry, geometry: RobotGeometry) -> Compile
     shared = _movable_functions(nominal)
 
     def moved(functions: Functions) -> dict[str, MachineFunction]:
-        return {name: replace(one, constants=deviations) for name, one in functions.items()}
+        return {name: replace(each, constants=deviations) for name, each in functions.items()}
 
     return CompiledFunctions(moved(shared.others), lambda: moved(shared.motion))
 

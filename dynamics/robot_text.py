@@ -68,7 +68,7 @@ def robot_text(robot: RobotDescription, comments: Sequence[str] = ()) -> str:
 
 
 def _columns(legs: Sequence[Leg]) -> list[str]:
-    """Lines with the fields of all legs, described by comments. A value of all is written once."""
+    """Lines with the fields of all legs, described by comments. Equal values are written once."""
     lines = []
     for name in type(legs[0]).model_fields:
         column = [getattr(leg, name) for leg in legs]

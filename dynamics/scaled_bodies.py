@@ -1,7 +1,7 @@
 """Bodies of a robot with other lengths than a given robot.
 
 Bodies keep their material. A platform is scaled as a plate of the same thickness, and the bodies of
-the legs as bars of the same section. The moments of a centred body are those of a thin plate or
+the legs as bars of the same section. The moments of a centred body grow as those of a thin plate or
 bar, and a full body is stretched with its centre of mass. A body of the legs whose inertias no
 rigid body can have, as those of cranks and links in the paper, becomes a uniform round rod of
 steel.

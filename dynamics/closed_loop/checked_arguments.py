@@ -52,7 +52,7 @@ def checked_directions(
     """Checked directions: (frames, n, k) for the run, and (n, k) for the commands before it.
 
     `shape` is (frames, n). If `directions` is None, k is 0. If `before` is None, the commands
-    before the run do not change. Raises SimulationError, also if k exceeds `most`.
+    before the run do not change. Raises SimulationError for a wrong shape, and if k exceeds `most`.
     """
     directions = np.zeros((*shape, 0)) if directions is None else directions
     given = np.asarray(directions)

@@ -1,4 +1,4 @@
-"""Kernels of the drives: the received command, the joint PID, and its limits.
+"""Kernels of the drives: the received command, the joint PID, and the limit of its torque.
 
 `drives` has the formula (eq. 31) and the laws.
 """

@@ -1,4 +1,4 @@
-"""Drives: the law by which each joint turns its command into a torque, and its largest torque.
+"""Drives: the law by which each joint turns its command into a torque, and the largest torque.
 
 Let U be the command of a joint, theta its coordinate, and lp, li, ld the gains. The torque or force
 is, up to the limit,

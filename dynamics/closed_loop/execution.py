@@ -1,8 +1,8 @@
 """Execution of a run: the kernels process its frames in the memory that is set up here.
 
 The kernels run compiled. Tests run them as plain Python, too, to compare both. If a sensor or a
-controller is a Python function, they process one frame at a time. They return a status, which the
-error of a run that ends early puts into words.
+controller is a Python function, kernels process one frame at a time. They return a status, which
+the error of a run that ends early puts into words.
 """
 
 from dataclasses import replace
@@ -50,7 +50,7 @@ MACHINE_CODE = (
 # Kernels that other kernels call by address.
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
 UNSTABLE = " (the loop is unstable)"
-# Reasons why a run ended early, by status. `failure` adds the leg that is out of reach.
+# Reasons why a run ended early, by status. `failure` adds a leg and its reach margin.
 FAILURES = {
     LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
@@ -234,7 +234,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
     start = problem.start
     chart = problem.robot.geometry.chart
     sizes = problem.sizes
-    slope = start.joint_integral_sensitivity
+    integral = start.joint_integral_sensitivity
     zeros = np.zeros((sizes.joints, sizes.parameters))
     by_command = zeros if start.command_sensitivity is None else start.command_sensitivity
     arrays = {
@@ -247,7 +247,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if ideal.lost is None else np.ascontiguousarray(ideal.lost),
         "noise": np.zeros((0, 0)) if ideal.noise is None else chart.coordinates(ideal.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": (zeros if slope is None else slope)[:, problem.columns],
+        "start_integral_sensitivity": (zeros if integral is None else integral)[:, problem.columns],
         "start_servo_sensitivity": _servo_sensitivity(problem, by_command)[:, problem.columns],
         "start_command_sensitivity": by_command[:, problem.columns],
     }
@@ -374,7 +374,7 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
 
 
 def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
-    """Error of a run that ended with a status. The message names a leg that is out of reach."""
+    """Error of a run that ended with a status. It names the leg with the least reach margin."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         evaluated = now.known.inputs[: problem.sizes.coordinates]

@@ -1,7 +1,8 @@
 """Kernels that run the frames of a run: its start, the commands that act, and its record.
 
 At the beginning of a frame, `visual_servo_kernels.issue_command` measures the pose and computes the
-command. The arguments `task`, `now`, `at`, `d`, `plan` and `record` are explained in `run_memory`.
+command. At a lost frame, it repeats the servo's command. The arguments `task`, `now`, `at`, `d`,
+`plan` and `record` are explained in `run_memory`.
 """
 
 from dynamics.closed_loop.drive_kernels import received, scale_received
@@ -35,11 +36,11 @@ def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> Non
         copy_rows(plan.start_servo_sensitivity, d.integral[:], now.parameters)
         issued = d.issued[len(d.issued) - 1]
         copy_rows(plan.start_command_sensitivity, issued, now.parameters)
-        further = plan.start_directions
-        copy_rows(further, issued[:, now.parameters :], further.shape[1])
+        directions = plan.start_directions
+        copy_rows(directions, issued[:, now.parameters :], directions.shape[1])
         newest = plan.start_commands[len(plan.start_commands) - 1]
         scale_received(task, newest, issued, now.width)
-        # the servo's command at rest comes from its integral
+        # the servo's last command is then the newest command of the start
         if len(plan.commands) == 0 and len(plan.feedforward) == 0:
             copy_rows(plan.start_command_sensitivity, d.last_command[:], now.parameters)
     if now.start_moves:
@@ -90,7 +91,7 @@ def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -
 
 @kernel
 def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
-    """Command of a joint by number. -1 is the newest command from before the start."""
+    """Command of a joint that frame `number` issued. -1 is the newest from before the start."""
     return commands[number, joint] if number >= 0 else start[max(0, len(start) + number), joint]
 
 
@@ -98,7 +99,7 @@ def command_of(start: Array, commands: Array, number: int, joint: int) -> float:
 def apply_command(
     task: Record, now: Record, d: Record, start: Array, commands: Array, number: int, ramp: float
 ) -> None:
-    """Set the command that acts from now on: the command `number`.
+    """Set the command that acts from now on: the one that frame `number` issued.
 
     `ramp` is the fraction of the ramp from the previous command that is already done. At 1, the
     command is constant.
@@ -113,7 +114,7 @@ def apply_command(
         now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
     if not task.sensitivities:
         return
-    # the last entry has the derivatives of the commands from before the start
+    # the last entry of `d.issued` is for the commands from before the start
     rows = len(d.issued) - 1
     newer = d.issued[number % rows if number >= 0 else rows]
     older = d.issued[(number - 1) % rows if number > 0 else rows]

@@ -29,8 +29,8 @@ def evaluate_lanes(
 ) -> None:
     """Do the same as `evaluate` at stage `k`, for the lanes in `asked` whose status is OK.
 
-    Within a step in which no joint sticks, only the slope is needed. The other results are stored
-    at the end of a step, where they are needed again.
+    The slope is always stored. The terms of the equation of motion are stored only if they will be
+    read again: if several joints stick, or at the end of a step with a stuck joint or an event.
     """
     size = len(at[0, 0].bias)
     count = len(at[0, 0].angle)
@@ -44,7 +44,6 @@ def evaluate_lanes(
         if own.status != OK:
             continue
         stuck = count_stuck(own)
-        # the terms of the equation of motion are copied only if they will be read again
         if task.stiffness == 0 and (
             stuck > 1 or (k == END and (stuck > 0 or own.purpose >= BRACKET))
         ):

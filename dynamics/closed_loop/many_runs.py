@@ -204,7 +204,7 @@ def simulate_batch(
             "number must be 1 or the number of runs"
         )
 
-    def one(index: int) -> ClosedLoopRun:
+    def run(index: int) -> ClosedLoopRun:
         vector = vectors[index % len(vectors)]
         reference = motions[index % len(motions)]
         start = start_states[index % len(start_states)]
@@ -216,7 +216,7 @@ def simulate_batch(
 
     # the compiled loop releases Python's global lock, so that threads can use all cores
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(one, range(count)))
+        return list(pool.map(run, range(count)))
 
 
 def prepare(robot: Robot) -> None:

@@ -26,7 +26,7 @@ CACHE_LINE = 64  # bytes in a line of the processor's cache
 
 
 class Plan(NamedTuple):
-    """Arrays that a run reads. Most have one row per frame; those named start_* are for its start.
+    """Arrays that a run reads. Most have one row per frame; those named start_* are for the start.
 
     Optional arrays that are missing have no rows.
     """
@@ -161,11 +161,11 @@ LAYOUT: dict[str, tuple[Fields, ...]] = {
         reals("joint_zero", "joint"),
         # number of columns from the gains of a joint to those of the next (0: shared gains)
         integers("gain_step"),
-        # servo, elastic joints, timing, limits
+        # servo, elastic joints, timing, drives
         reals("kp kd ki stiffness damping motor_inertia period"),
         integers("torques"),
         reals("torque_limit filter_time"),
-        # parameters of the robot, and the indices of those with a column of derivatives
+        # parameters; number and indices of those of rigid bodies that have a column of derivatives
         integers("shown"),
         integers("pivots", "rigid"),
         reals("rigid", "rigid"),

@@ -44,7 +44,7 @@ from dynamics.parameters import LANES
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 END = 4
-# rate of a margin, rad/s^2 or N m/s, up to which the time of an event is taken as constant
+# rate of a margin, rad/s^2 or N m/s (m/s^2 or N/s), up to which an event keeps its time
 NO_APPROACH = 1e-9
 
 
@@ -95,7 +95,7 @@ def share_with_columns(task: Record, now: Record, at: Record, k: int) -> None:
 
 @kernel
 def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record, stage: int) -> None:
-    """Differentiate with respect to the parameters at a fixed state.
+    """Differentiate forces and torques with respect to the parameters at a fixed state.
 
     `d.push` is the derivative of -M q_ddot - b. `d.direct` is the derivative of the torque of each
     joint, without the friction torque of a stuck joint.
@@ -179,7 +179,7 @@ def held_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> No
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Differentiate the slope and the net torques at one state, and write them into `d.k[k]`.
+    """Write the derivatives of the slope and of the net torques at one state into `d.k[k]`.
 
     The derivatives of state, filtered rates and time are `d.trial`, `d.filtered` and
     `d.stage_time`. The derivatives of the equation of motion must have been computed. See

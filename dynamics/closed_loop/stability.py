@@ -158,9 +158,8 @@ def lowest_frame_rate(
     The search begins at the rate of the settings. If the loop is stable there, the result is lower,
     and SLOWEST_HZ if all rates down to that are stable. If it is unstable there, the result is the
     next higher rate at which the loop becomes stable, or NaN if none is found. It can be unstable
-    again farther away, because the search ends at the first limit. The highest rate in the search
-    is 100 times the first, or the rate at which the latency is MOST_LATE frames, if it is higher
-    than the first.
+    again farther away, because the search ends at the first limit. It also ends at 100 times the
+    rate of the settings, and where a higher rate makes the latency longer than MOST_LATE frames.
     """
     rate = settings.timing.frame_rate_hz
     near = _near_rest(robot, parameters, pose, settings.drives)

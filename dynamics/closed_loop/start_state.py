@@ -33,8 +33,8 @@ class StartState:
     last_measured : array_like, shape (6,)
         Pose measured one frame before, m and rad.
     joint_integral_sensitivity, command_sensitivity : array_like, shape (n, p), optional
-        Derivatives of the joint integral and of the commands with respect to the parameters. All
-        commands have the same. The default is zero. The derivatives of the servo integral follow
+        Derivatives of the joint integral and of every command with respect to the parameters, the
+        same for all commands. The default is zero. The derivatives of the servo integral follow
         from those of the commands.
     motor_angle, motor_rate : array_like, shape (n,), optional
         Coordinate of the motors of elastic joints, rad or m, and its rate.

@@ -173,7 +173,7 @@ def narrow(task: Record, now: Record, at: Record, d: Record) -> int:
 def ask_between(now: Record, length: float) -> None:
     """Request a step to the estimated event.
 
-    If the estimate is outside the bracket, or after 40 estimates, the step goes to the middle. (The
+    If the estimate is outside the bracket, or after 41 estimates, the step goes to the middle. (The
     first estimate is trial 3.)
     """
     if now.trials > 43 or not now.low < length < now.high:
@@ -197,9 +197,9 @@ def judge_bracket(task: Record, now: Record, at: Record, d: Record, margin: floa
 
 @kernel
 def judge_crossing(task: Record, now: Record, at: Record, d: Record, margin: float) -> int:
-    """Accept a step to the estimated event, or request another one if the estimate improves.
+    """Accept a step to the estimated event, or request another one with a better estimate.
 
-    After 40 estimates and 40 steps to the middle of the bracket, the step is accepted.
+    A step is accepted if its margin or the error of its length is negligible, or if it is the 80th.
     """
     tried = now.length
     if margin > 0:
@@ -306,7 +306,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 
 @kernel
 def take_step(task: Record, now: Record, at: Record, d: Record, event: bool, held: bool) -> int:
-    """Accept the step that was tried, which ends at its target or at an event.
+    """Accept the step that was tried, which ends at the target time or at an event.
 
     For `held` see `after_event`.
     """

@@ -40,7 +40,7 @@ def issue_command(
     row = now.first_row + k
     if len(plan.commands) > 0:
         copy(plan.commands[k], now.last_command[:])
-    elif record.measured_ok[row]:  # a lost frame repeats the command before
+    elif record.measured_ok[row]:  # at a lost frame, `last_command` stays as it is
         serve(task, now, d, plan, record.measured[row], k)
     copy(now.last_command[:], record.command[row])
     if len(plan.feedforward) > 0:

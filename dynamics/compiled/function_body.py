@@ -195,8 +195,8 @@ class FunctionBody:
             kind = type_name(size)
             mask = f"<{2 * size} x i32> <{', '.join(f'i32 {lane}' for lane in range(2 * size))}>"
             joined = [
-                self._once(f"shufflevector {kind} {one}, {kind} {other}, {mask}")
-                for one, other in pairs
+                self._once(f"shufflevector {kind} {first}, {kind} {second}, {mask}")
+                for first, second in pairs
             ]
             size *= 2
         return joined[0]

@@ -134,8 +134,8 @@ def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     Functions that are not hot are only translated, because optimising takes LLVM ten times as long.
     Without it, their evaluation takes up to twice as long, with the same results.
     """
-    inner = [one for one in functions if one.name() in hot]
-    others = [one for one in functions if one.name() not in hot]
+    inner = [each for each in functions if each.name() in hot]
+    others = [each for each in functions if each.name() not in hot]
     codes = [_optimised(inner, hot) if inner else b"", _translated(others) if others else b""]
     shaped = {function.name(): shapes(function) for function in functions}
     return json.dumps([shaped, len(codes[0])]).encode() + b"\n" + b"".join(codes)
@@ -151,9 +151,9 @@ def _optimised(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     machine = _machine()
     module = _module(llvm_text(functions, hot), machine)
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
-    for one in functions:
-        if not isinstance(one, ColumnFunction):
-            builder.getFunctionPassManager().run(module.get_function(one.name()), builder)
+    for function in functions:
+        if not isinstance(function, ColumnFunction):
+            builder.getFunctionPassManager().run(module.get_function(function.name()), builder)
     return bytes(machine.emit_object(module))
 
 
@@ -233,7 +233,7 @@ def llvm_text(functions: list[AnyFunction], hot: Collection[str] = ()) -> str:
     `hot` names functions whose rounding may differ for speed (see `quick_arithmetic`). Raises
     DynamicsError with the name of an operation that has no translation.
     """
-    bodies = [_body(one, one.name() in hot) for one in functions]
+    bodies = [_body(function, function.name() in hot) for function in functions]
     declared = sorted({called for body in bodies for called in body.called})
     return "\n".join(
         [*(f"declare {called}" for called in declared), *(body.text() for body in bodies)]

@@ -141,10 +141,10 @@ def _fused(graph: Graph) -> Graph:
             added = node.operation == "ADD"
             first, second = (graph.nodes[k].operation in ("MUL", "SQ") for k in node.operands)
             if second:
-                one, other = factors(node.operands[1])
-                other = other if added else put(Node("NEG", (other,)))
+                left, right = factors(node.operands[1])
+                right = right if added else put(Node("NEG", (right,)))
                 node = Node("FMA")
-                operands = (one, other, operands[0])
+                operands = (left, right, operands[0])
             elif first:
                 rest = operands[1] if added else put(Node("NEG", operands[1:]))
                 operands = (*factors(node.operands[0]), rest)
@@ -216,7 +216,7 @@ def _arctangent() -> ca.Function:
 
 def _polynomial(coefficients: Sequence[float], x: ca.SX) -> ca.SX:
     """Value of a polynomial by Estrin's scheme, which computes pairs of terms in parallel."""
-    terms: list[ca.SX] = [ca.SX(one) for one in coefficients]
+    terms: list[ca.SX] = [ca.SX(coefficient) for coefficient in coefficients]
     while len(terms) > 1:
         unpaired = terms[-1:] if len(terms) % 2 else []
         terms = [

@@ -42,7 +42,7 @@ Closure = Callable[[np.ndarray, np.ndarray], Sequence[np.ndarray]]
 class ForwardSolution:
     """Result of a search.
 
-    `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) of Newton's method.
+    `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) steps of Newton.
     `residual` (n,) or (N, n) is the magnitude of the difference between the given joint coordinates
     and those of the pose, rad or m. It is NaN if a leg cannot reach the pose.
     """
@@ -122,7 +122,7 @@ def assembly_modes(
 def search(
     functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> ForwardSolution:
-    """Best poses (N, 6) found for joint coordinates (N, n) from starts (N, 6)."""
+    """Final poses (N, 6) of the search for joint coordinates (N, n) from starts (N, 6)."""
     poses, iterations = close_loops(functions["loop_closure"], chart, theta, start)
     joints = functions["inverse_kinematics"](poses)[0][..., 0]
     return ForwardSolution(poses, iterations, np.abs(theta - joints))
@@ -131,9 +131,9 @@ def search(
 def close_loops(
     closure: Closure, chart: Chart, theta: np.ndarray, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (N, 6) that best close the loops for joint coordinates (N, n), and step counts (N,).
+    """Final poses (N, 6) of Newton's method for joint coordinates (N, n), and step counts (N,).
 
-    Newton's method halves steps that do not reduce the gaps. A row is finished when its step is
+    Steps that do not reduce the gaps of the loops are halved. A row is finished when its step is
     negligible or reduces its gaps no further, or after `MAX_ITERATIONS` steps.
     """
     poses = np.array(start)

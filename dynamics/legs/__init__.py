@@ -5,9 +5,9 @@ A kind of leg defines its geometry and the kinematics of its bodies. Its dynamic
 folder and in robot files.
 """
 
+from dynamics.legs.crank_legs import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.leg import Leg
 from dynamics.legs.pss import PssLeg, PusLeg
-from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
 AnyLeg = RssLeg | RusLeg | UpsLeg | PssLeg | PusLeg | ParallelogramLeg | RrrLeg

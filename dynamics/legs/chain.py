@@ -9,9 +9,9 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from dynamics.errors import RobotFileError
+from dynamics.legs.crank_legs import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.leg import Leg
 from dynamics.legs.pss import PssLeg, PusLeg
-from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg, RusLeg
 from dynamics.legs.ups import UpsLeg
 
 # Difference of angles, rad, and distances, m, below which they count as equal. It allows for
@@ -51,11 +51,12 @@ def leg_of(chain: Chain) -> Leg:
     """Leg with the joints of a chain, on the branch that the chain has at home.
 
     Raises RobotFileError, with the valid kinds, if the joints form no kind of leg. Raises it, with
-    the deviation, if the joints are not placed as their kind requires.
+    the deviation or the number, if the joints are not placed as their kind requires.
     """
     if chain.signature not in SIGNATURES:
         kinds = ", ".join(
-            f"{one.model_fields['type'].default} = {text}" for text, (one, _) in SIGNATURES.items()
+            f"{kind.model_fields['type'].default} = {text}"
+            for text, (kind, _) in SIGNATURES.items()
         )
         raise RobotFileError(
             f"its joints, {chain.signature}, make no kind of leg (*: actuated); valid: {kinds}"

@@ -3,8 +3,8 @@
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
 its joints, m, its lengths, m, and small rotations of its axis, rad. Rotations are relative to the
 present axis. Their values are thus zero, and only their deviations can differ from zero. The
-rotations `u` and `v` are about axes perpendicular to that of the leg. On a crank, `u` is about the
-zero direction, and `crank_zero` is about the crank axis.
+rotations `u` and `v` are about axes perpendicular to the axis of the leg. On a crank, `u` is about
+the zero direction, and `crank_zero` is about the crank axis.
 
 A leg can be described by another leg and a vector of deviations of the geometric numbers. If the
 deviations are symbols, expressions of the leg can be differentiated with respect to them.
@@ -23,7 +23,7 @@ from dynamics.legs.leg import Leg
 AnyKind = TypeVar("AnyKind", bound=Leg)
 # Fields of a leg that are points, whose coordinates are geometric numbers.
 POINTS = ("base_joint", "platform_joint")
-MOST_NUMBERS = 11  # largest number of geometric numbers of a leg of any built-in kind
+MOST_NUMBERS = 11  # most geometric numbers that a leg of a built-in kind has
 
 
 def unit_of(number: str) -> str:
@@ -74,7 +74,7 @@ def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
     changes = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
     if leg.turned:
         between = _frame(nominal).T @ _frame(leg)
-        # this leg has no zero direction, and its axis is Rx(u) Ry(v) z in the nominal frame
+        # without a zero direction, u and v follow from the axis, Rx(u) Ry(v) z in the nominal frame
         if len(leg.turned) == 1:
             x, y, z = between[:, 2]
             turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]

@@ -8,9 +8,9 @@ columns). This form needs a fraction of the operations.
 
 A kind of leg defines the positions and rotations of its bodies; their forces follow by virtual
 work. A kind can also define closed forms that are faster. The inverse kinematics of a kind is the
-method `coordinate`, in `rss`, `pss` or `ups`. All vectors, such as the position (3,) of A, are in
-the axes of the base. Units are SI. The actuated coordinate is in rad for a rotating actuator, and
-in m for a sliding one.
+method `coordinate`, in `crank_legs`, `pss` or `ups`. The motion of A and the forces at A, vectors
+(3,), are in the axes of the base. Units are SI. The actuated coordinate is in rad for a rotating
+actuator, and in m for a sliding one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dynamics.spatial_inertia import SpatialInertia, spatial_inertia
 
 
 def _vector(value: object) -> np.ndarray:
-    """Three finite numbers. Raises ValueError."""
+    """Read-only array of three numbers in the range of `Place`. Raises ValueError for others."""
     array = np.array(value)
     if array.shape != (3,) or array.dtype.kind not in "fi" or not np.isfinite(array).all():
         raise ValueError(f"needs 3 finite numbers, got {shown(value)}")
@@ -51,7 +51,7 @@ EXACT = 1e-12
 
 
 def _direction(value: object) -> np.ndarray:
-    """Unit vector along three numbers. Raises ValueError if their length is far from 1."""
+    """Vector (3,) scaled to the length 1. Raises ValueError if its length is far from 1."""
     array = _vector(value)
     length = float(np.linalg.norm(array))
     if abs(length - 1.0) > ROUNDED:
@@ -156,12 +156,12 @@ class Leg(BaseModel, ABC):
 
     @property
     def travel_room(self) -> float:
-        """Largest travel, m, in both directions that the stroke allows. Infinite without one."""
+        """Distance, m, of coordinate zero from the nearer end of the stroke, or infinity."""
         return float("inf")
 
     @property
     def side(self) -> float | ca.SX:
-        """Sign of the square root in the inverse kinematics. It is +1 if no branch is selected."""
+        """Selected branch of the inverse kinematics, or +1 if no branch is selected."""
         return 1.0 if self.branch is None else self.branch
 
     def assembled(self, joint: np.ndarray, number: int) -> Self:
@@ -191,7 +191,7 @@ class Leg(BaseModel, ABC):
         return assembled
 
     def _turning(self, joint: np.ndarray) -> np.ndarray:
-        """Rotation of each body per motion of A, rad/m. NaN for bodies whose axes are undefined."""
+        """Rotation of each body per motion of A, rad/m, or NaN if the axes are undefined."""
         point = ca.SX.sym("position", 3)
         point_rate = ca.SX.sym("velocity", 3)
         turns = [
@@ -252,7 +252,7 @@ class Leg(BaseModel, ABC):
         """Angular velocities (3,) of the bodies, linear in the velocity (3,) of A."""
 
     def driven_inertia(self, body: np.ndarray) -> float:
-        """Inertia of the driven body at its actuator, kg or kg m^2. NaN if no body is driven alone.
+        """Inertia of the driven body at its actuator, kg or kg m^2, or NaN if there is none.
 
         `body` (10,) has the inertial parameters of a full body.
         """
@@ -287,18 +287,18 @@ class Leg(BaseModel, ABC):
         position: ca.SX,
         velocity: ca.SX,
         acceleration: ca.SX,
-        bodies: Sequence[ca.SX],
+        parameters: Sequence[ca.SX],
         gravity: ca.DM,
     ) -> ca.SX:
-        """Force at A (3,), N, that is needed for the motion of the bodies.
+        """Force at A (3,), N, that is needed for the motion of bodies with inertial parameters.
 
-        `bodies` has the inertial parameters of each body, 4 if it is centred or 10 if it is full.
+        `parameters` has those of each body: 4 if the body is centred, 10 if it is full.
         """
         # symbols, with respect to which the maps can be differentiated
         point, point_rate, point_acceleration = (ca.SX.sym(name, 3) for name in "pva")
-        parameters = _symbols_for(bodies)
+        symbols = _symbols_for(parameters)
         total = ca.SX.zeros(3)
-        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, parameters):
+        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, symbols):
             centre_acceleration = centre_map @ point_acceleration + ca.jtimes(
                 centre_map @ point_rate, point, point_rate
             )
@@ -308,30 +308,30 @@ class Leg(BaseModel, ABC):
             total += spin_map.T @ moment
         return _replaced(
             total,
-            (point, point_rate, point_acceleration, *parameters),
-            (position, velocity, acceleration, *bodies),
+            (point, point_rate, point_acceleration, *symbols),
+            (position, velocity, acceleration, *parameters),
         )
 
-    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        """Mass matrix (3, 3) of the leg at A. For `bodies` see `force`."""
+    def mass(self, position: ca.SX, parameters: Sequence[ca.SX]) -> ca.SX:
+        """Mass matrix (3, 3) of the leg at A. For `parameters` see `force`."""
         point = ca.SX.sym("p", 3)
         point_rate = ca.SX.sym("v", 3)
-        parameters = _symbols_for(bodies)
+        symbols = _symbols_for(parameters)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, _ in self._maps(point, point_rate, parameters):
+        for inertia, centre_map, spin_map, _ in self._maps(point, point_rate, symbols):
             total += inertia.mass_matrix(centre_map, spin_map)
-        return symmetric_from_lower(_replaced(total, (point, *parameters), (position, *bodies)))
+        return symmetric_from_lower(_replaced(total, (point, *symbols), (position, *parameters)))
 
-    def coriolis(self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+    def coriolis(self, position: ca.SX, velocity: ca.SX, parameters: Sequence[ca.SX]) -> ca.SX:
         """Matrix C (3, 3). C times the velocity is the Coriolis and centrifugal force at A.
 
         It is the sum of J^T (M_body J_dot + C_body J) over the bodies (eq. 21, 22).
         """
         point = ca.SX.sym("p", 3)
         point_rate = ca.SX.sym("v", 3)
-        parameters = _symbols_for(bodies)
+        symbols = _symbols_for(parameters)
         total = ca.SX.zeros(3, 3)
-        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, parameters):
+        for inertia, centre_map, spin_map, spin in self._maps(point, point_rate, symbols):
             map_rates = [
                 ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), point, point_rate), 3, 3)
                 for m in (centre_map, spin_map)
@@ -339,31 +339,31 @@ class Leg(BaseModel, ABC):
             maps = (centre_map, spin_map)
             for part in inertia.coriolis_parts(maps, map_rates, centre_map @ point_rate, spin):
                 total += part
-        return _replaced(total, (point, point_rate, *parameters), (position, velocity, *bodies))
+        return _replaced(total, (point, point_rate, *symbols), (position, velocity, *parameters))
 
     def _maps(
-        self, position: ca.SX, velocity: ca.SX, bodies: Sequence[ca.SX]
+        self, position: ca.SX, velocity: ca.SX, parameters: Sequence[ca.SX]
     ) -> list[tuple[SpatialInertia, ca.SX, ca.SX, ca.SX]]:
-        """Inertia, two maps and angular velocity of every body.
+        """Inertia, two maps and angular velocity of every body, for a motion of A as symbols.
 
         The maps (3, 3) give the velocity of the reference point and the angular velocity from the
         velocity of A.
         """
         maps_of_bodies = []
         spins = self.angular_velocities(position, velocity)
-        for kind, parameters, placement, spin in zip(
-            self.bodies, bodies, self.placements(position), spins, strict=True
+        for body, of_body, placement, spin in zip(
+            self.bodies, parameters, self.placements(position), spins, strict=True
         ):
             maps = ca.jacobian(placement.centre, position), ca.jacobian(spin, velocity)
             maps_of_bodies.append(
-                (spatial_inertia(parameters, placement.axes, kind.moments), *maps, spin)
+                (spatial_inertia(of_body, placement.axes, body.moments), *maps, spin)
             )
         return maps_of_bodies
 
 
-def _symbols_for(bodies: Sequence[ca.SX]) -> list[ca.SX]:
+def _symbols_for(parameters: Sequence[ca.SX]) -> list[ca.SX]:
     """Symbols for the inertial parameters of bodies."""
-    return [ca.SX.sym(f"i{k}", body.numel()) for k, body in enumerate(bodies)]
+    return [ca.SX.sym(f"i{k}", of_body.numel()) for k, of_body in enumerate(parameters)]
 
 
 def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
@@ -374,7 +374,7 @@ def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.S
 def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
     """Axes (3, 3) of a link along the unit vector z.
 
-    x is perpendicular to the direction `across_from` and to z, and y = z x x.
+    x is along the cross product of the direction `across_from` and z, and y along that of z and x.
     """
     across = ca.cross(ca.SX(across_from), z)
     x = across * (1 / ca.norm_2(across))
@@ -382,9 +382,9 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
 
 
 def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
-    """Angular velocity (3,) of a body on a universal joint, whose z changes at a rate (3,).
+    """Angular velocity (3,) of a body on a universal joint whose axis z (3,) has the rate `z_rate`.
 
-    The body turns about a first axis, a unit vector fixed on the base, and about its own x (see
+    The body turns about a first axis, a unit vector fixed on the base, and about its of_body x (see
     `link_axes`).
     """
     across = ca.cross(ca.SX(axis), z)

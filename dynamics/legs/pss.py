@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.crank_and_link import (
+from dynamics.legs.crank_legs import Z
+from dynamics.legs.full_bodies import (
     LinkMotion,
     centred,
     link_forces,
@@ -30,7 +31,6 @@ from dynamics.legs.leg import (
     link_axes,
     universal_spin,
 )
-from dynamics.legs.rss import Z
 
 
 class PssLeg(Leg):
@@ -137,12 +137,12 @@ class PssLeg(Leg):
         position: ca.SX,
         velocity: ca.SX,
         acceleration: ca.SX,
-        bodies: Sequence[ca.SX],
+        parameters: Sequence[ca.SX],
         gravity: ca.DM,
     ) -> ca.SX:
-        slider, ten = bodies
+        slider, ten = parameters
         if centred([ten]) or self._link_spins:
-            return super().force(position, velocity, acceleration, bodies, gravity)
+            return super().force(position, velocity, acceleration, parameters, gravity)
         gradient = self.gradient(position)
         link = self.link(position)
         link_rate = self._link_rate(position, velocity)
@@ -159,17 +159,15 @@ class PssLeg(Leg):
         thrust = slider[0] * (of_slider - gravity) + pull - turn
         return pull + turn + gradient * ca.dot(self.slider_axis, thrust)
 
-    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
-        slider, ten = bodies
+    def mass(self, position: ca.SX, parameters: Sequence[ca.SX]) -> ca.SX:
+        slider, ten = parameters
         if centred([ten]) or self._link_spins:
-            return super().mass(position, bodies)
+            return super().mass(position, parameters)
         gradient = self.gradient(position)
         axes = link_axes(self.across_from, self.link(position) * (1 / self.link_length))
-        moving_with_it = link_mass_matrix(
-            axes, self.link_length, ca.SX(self.slider_axis), gradient, ten
-        )
+        link_part = link_mass_matrix(axes, self.link_length, ca.SX(self.slider_axis), gradient, ten)
         reflected = (slider[0] + ten[0] / 4) * (gradient @ gradient.T)
-        return symmetric_from_lower(reflected + moving_with_it)
+        return symmetric_from_lower(reflected + link_part)
 
     @property
     def _link_spins(self) -> bool:

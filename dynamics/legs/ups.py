@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from pydantic import Field
 
+from dynamics.legs.crank_legs import Z
 from dynamics.legs.leg import (
     Body,
     Direction,
@@ -23,7 +24,6 @@ from dynamics.legs.leg import (
     link_axes,
     universal_spin,
 )
-from dynamics.legs.rss import Z
 
 
 class UpsLeg(Leg):

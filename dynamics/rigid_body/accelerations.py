@@ -64,7 +64,7 @@ def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     M (m, m); the negated derivatives (n,) of joint torques with respect to joint velocities; and
     their derivatives (n,) with respect to the error, its integral, and the rate of the command.
 
-    The inputs of each column are the derivatives of pose and rate (m,), and of joint integral,
+    The inputs of each column are the derivatives of q and its rate (m,), and of joint integral,
     command and command rate (n,). Two more are derivatives at a fixed state: `push` (m,) of -M
     q_ddot - b, and `direct` (n,) of the torque. The outputs of a column are the derivatives of
     rate, acceleration (m,), command error and torque (n,).

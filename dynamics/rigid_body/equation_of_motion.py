@@ -131,7 +131,7 @@ def servo_jacobian(geometry: AnyGeometry) -> PartedFunction:
 def motion_in_lanes(motion: PartedFunction) -> ColumnFunction:
     """Function of the equation of motion for several states of one robot at once.
 
-    The inputs of a column are pose and rate (m,). Its outputs are J_theta_dot rate (n,), theta
+    The inputs of a column are q and its rate (m,). Its outputs are J_theta_dot rate (n,), theta
     (n,), its rate (n,), the factor of M (m, m), b (m,) and J_theta (n, m).
     """
     single = motion.whole

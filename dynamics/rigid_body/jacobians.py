@@ -59,7 +59,7 @@ def pose_jacobian(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
 def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     """Placements (bodies, 15) of the bodies of all legs, leg by leg, in the axes of the base.
 
-    A row has the centre of mass, m, the axes (3, 3) by rows, and the angular velocity, rad/s.
+    A row has the reference point, m, the axes (3, 3) by rows, and the angular velocity, rad/s.
     """
     rows = []
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):

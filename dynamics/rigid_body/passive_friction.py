@@ -24,7 +24,7 @@ SLOW = 0.02  # relative angular velocity, rad/s, below which dry friction of a p
 def passive_friction_columns(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     """Wrenches (6, k) at the platform that overcome passive friction, for a unit of each parameter.
 
-    The parameters are those of the layout, in its order.
+    The parameters are those in `layout.passive_names`, in this order.
     """
     names = geometry.layout.passive_names
     columns = ca.SX.zeros(6, len(names))

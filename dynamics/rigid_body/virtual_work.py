@@ -38,7 +38,7 @@ def inertial_wrench(
 ) -> ca.SX:
     """Wrench M twist_dot + C twist + G (6,) for parameters `rigid` of the equation of motion.
 
-    The wrench includes the friction of passive joints. It is the product of the regressor and the
+    It includes the friction of passive joints. It is the product of `rigid_body_regressor` and the
     parameters, computed without the regressor.
     """
     gravity = ca.DM(geometry.gravity)
@@ -146,7 +146,7 @@ def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
 
 
 def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
-    """Functions M, C, G, friction, regressor (eq. 23-26), and dynamics (eq. 17, 40).
+    """Functions for M, C, G, friction and regressor (eq. 23-26), and for dynamics (eq. 17, 40).
 
     Wrenches have six entries. The legs balance the entries along which the platform cannot move.
     These entries have no effect on the torques.

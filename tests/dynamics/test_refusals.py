@@ -166,6 +166,11 @@ def test_the_fast_forward_dynamics_names_what_has_no_answer_and_goes_on(robot):
         ),
         ((home, rest.astype(np.float32), rest), ShapeError, "^twist must be a float64 array"),
         ((home[None], rest, rest), ShapeError, r"^pose must have shape \(6,\), got \(1, 6\)"),
+        (
+            (home, np.frombuffer(bytes(49), np.uint8)[1:].view(float), rest),
+            ShapeError,
+            "must be aligned float64 arrays$",
+        ),
     ):
         with pytest.raises(error, match=words):
             fast(*bad)

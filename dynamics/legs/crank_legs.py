@@ -1,4 +1,4 @@
-"""Legs with a crank on the base: RSS, whose link has two spherical joints (S), and RUS.
+"""Legs with a crank on the base: RSS, RUS, parallelogram (Delta robots) and planar RRR.
 
 The inverse kinematics is in closed form (eq. 3 and 4). The dynamics uses the Jacobians of eq. 5-16.
 Rates of Jacobians (Appendix A of the paper) are computed by automatic differentiation, because eq.
@@ -7,10 +7,10 @@ base: eq. 3 and 5 need R a, although the paper defines a in platform axes. Centr
 mid-length, unless a body has ten inertial parameters. Forces follow by virtual work, as for any
 `Leg`. For a link that does not spin, they are here in closed form, which is faster.
 
-The link of a RUS leg has a universal joint (U) at the tip of the crank. The first axis of this
-joint is parallel to the crank axis, so that its direction is fixed in the axes of the base. The
-link rotates about this axis and about its own x. Its spin about its length is thus determined, and
-all three of its moments of inertia do work.
+The link of an RSS leg has two spherical joints (S). That of a RUS leg has a universal joint (U) at
+the tip of the crank. The first axis of this joint is parallel to the crank axis, and thus fixed in
+the axes of the base. The link rotates about this axis and about its own x. This determines its spin
+about its length, and all three of its moments of inertia do work.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.crank_and_link import LinkMotion, centred, full_force, full_mass
+from dynamics.legs.full_bodies import LinkMotion, centred, full_force, full_mass
 from dynamics.legs.leg import (
     EXACT,
     ROUNDED,
@@ -180,7 +180,7 @@ class RssLeg(Leg):
         return angle_gradient(self.vectors(position))
 
     def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Link, and J_a1."""
+        """Vector l (3,) of the link, and J_a1."""
         leg = self.vectors(position)
         return leg.link, crank_leverage(leg)
 
@@ -233,17 +233,17 @@ class RssLeg(Leg):
         position: ca.SX,
         velocity: ca.SX,
         acceleration: ca.SX,
-        bodies: Sequence[ca.SX],
+        parameters: Sequence[ca.SX],
         gravity: ca.DM,
     ) -> ca.SX:
         if self._link_spins:
-            return super().force(position, velocity, acceleration, bodies, gravity)
+            return super().force(position, velocity, acceleration, parameters, gravity)
         leg = self.vectors(position)
-        crank, link = bodies
+        crank, link = parameters
         motion = leg_motion(leg, velocity, acceleration)
         gradient = angle_gradient(leg)
-        if not centred(bodies):
-            return full_force(leg, motion, gradient, bodies, gravity)
+        if not centred(parameters):
+            return full_force(leg, motion, gradient, parameters, gravity)
         tangent = ca.cross(leg.axis, leg.crank)
         # the crank rotates only about its own z; Izz of a link without spin about l does no work
         lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
@@ -259,14 +259,14 @@ class RssLeg(Leg):
         turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
         return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
-    def mass(self, position: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+    def mass(self, position: ca.SX, parameters: Sequence[ca.SX]) -> ca.SX:
         if self._link_spins:
-            return super().mass(position, bodies)
+            return super().mass(position, parameters)
         leg = self.vectors(position)
-        crank, link = bodies
+        crank, link = parameters
         gradient = angle_gradient(leg)
-        if not centred(bodies):
-            return full_mass(leg, gradient, bodies)
+        if not centred(parameters):
+            return full_mass(leg, gradient, parameters)
         tangent = ca.cross(leg.axis, leg.crank)
         reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
         half = gradient @ (link[0] / 4 * tangent).T

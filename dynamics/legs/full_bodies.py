@@ -1,9 +1,10 @@
 """Force and mass matrix of a crank and a link with ten inertial parameters each (CasADi).
 
-The parts of the link are those of a link on a slider, too (`legs.pss`).
+Legs with a slider use the functions for the link as well (`legs.pss`).
 
-The crank only rotates about its axis z. Let r be its length, theta its angle, x the axis along it,
-y = z x x, and g gravity. To the torque about z, the first moments m_x and m_y of the crank add
+The crank only rotates about its axis z. Let r be its length, theta its angle, x the axis along the
+crank, y the third axis of the crank, and g gravity. To the torque about z, its first moments m_x
+and m_y add
 
     m_x (r theta_ddot - y . g) + m_y x . g
 
@@ -22,7 +23,7 @@ from dynamics.legs.leg import link_axes
 from dynamics.spatial_inertia import INERTIAL
 
 if TYPE_CHECKING:
-    from dynamics.legs.rss import LegMotion, LegVectors
+    from dynamics.legs.crank_legs import LegMotion, LegVectors
 
 
 @dataclass(frozen=True)
@@ -39,24 +40,24 @@ class LinkMotion:
     angular_acceleration: ca.SX
 
 
-def centred(bodies: Sequence[ca.SX]) -> bool:
+def centred(parameters: Sequence[ca.SX]) -> bool:
     """Return True if all bodies are centred, with four parameters."""
-    return all(body.numel() == len(INERTIAL) for body in bodies)
+    return all(body.numel() == len(INERTIAL) for body in parameters)
 
 
 def full_force(
     leg: "LegVectors",
     motion: "LegMotion",
     gradient: ca.SX,
-    bodies: Sequence[ca.SX],
+    parameters: Sequence[ca.SX],
     gravity: ca.DM,
 ) -> ca.SX:
     """Force at A (3,), N, that is needed for the motion of crank and link.
 
-    `gradient` (3,) is that of the crank angle. `bodies` has the parameters of crank and link, 4 or
-    10 each.
+    `gradient` (3,) is that of the crank angle with respect to A. `parameters` has the inertial
+    parameters of crank and link, 4 or 10 each.
     """
-    mass, mx, my, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
+    mass, mx, my, *_, izz = ca.vertsplit(_ten(parameters[0])[:7])
     tangent = ca.cross(leg.axis, leg.crank)
     along = ca.dot(leg.crank, gravity) * (1 / leg.crank_length)
     across = ca.dot(tangent, gravity) * (1 / leg.crank_length)
@@ -64,7 +65,7 @@ def full_force(
     torque = mass * lever + izz * motion.crank_acceleration
     torque += mx * (leg.crank_length * motion.crank_acceleration - across) + my * along
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
-    pull, turn = link_forces(axes, leg.link_length, motion, _ten(bodies[1]), gravity)
+    pull, turn = link_forces(axes, leg.link_length, motion, _ten(parameters[1]), gravity)
     return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
 
@@ -73,9 +74,9 @@ def link_forces(
 ) -> tuple[ca.SX, ca.SX]:
     """Forces (3,) `pull` and `turn` by which a link is moved: pull + turn at A, pull - turn at T.
 
-    `axes` (3, 3) are those of the link. `ten` (10,) are its inertial parameters. Components are in
-    these axes: p, q of the angular velocity, u, v of the angular acceleration, and x, y, z of the
-    acceleration of the middle relative to gravity.
+    `axes` (3, 3) are those of the link. `ten` (10,) are its inertial parameters. In these axes,
+    p, q are components of the angular velocity, u, v of the angular acceleration, and x, y, z of
+    the acceleration of the middle relative to gravity.
     """
     mass, sx, sy, sz, xx, yy, _, xy, xz, yz = ca.vertsplit(ten)
     p, q = (ca.dot(axes[:, k], motion.angular_velocity) for k in range(2))
@@ -95,16 +96,16 @@ def link_forces(
     return axes @ push / 2, (moment_y * axes[:, 0] - moment_x * axes[:, 1]) * (1 / length)
 
 
-def full_mass(leg: "LegVectors", gradient: ca.SX, bodies: Sequence[ca.SX]) -> ca.SX:
+def full_mass(leg: "LegVectors", gradient: ca.SX, parameters: Sequence[ca.SX]) -> ca.SX:
     """Mass matrix (3, 3) of crank and link at A. For the arguments see `full_force`."""
-    mass, mx, *_, izz = ca.vertsplit(_ten(bodies[0])[:7])
-    link_mass = bodies[1][0]
+    mass, mx, *_, izz = ca.vertsplit(_ten(parameters[0])[:7])
+    link_mass = parameters[1][0]
     tangent = ca.cross(leg.axis, leg.crank)
     radius = leg.crank_length
     reflected = izz + mx * radius + (mass + link_mass) * (radius**2 / 4)
     axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
-    moving_with_it = link_mass_matrix(axes, leg.link_length, tangent, gradient, _ten(bodies[1]))
-    return symmetric_from_lower(reflected * (gradient @ gradient.T) + moving_with_it)
+    link_part = link_mass_matrix(axes, leg.link_length, tangent, gradient, _ten(parameters[1]))
+    return symmetric_from_lower(reflected * (gradient @ gradient.T) + link_part)
 
 
 def link_mass_matrix(
@@ -113,7 +114,7 @@ def link_mass_matrix(
     """Mass matrix (3, 3) of a link at A, without the part of its mass that is reflected at T.
 
     T moves by `tangent` (3,) times the rate of the coordinate, whose gradient (3,) is `gradient`.
-    The reflected part is gradient gradient^T times a quarter of the mass and of |tangent|^2.
+    The reflected part is gradient gradient^T times mass |tangent|^2 / 4.
     """
     mass, sx, sy, sz, xx, yy, _, xy, *_ = ca.vertsplit(ten)
     half = gradient @ (mass / 4 * tangent).T
