@@ -28,7 +28,8 @@ def fast_forward_dynamics(
     robot : Robot
         Robot that moves.
     parameters : ndarray, shape (p,), optional
-        Dynamic parameters, which are checked once. The default is `nominal_parameters`.
+        Dynamic parameters, which are checked once, or all identified numbers. The default is
+        `nominal_parameters`.
 
     Returns
     -------
@@ -51,7 +52,7 @@ def fast_forward_dynamics(
     check_type("robot", robot, Robot, DynamicsError)
     if parameters is None:
         parameters = robot.nominal_parameters
-    checked = robot.layout.check(parameters)
+    checked = robot.layout.check(robot.layout.without_gains(parameters))
     joints = robot.layout.joints
     function = robot.functions["forward_dynamics"]
     result = np.zeros(6)

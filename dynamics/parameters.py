@@ -274,6 +274,12 @@ class ParameterLayout:
             self.each_gains(values[self.joint_pid]),
         )
 
+    def without_gains(self, values: ArrayLike) -> ArrayLike:
+        """Dynamic parameters of an array (..., all identified numbers). Others are unchanged."""
+        if isinstance(values, np.ndarray) and values.shape[-1:] == (len(self.names),):
+            return np.asarray(values[..., self.dynamic])
+        return values
+
     def check(self, values: ArrayLike, *, batch: bool = False) -> np.ndarray:
         """Dynamic parameters as floats (p,), or (N, p) if `batch` is True.
 

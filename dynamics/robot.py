@@ -100,8 +100,9 @@ class Robot(RobotDynamics):
     def casadi(self, name: str) -> ca.Function:
         """CasADi function of the kinematics or dynamics, for a controller or an optimiser.
 
-        The function has the same equations as the method of the same name. It checks no arguments,
-        and returns NaN for a pose that a leg cannot reach.
+        The function has the same equations as the method of the same name. It checks no arguments.
+        For a pose that a leg cannot reach, it returns NaN or numbers without a meaning. The output
+        `reach_margin` of inverse_kinematics is negative there.
 
         Parameters
         ----------

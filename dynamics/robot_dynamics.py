@@ -285,7 +285,4 @@ class RobotDynamics(RobotKinematics):
         """Dynamic parameters as an array, by default `nominal_parameters`."""
         if parameters is None:
             return self.nominal_parameters
-        with_gains = (len(self.layout.names),)
-        if isinstance(parameters, np.ndarray) and parameters.shape[-1:] == with_gains:
-            parameters = parameters[..., self.layout.dynamic]
-        return self.layout.check(parameters, batch=True)
+        return self.layout.check(self.layout.without_gains(parameters), batch=True)

@@ -59,14 +59,15 @@ def mjcf(
 @imports.command(cls=Command)
 def urdf(
     file: Annotated[Path, typer.Argument(help="URDF file, a tree of bodies.")],
+    out: Out,
     closures: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             metavar="YAML",
             help="YAML file with closed_loop, type and name_mot, as in example-parallel-robots.",
+            show_default="the name of FILE, with .yaml",
         ),
-    ],
-    out: Out,
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Read a robot from URDF and a YAML file of its loop closures and motors.
@@ -74,14 +75,20 @@ def urdf(
     Reads both files. Writes a robot file.
 
     \b
-    Example:
-      cmmsim import urdf robot.urdf --closures robot.yaml --out mine.toml
+    Examples:
+      cmmsim import urdf ups6.urdf --out mine.toml     with ups6.yaml, as cmmsim export urdf writes
+      cmmsim import urdf robot.urdf --closures loops.yaml --out mine.toml
     """
     from dynamics.engines.urdf_import import robot_of_urdf
 
+    loops = closures or file.with_suffix(".yaml")
+    if closures is None and file.is_file() and not loops.is_file():
+        raise RobotFileError(
+            f"{file}: there is no {loops} with the closures of its loops; name it by --closures"
+        )
     _write(
-        *_read(robot_of_urdf, file, closures),
-        f"From {file.name} with {closures.name}, imported by cmmsim.",
+        *_read(robot_of_urdf, file, loops),
+        f"From {file.name} with {loops.name}, imported by cmmsim.",
         out,
         quiet,
     )

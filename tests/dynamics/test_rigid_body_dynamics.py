@@ -54,6 +54,9 @@ def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
         single = robot.forward_dynamics(*row, parameters)
         np.testing.assert_allclose(single, expected, rtol=1e-12)
         np.testing.assert_array_equal(fast(*row), single)
+    gains = robot.parameter_sets["guess"].joint_pid
+    with_gains = fast_forward_dynamics(robot, np.concatenate([parameters, gains]))
+    np.testing.assert_array_equal(with_gains(*row), single)
 
 
 def test_batches_equal_single_calls(robot, states, parameters):

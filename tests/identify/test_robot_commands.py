@@ -252,4 +252,8 @@ def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, t
     assert "leg 2 (cylinder2, rod2): it has 0 actuated joints" in one_line(capfd.readouterr().err)
     assert command("import", "urdf", model, "--closures", tmp_path / "none.yaml", "--out", out) == 1
     assert f"cannot read {tmp_path / 'none.yaml'}" in one_line(capfd.readouterr().err)
+    assert command("import", "urdf", model, "--out", out) == 1
+    assert f"there is no {tmp_path / 'ups6.yaml'} with the closures of its loops; name it by " in (
+        one_line(capfd.readouterr().err)
+    )
     assert {path.name for path in tmp_path.iterdir()} == {"ups6.xml"}
