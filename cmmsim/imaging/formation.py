@@ -5,7 +5,7 @@ margin around each window supplies the light that the point spread brings in fro
 Distortion is applied by resampling: each fine pixel takes its light from its ideal pixel, which is
 its position in the image of a perfect lens. Then the point spread, the mean over each pixel, a
 ghost (a faint shifted copy) and the relative illumination are applied. All steps are linear in
-light. For a perfect lens without point spread, the pixels are drawn directly.
+light. Without distortion, blur and a painter, the pixels are drawn directly.
 
 Ideal pixels are exact at three by three nodes of a window, and interpolated by quadratics in
 between. In windows of some tens of pixels, the interpolation error is below 1e-4 px. Values between
@@ -256,7 +256,7 @@ class ImageFormation:
         return self.optics.spreads_px(side.camera.focal_px, depths)
 
     def reach_px(self, camera: PinholeCamera) -> int:
-        """Return the largest distance, in whole px, at which light of a point is seen."""
+        """Return the largest distance, in whole px, from a point's image to light of the point."""
         ghost = max(map(abs, self.optics.ghost_offset)) if self.optics.ghost > 0.0 else 0
         return self._margin_px(camera) + ghost
 

@@ -16,8 +16,8 @@ class Solids(NamedTuple):
 
     ``half_planes`` (m, 3) contains a, b, c of a x + b y <= c, px. The slice starts[k]:starts[k + 1]
     belongs to solid k. ``boxes`` (s, 4) are lowest x, y and highest x, y, px, and ``levels`` (s,)
-    the radiances of the s solids. The fractions of pixels that solid k covers are stored in
-    ``covers[slots[k]]``, or nowhere if ``slots[k]`` is -1.
+    the radiances of the s solids. ``draw_solids`` stores the fractions of pixels that solid k
+    covers in ``covers[slots[k]]``, or nowhere if ``slots[k]`` is -1.
     """
 
     half_planes: Array

@@ -25,7 +25,7 @@ OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class PointLamp:
-    """Lamp at the position ``place`` (3,) in the axes of the camera that is drawn, m.
+    """Lamp at the position ``place`` (3,) in the axes of the camera that takes the image, m.
 
     ``strength`` is the radiance of a white face that faces the lamp from a distance of 1 m.
     """
@@ -45,9 +45,9 @@ def draw_frames(
     """Draw the radiance (n, h, w) float32 of n windows of one size.
 
     Each pixel is the mean of ``supersampling``² stratified rays. If there are ``lamps`` or
-    ``ambient`` light, surfaces are lit by them instead of emitting their levels. ``ambient`` is the
-    radiance of a white face in the light from all sides; it then replaces ``background``. Raises
-    CmmError if Mitsuba is missing, or if the pixels of a camera are not square.
+    ``ambient`` light, surfaces are lit by them instead of emitting their levels, and ``ambient``
+    replaces ``background``. ``ambient`` is the radiance of a white face in the light from all
+    sides. Raises CmmError if Mitsuba is missing, or if the pixels of a camera are not square.
     """
     mi = _mitsuba()
     views = Views.of(views)
@@ -80,7 +80,7 @@ MITSUBA = Renderer("mitsuba", draw_frames, 0.0016)
 
 
 def _mitsuba() -> Any:
-    """Import Mitsuba and return the module. Raises CmmError, which says how to install it."""
+    """Import Mitsuba and return the module. Raises CmmError if it is not installed."""
     try:
         import mitsuba
     except ImportError as error:
@@ -124,8 +124,8 @@ def _sensor(
 def _surface(level: float, lit: bool) -> dict[str, Any]:
     """Return a diffuse surface if ``lit`` is True, else one that emits its level."""
     value = {"type": "rgb", "value": float(level)}
-    own = {"light": {"type": "area", "radiance": value}}
-    return {"bsdf": {"type": "diffuse", "reflectance": value}} if lit else own
+    emitter = {"light": {"type": "area", "radiance": value}}
+    return {"bsdf": {"type": "diffuse", "reflectance": value}} if lit else emitter
 
 
 def _disc(mi: Any, disc: Disc, move: Array, lit: bool) -> dict[str, Any]:

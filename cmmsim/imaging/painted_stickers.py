@@ -105,7 +105,7 @@ class Paint:
     def _lights(
         self, camera_from_base: Array, centres: Array, normals: Array, steps: Array
     ) -> Array:
-        """Return the light at n stickers, and its changes along both axes of each, in one (n, 3).
+        """Return an array (n, 3) of the light at n stickers, and its changes along their two axes.
 
         The stickers have ``centres`` and ``normals`` (n, 3). ``steps`` (n, 3, 2) are their axes,
         one radius long. All are in camera axes.
@@ -166,11 +166,11 @@ class StickerPainter:
             behind = renderer.draw(self.dark, views, supersampling, 1.0)
         for seen in views.exposures:
             camera = seen.camera
-            places = seen.camera_from_bodies
+            moves = seen.camera_from_bodies
             windows = seen.windows, np.asarray(views.corners[seen.windows], dtype=float)
-            paint_view(images, shown, *windows, self.paint.seen_by(camera, places))
+            paint_view(images, shown, *windows, self.paint.seen_by(camera, moves))
             if len(self.objects):
-                turn = np.ascontiguousarray(places[1, :3, :3])
+                turn = np.ascontiguousarray(moves[1, :3, :3])
                 lens = camera.focal_lengths, camera.centre
                 scatter_objects(images, behind, *windows, self.objects, turn, *lens)
         return images

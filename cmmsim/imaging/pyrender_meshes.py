@@ -33,7 +33,7 @@ FEWEST_SIDES = 16
 GROUND_SIDES = 16
 # Ratio of the outer radius of a band to the radius of the ring inside it.
 BAND_REACH = 5.0
-# px around a window that the solid must fill as well, to be safe against rounding.
+# px: margin around a window that the solid must fill as well, to be safe against rounding.
 RIM_PX = 0.5
 # m: smallest height of a disc above what lies below it, and of the camera above a disc's plane, for
 # drawing without a depth test.
@@ -229,7 +229,7 @@ class PaintedSolids:
         laid = PaintedWindows(
             np.full(len(views), -1), np.zeros(len(views), dtype=bool), np.full(len(views), -1)
         )
-        # At most two patches: a solid and a stack of discs.
+        # Windows into which at most two patches reach, such as a solid and a stack of discs.
         few = reaching.sum(axis=1) <= 2
         bounds = views.bounds
         for shown in views.exposures:

@@ -8,9 +8,9 @@ sample. Multisampling would be slower and hardly more accurate, because stickers
 
 In a cell, only patches whose bounding box reaches into it are drawn. Projection and
 camera_from_body are multiplied in double precision, so that the shader gets one well-scaled matrix.
-Depth tests are used only where they are needed. If a solid or the dark ring of a sticker fills a
-cell, the cell is cleared to the level of the solid or ring, see ``PaintedSolids``. Each piece of
-the atlas is sent to OpenGL as soon as it is ready, and drawn while the next one is prepared.
+Depth tests are used only where they are needed. If a solid fills a cell, the cell is cleared to the
+level of the solid or of a sticker's ring on it, see ``PaintedWindows``. Each piece of the atlas is
+sent to OpenGL as soon as it is ready, and drawn while the next one is prepared.
 """
 
 import ctypes

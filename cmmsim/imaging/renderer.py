@@ -68,7 +68,7 @@ class Views(Sequence[View]):
     def of(cls, views: Sequence[View]) -> Views:
         """Group single windows by camera and transforms of bodies.
 
-        Windows form a group if they have the very same objects, not merely equal ones.
+        Windows form a group if their camera and their transforms are the very same objects.
         """
         if isinstance(views, Views):
             return views

@@ -24,14 +24,14 @@ def row_sweeps(
     """Return, for each of N poses, the changes (2, 4, 4) of camera_from_platform per row.
 
     The platform has poses (N, 6) that change at rates (N, 6), and a row is exposed ``row_time`` s
-    after the row above it. ``from_base`` are camera_from_base (4, 4) of both cameras. The changes
-    are None for a platform at rest.
+    after the row above it. ``from_base`` are camera_from_base (4, 4) of the left and the right
+    camera. A pose of a platform at rest has None instead of changes.
     """
     ahead, behind = (
         transforms_of(poses + sign * 0.5 * SWEPT_ROWS * row_time * rates) for sign in (1.0, -1.0)
     )
     steps = (ahead - behind) / SWEPT_ROWS
-    sweeps = np.stack([camera @ steps for camera in from_base], axis=1)
+    sweeps = np.stack([move @ steps for move in from_base], axis=1)
     return [sweep if sweep.any() else None for sweep in sweeps]
 
 
@@ -40,9 +40,9 @@ def swept(
 ) -> Array:
     """Return camera_from_body (b, 4, 4) when the middle row of a window is exposed.
 
-    ``bodies`` (b, 4, 4) belong to the middle row of the image. ``sweep`` (4, 4) is the change of
-    the first body's transform from one row to the next, or None for a body at rest. The window
-    begins at ``first_row`` and has ``size`` rows. The motion is linearised.
+    ``bodies`` (b, 4, 4), with the platform first, belong to the middle row of the image. ``sweep``
+    (4, 4) is the change of the platform's transform from one row to the next, or None at rest. The
+    window begins at ``first_row`` and has ``size`` rows. The motion is linearised.
     """
     if sweep is None:
         return bodies
@@ -51,17 +51,17 @@ def swept(
     return moved
 
 
-def drawn_row_by_row(
+def drawn_at_middle_rows(
     formation: ImageFormation,
     sides: Sequence[Side],
     sweeps: Sequence[Array | None],
     size: int,
     supersampling: int,
 ) -> list[NDArray[np.float32]]:
-    """Return the radiance (2, n, size, size) of windows of each exposure.
+    """Return the radiance (2, n, size, size) of each exposure's windows, each at its own time.
 
-    ``sides`` are the left and the right side of each exposure, and ``sweeps`` the changes (2, 4, 4)
-    of ``row_sweeps``.
+    ``sides`` are the left and the right side of the first exposure, then those of the second, and
+    so on. ``sweeps`` is the result of ``row_sweeps`` for the exposures.
     """
     windows = []
     for k, side in enumerate(sides):

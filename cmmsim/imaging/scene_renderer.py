@@ -154,12 +154,15 @@ class _Scene:
         for k, centre in enumerate(centres):
             self._camera.cx, self._camera.cy = centre
             projections[k] = self._camera.get_projection_matrix(*size)
-        drawn = [(node, one, reached[:, own].any(axis=1)) for node, one, own in self.primitives]
+        drawn = [
+            (node, primitive, reached[:, patches].any(axis=1))
+            for node, primitive, patches in self.primitives
+        ]
         columns, rows = ATLAS // size
         for first in range(0, len(centres), columns * rows):
             part = slice(first, first + columns * rows)
-            own = [(node, one, np.asarray(shown)[part]) for node, one, shown in drawn]
-            atlas = _drawing().draw(self._scene, own, projections[part], size)
+            parts = [(node, primitive, np.asarray(shown)[part]) for node, primitive, shown in drawn]
+            atlas = _drawing().draw(self._scene, parts, projections[part], size)
             for k in range(len(projections[part])):
                 row, column = divmod(k, columns)
                 top = row * size[1]

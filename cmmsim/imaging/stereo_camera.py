@@ -11,13 +11,13 @@ from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array, apply_each, rigid, transforms_of
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
-from cmmsim.imaging.row_sweep import drawn_row_by_row, row_sweeps
+from cmmsim.imaging.row_sweep import drawn_at_middle_rows, row_sweeps
 from cmmsim.imaging.scene_bodies import DiscStack
 from cmmsim.imaging.whole_image import whole_image
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 from cmmsim.radiometry.stereo_images import StereoFrame, Windows
 
-# Largest movement of a sticker between two sub-frames, into which an exposure is divided.
+# Largest movement of a sticker from one of the sub-frames of an exposure to the next.
 LARGEST_STEP_PX = 0.3
 # An exposure that needs more sub-frames is refused.
 MOST_SUB_FRAMES = 500
@@ -182,7 +182,7 @@ class VirtualStereoCamera:
             for side in zip(self.rig.cameras, at, first, strict=True)
         ]
         if any(sweep is not None for sweep in sweeps):
-            return drawn_row_by_row(self.formation, sides, sweeps, size, supersampling)
+            return drawn_at_middle_rows(self.formation, sides, sweeps, size, supersampling)
         together = max(len(sides), 2) if self.formation.draws_pixels(self.rig.cameras) else 2
         windows = [
             window
@@ -209,8 +209,7 @@ class VirtualStereoCamera:
         """Return the mean radiance (height, width) of one whole image over all moments.
 
         ``side`` is 0 for the left and 1 for the right camera. Each moment has the camera_from_body
-        (b, 4, 4) of this camera. ``sweep`` (2, 4, 4) is the result of ``row_sweeps`` for this
-        exposure.
+        (b, 4, 4) of this camera. ``sweep`` (2, 4, 4) is an element of the result of ``row_sweeps``.
         """
         own = None if sweep is None else sweep[side]
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling, own)
@@ -276,7 +275,7 @@ class VirtualStereoCamera:
 
         ``left`` and ``right`` (N, 6) are the platform's poses when each camera exposes.
         """
-        # An obstacle without a transform is placed far behind both cameras.
+        # An obstacle without a transform is placed far below the scene.
         absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
         still = np.stack(
             [np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)]
@@ -326,7 +325,7 @@ class LiveImages:
         self._sweep = sweep
 
     def full(self) -> StereoFrame:
-        """Return both whole images of a single exposure, whatever the number of averaged ones."""
+        """Return both whole images of a single exposure, even if windows average several."""
         images = []
         for side, pattern in enumerate(self._camera.patterns):
             moments = [placed[side] for placed in self._moments]

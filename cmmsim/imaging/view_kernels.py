@@ -221,7 +221,7 @@ def occlusion_mask(
     for k in range(len(slots)):
         slots[k] = -1
         move = camera_from_bodies[scene.bodies[k]]
-        # Bodies behind the camera, such as absent obstacles, hide nothing.
+        # A body behind the camera hides nothing.
         if move[2, 3] < -near:
             continue
         own = slice(scene.face_starts[k], scene.face_starts[k + 1])

@@ -87,7 +87,7 @@ def whole_image(
     """Return the mean radiance (height, width) of one camera's image over several moments.
 
     Each moment states camera_from_body (b, 4, 4). The image is drawn coarsely, except for finely
-    drawn windows around bright spots. ``sweep`` (4, 4) is the change of the first body's transform
+    drawn windows around bright spots. ``sweep`` (4, 4) is the change of the platform's transform
     from one row to the next, see ``swept``.
     """
     image, bright = _coarse(formation, camera, moments)
