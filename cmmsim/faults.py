@@ -208,7 +208,7 @@ class FaultGenerator:
         for number in rng.choice(len(names), rng.integers(1, len(names) + 1), replace=False):
             sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
             position = apply(pose_to_transform(pose), sticker)
-            between_cameras = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
+            between_cameras = apply(self._taught.base_from_camera, 0.5 * self._rig.right_centre)
             position = (
                 position
                 + rng.uniform(0.02, 0.5) * (between_cameras - position)
@@ -218,10 +218,6 @@ class FaultGenerator:
                 np.r_[position, rng.uniform(-1.0, 1.0, 3)]
             )
         return Fault("obstacles", obstacles=base_from_bodies)
-
-    def _right_eye(self) -> Array:
-        """Return the position (3,) of the right camera in the base frame, m."""
-        return apply(self._taught.base_from_camera, invert(self._rig.right_from_left)[:3, 3])
 
     def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         yield FillMark(int(rng.integers(2)), 0.0)

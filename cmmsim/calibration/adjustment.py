@@ -155,8 +155,8 @@ class _Normal:
 
     ``matrix`` (v, s, s) and the right-hand side ``rhs`` (v, s) have s = c + 6 unknowns: first the c
     common ones, then the pose of the view's board. ``residuals`` are those of each camera (m, 2),
-    px. ``cost`` is the sum of the squared residuals of both cameras, px². A point behind a camera
-    makes it inf.
+    px. ``cost`` is the sum of the squared residuals of both cameras, px², or inf if a point lies
+    behind a camera.
     """
 
     matrix: Array
@@ -250,7 +250,7 @@ def adjust(
 def _minimise(
     build: Callable[[RigState], _Normal], state: RigState, free: Array
 ) -> tuple[RigState, int]:
-    """Return the state of least cost by Levenberg and Marquardt's method, and the steps taken.
+    """Return the state of least cost by Levenberg and Marquardt's method, and the number of steps.
 
     Raises CalibrationError after MOST_STEPS steps.
     """

@@ -46,7 +46,7 @@ FIT_ITERATIONS = 5
 # this part beyond GROUND_FROM dot radii belong to the background.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
-# Standard deviations of blur that are tried, and the number of dots on which they are tried.
+# Standard deviations of blur that are tried, and the largest number of dots that this takes.
 SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
 PROBED = 12
 # A fit is rejected if its centre is farther than this from the rough centre, in dot radii.
@@ -116,8 +116,8 @@ def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     measured = np.isfinite(pixels).all(axis=1)
     fewest = FEWEST_CHARUCO if board.kind == "charuco" else FEWEST_MEASURED * len(pixels)
     if measured.sum() < fewest:
-        other = radius_differs(radius, board.radius)
-        why = f"; dots measure {radius:.3g} m in radius, not {board.radius:g} m" if other else ""
+        wrong = radius_differs(radius, board.radius)
+        why = f"; dots measure {radius:.3g} m in radius, not {board.radius:g} m" if wrong else ""
         return f"only {measured.sum()} of {len(pixels)} points are sharp and whole{why}"
     return _as_seen_from_the_front(
         board, BoardView(np.flatnonzero(measured), pixels[measured], radius)

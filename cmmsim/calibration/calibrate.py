@@ -173,7 +173,7 @@ def _without_misfits(
 
 
 def _image_rms(solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> Array:
-    """Return the root mean square residual (2, v) of each image, px; NaN for unused images."""
+    """Return the root mean square residual (2, v) of each image, px. Unused images have NaN."""
     views = len(solved.state.left_from_boards)
     rms = np.full((2, views), np.nan)
     for side, (seen, residuals) in enumerate(zip(sightings, solved.residuals, strict=True)):

@@ -21,9 +21,8 @@ from cmmsim.imaging.scene_bodies import SUNK, Disc, DiscStack, Mesh, Patch, soli
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import StereoFrame
 
-# The first constants describe the drawn board.
-# Width of the plate beyond its outermost points, in spacings. On a board of squares, the outer
-# squares fill this margin. A bright rim of width RIM, in spacings, surrounds them.
+# Width of the drawn plate beyond the outermost points, in spacings. On a board of squares, the
+# outer squares fill this margin. A bright rim of width RIM, in spacings, surrounds them.
 MARGIN = 1.0
 RIM = 0.35
 # Picture elements along the side of a square. OpenCV rounds the sides of markers to whole elements.
@@ -34,14 +33,13 @@ BRIGHT = 0.86
 DARK = 0.06
 # The normal of the front points against the board's z axis.
 FRONT = frozen([0.0, 0.0, -1.0])
-# The next constants limit the poses of the board.
 # Largest angle between the front's normal and the direction to the middle of the baseline, rad.
 LARGEST_TILT = 0.75
 # Range of the board's depth, in units of ``meeting_depth``.
 DEPTH_RANGE = (0.8, 1.2)
 # Each image is divided into CELLS x CELLS cells, in which the board appears in turn.
 CELLS = 3
-# Smallest cosine of the angle between the board's z axis and the line to either camera.
+# Smallest cosine of the angle between the board's z axis and the line from either camera to it.
 GRAZING = 0.35
 # Largest number of poses tried for one pair, and number of poses that are examined together.
 TRIES = 4000
@@ -109,8 +107,8 @@ def meeting_depth(rig: StereoRig) -> float:
     It is 1.5 baselines for axes that are parallel or come nearest behind the cameras.
     """
     right_axis = invert(rig.right_from_left)[:3, 2]
-    eye = _right_eye(rig)
-    # The closest approach of two lines. It is not defined for parallel axes.
+    eye = rig.right_centre
+    # No point of the left axis is nearest to a parallel right axis.
     across = 1.0 - right_axis[2] ** 2
     depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
     return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
@@ -128,9 +126,9 @@ def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generat
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
     """Draw one pose that shows the whole board to both cameras.
 
-    ``number`` selects the cell in which the board's middle lies, of the left image if it is even,
-    otherwise of the right image. If the first half of the tries fails, any cell is allowed. Raises
-    CalibrationError if all tries fail.
+    An even ``number`` selects a cell of the left image, an odd one a cell of the right image. The
+    board's middle lies in this cell, or in any cell of the image if the first half of the tries
+    fails. Raises CalibrationError if all tries fail.
     """
     corners = plate_corners(board)
     depth = meeting_depth(rig)
@@ -157,9 +155,10 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
 def _drawn_numbers(
     number: int, first: int, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int_], Array]:
-    """Draw a cell and six numbers from 0 to 1 for each pose: (count,) and (count, 6).
+    """Return the cells (count,) of tries, and random numbers (count, 6) from 0 to 1.
 
-    ``first`` is the index of the first of these tries for the pose of the given ``number``.
+    The tries for pose ``number`` begin with the index ``first``. In the second half of all tries,
+    the cells are random, too.
     """
     own_cell = (4 + 2 * number) % CELLS**2
     if first < TRIES // 2:
@@ -192,15 +191,10 @@ def _poses_of(
     axes = np.column_stack([np.cos(about), np.sin(about), np.zeros(len(cells))])
     tilted = Rotation.from_rotvec(tilt[:, None] * axes) * Rotation.from_euler("z", turn[:, None])
     poses = np.zeros((len(cells), 4, 4))
-    poses[:, :3, :3] = _facing(0.5 * _right_eye(rig) - middles) @ tilted.as_matrix()
+    poses[:, :3, :3] = _facing(0.5 * rig.right_centre - middles) @ tilted.as_matrix()
     poses[:, :3, 3] = middles - poses[:, :3, :3] @ middle
     poses[:, 3, 3] = 1.0
     return poses
-
-
-def _right_eye(rig: StereoRig) -> Array:
-    """Return the position (3,) of the right camera in axes of the left camera, m."""
-    return invert(rig.right_from_left)[:3, 3]
 
 
 def _facing(towards: Array) -> Array:
@@ -220,7 +214,7 @@ def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.b
     A view at a grazing angle does not count.
     """
     middles = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
-    views = np.stack([middles, middles - _right_eye(rig)])
+    views = np.stack([middles, middles - rig.right_centre])
     return np.asarray(
         (
             np.einsum("ni,sni->sn", poses[:, :3, 2], views)

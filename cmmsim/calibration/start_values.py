@@ -152,7 +152,7 @@ def _with_agreeing_orders(
     ``from_left`` and ``from_right`` are the poses left_from_board and right_from_board, by the
     pair's index. Return the pairs with the points in this order, the poses right_from_board in this
     order, and right_from_left (4, 4). In a pair that agrees in no order, the reason MISFIT replaces
-    both views. Raises CalibrationError if fewer than FEWEST_VIEWS or half of the pairs agree.
+    both views. Raises CalibrationError if fewer than FEWEST_VIEWS or less than half of them agree.
     """
     orders = board.symmetries
     symmetry_motions = [_symmetry_motion(board, order) for order in orders]
@@ -201,20 +201,17 @@ def _symmetry_motion(board: Board, order: NDArray[np.int_]) -> Array:
     return rigid(rotation, points[0] - rotation @ renamed[0])
 
 
-def _nearly_equal(places: Array) -> Array:
-    """Return a mask (n, n). Entry (i, j) is True if transforms i and j are nearly equal.
-
-    The transforms ``places`` are (n, 4, 4).
-    """
-    shifts = places[:, :3, 3]
+def _nearly_equal(transforms: Array) -> Array:
+    """Return a mask (n, n), which is True where two of n transforms (4, 4) are nearly equal."""
+    shifts = transforms[:, :3, 3]
     distances = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
     near = distances < ALIKE_SHIFT * np.linalg.norm(shifts, axis=1)[:, None]
-    return np.asarray(near & (_angles(places, places[:, :3, :3]) < ALIKE_ANGLE))
+    return np.asarray(near & (_angles(transforms, transforms[:, :3, :3]) < ALIKE_ANGLE))
 
 
-def _angles(places: Array, rotations: Array) -> Array:
+def _angles(transforms: Array, rotations: Array) -> Array:
     """Return the angles (n, m), rad, between transforms (n, 4, 4) and rotations (m, 3, 3)."""
-    trace = np.einsum("nij,mij->nm", places[:, :3, :3], rotations)
+    trace = np.einsum("nij,mij->nm", transforms[:, :3, :3], rotations)
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 

@@ -77,6 +77,11 @@ class StereoRig:
         """Transforms (4, 4) from the camera frame C into the axes of each camera, left first."""
         return np.eye(4), self.right_from_left
 
+    @property
+    def right_centre(self) -> Array:
+        """Centre (3,) of the right camera in the camera frame C, m."""
+        return invert(self.right_from_left)[:3, 3]
+
     @cached_property
     def ideal(self) -> StereoRig:
         """Rig with the same parameters and perfect lenses."""
@@ -190,8 +195,10 @@ def toed_in_rig(
     forward = target - position
     right_axis = np.cross(forward, [0.0, 0.0, 1.0])
     right_axis /= np.linalg.norm(right_axis)
-    eyes = [_look_at(position + side * 0.5 * baseline * right_axis, target) for side in (-1.0, 1.0)]
-    return StereoRig(camera, camera, eyes[1] @ invert(eyes[0])), eyes[0]
+    left, right = (
+        _look_at(position + side * 0.5 * baseline * right_axis, target) for side in (-1.0, 1.0)
+    )
+    return StereoRig(camera, camera, right @ invert(left)), left
 
 
 def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
@@ -201,12 +208,11 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     optical axes, projected perpendicular to the baseline. For a rig that ``toed_in_rig`` made for
     the same position and target, both functions return the same transform.
     """
-    right_centre = invert(rig.right_from_left)[:3, 3]
-    x = right_centre / np.linalg.norm(right_centre)
+    x = rig.right_centre / np.linalg.norm(rig.right_centre)
     # the sum of both optical axes, in the axes of the left camera, has the viewing direction
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
-    return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(
+    return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * rig.right_centre) @ _look_at(
         position, target
     )
 

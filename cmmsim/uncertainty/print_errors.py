@@ -6,7 +6,6 @@ view alone, so a sticker has the same errors whenever it is seen at the same ang
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +50,7 @@ class PrintErrors:
         return np.stack(
             [
                 self._seen(points - eye, normals, axes, slope)
-                for eye, slope in zip(_eyes(rig), slopes, strict=True)
+                for eye, slope in zip((np.zeros(3), rig.right_centre), slopes, strict=True)
             ]
         )
 
@@ -77,8 +76,3 @@ def known_errors(file: SensorFile) -> PrintErrors | None:
     if file.print.known and (sizes.thickness or sizes.retro_shift):
         return PrintErrors(sizes, file.stickers.radius)
     return None
-
-
-def _eyes(rig: StereoRig) -> Sequence[Array]:
-    """Return the centres (3,) of both cameras in the camera frame."""
-    return [-move[:3, :3].T @ move[:3, 3] for move in rig.from_camera]
