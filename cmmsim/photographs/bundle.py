@@ -276,7 +276,7 @@ def _gauge(seen: Observations, state: BundleState, size: int) -> Array:
     """Return six orthonormal columns (size, 6) that span the common movements of the platform."""
     places = state.places[seen.base :]
     arms = places - places.mean(axis=0)
-    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
+    shifts = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
     gauge = np.zeros((size, POSE))
-    gauge[3 * seen.base : 3 * len(state.places)] = np.linalg.qr(moves.reshape(-1, POSE))[0]
+    gauge[3 * seen.base : 3 * len(state.places)] = np.linalg.qr(shifts.reshape(-1, POSE))[0]
     return gauge

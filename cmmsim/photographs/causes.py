@@ -127,6 +127,6 @@ def light_doubt(photograph: Photograph, spots: Spots, observer: Observer) -> str
 
 
 def _misfit(spots: Spots) -> float:
-    """Return the median of the reduced chi-squares of all spots."""
+    """Return the median of the reduced chi-squares of good spots, or 0 if there are none."""
     found = np.concatenate([one.misfits[one.good] for one in spots])
     return float(np.median(found)) if len(found) else 0.0

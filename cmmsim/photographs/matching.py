@@ -51,7 +51,7 @@ ROUGH = (NOMINAL_TOLERANCE, 3.0 * NOMINAL_TOLERANCE)
 NONE = -1
 # Largest number of pairs that are tried as the first model of the platform.
 REFERENCES = 4
-# A sticker that has moved is searched within this distance of its rough position, m.
+# A sticker that has moved, or was seldom found, is searched this near to its rough position, m.
 NEAR = 0.015
 
 
@@ -152,7 +152,7 @@ class FoundBody:
 
 
 def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
-    """Return the candidates (g, K) of g points in K pairs, or NONE where one is missing.
+    """Return the indices (g, K) of the candidates of g points in K pairs; NONE if one is missing.
 
     Each of these points has the same pixels in two or more pairs.
     """
@@ -180,7 +180,7 @@ def standing(pairs: Sequence[Candidates]) -> NDArray[np.int_]:
 
 
 def places_of(pairs: Sequence[Candidates], members: NDArray[np.int_]) -> Array:
-    """Return the median positions (g, 3), m, of points with candidates ``members`` (g, K)."""
+    """Return the median positions (g, 3), m, of points, from the result of `standing` (g, K)."""
     return np.array(
         [
             np.median([pairs[k].points[j] for k, j in enumerate(own) if j != NONE], axis=0)
@@ -283,7 +283,7 @@ def _extended(
     moves: Array,
     seen: NDArray[np.bool_],
 ) -> Array:
-    """Return the model with added points that at least two other pairs have."""
+    """Return the model with further points, each of which at least two pairs show."""
     others = []
     owner = []
     for k in np.flatnonzero(seen).tolist():
@@ -367,7 +367,7 @@ def _missing(
     """Return reasons by the index of each sticker that cannot be used.
 
     Such a sticker was not found, or it has moved. If it has moved, points (g, 3) near its rough
-    position belong to different pairs. ``members`` (g, K) are the candidates of the points.
+    position belong to different pairs. ``members`` (g, K) are the indices of their candidates.
     """
     reasons = {}
     seen = members != NONE

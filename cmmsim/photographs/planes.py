@@ -135,7 +135,7 @@ def taught_frames(
 
 
 def _moved(points: Array) -> tuple[Array, Array]:
-    """Return the points (3 n, n, 3) after a step of each coordinate, first forwards, then back."""
+    """Return the points (3 n, n, 3) with one coordinate after the other enlarged, and reduced."""
     steps = STEP * np.eye(points.size).reshape(-1, *points.shape)
     return points + steps, points - steps
 
