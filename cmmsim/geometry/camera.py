@@ -1,4 +1,4 @@
-"""A pinhole camera with its lens: distortion, point spread and vignetting.
+"""A pinhole camera with its lens: distortion, point spread, defocus, vignetting and ghost.
 
 Pixel coordinates (0, 0) are the centre of the top-left pixel. Camera axes are x right, y down, z
 forward. A perfect lens has no distortion. The ideal pixel of a point is the pixel at which the same

@@ -107,7 +107,8 @@ def transformed(move: Array, point: Array) -> tuple:
 def pose_slopes(camera: Array, move: Array, point: Array, arm: Array, slopes: Array) -> tuple:
     """Fill the derivatives (2, 6) of a point's pixel with respect to the small error of a pose.
 
-    ``arm`` (3,) is the point relative to the origin of the pose's body. Return the pixel.
+    ``move`` (4, 4) transforms the ``point`` (3,) into camera axes. ``arm`` (3,) is the point
+    relative to the origin of the pose's body, in the same axes as the point. Return the pixel.
     """
     x, y, z = transformed(move, point)
     u, v, a, b, c, d = project(camera, x, y, z)
@@ -128,10 +129,10 @@ def weigh(slopes: Array, spread: Array, weight: Array, weighted: Array) -> None:
 
     The weight is the inverse of the pixel's covariance ``spread`` (2, 2).
     """
-    share = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
-    weight[0, 0] = spread[1, 1] / share
-    weight[0, 1] = weight[1, 0] = -spread[0, 1] / share
-    weight[1, 1] = spread[0, 0] / share
+    determinant = spread[0, 0] * spread[1, 1] - spread[0, 1] * spread[1, 0]
+    weight[0, 0] = spread[1, 1] / determinant
+    weight[0, 1] = weight[1, 0] = -spread[0, 1] / determinant
+    weight[1, 1] = spread[0, 0] / determinant
     for i in range(6):
         for j in range(2):
             weighted[i, j] = slopes[0, i] * weight[0, j] + slopes[1, i] * weight[1, j]

@@ -171,7 +171,7 @@ def inverse_shape(shape: Array) -> Array:
 # Distance from the rim at which the point spread is cut off, in standard deviations. This loses a
 # fraction 4e-8 of the light.
 REACH = 5.5
-# Rim points per standard deviation of the point spread.
+# Rim points per standard deviation of the point spread, and the smallest number of rim points.
 POINTS_PER_SIGMA = 1.1
 FEWEST_POINTS = 24
 SQRT_HALF = math.sqrt(0.5)

@@ -25,11 +25,11 @@ from cmmsim.geometry.transform_kernels import move_by, transform_point
 
 @compiled
 def lie_on_a_line(used: Array, places: Array, width: float) -> bool:
-    """Tell whether the places (n, 3) in the mask ``used`` (n,) lie within ``width`` m of one line.
+    """Tell whether the places (n, 3) in the mask ``used`` (n,) lie nearly on one line.
 
-    The middle eigenvalue of their scatter matrix, a sum of squares, is compared with ``width``
-    squared. A lower bound of the eigenvalue is compared first, because it is faster to compute. At
-    least one place must be used.
+    They do if the middle eigenvalue of their scatter matrix, a sum of squares, is below the square
+    of ``width``, m. A lower bound of the eigenvalue is compared first, because it is faster to
+    compute. At least one place must be used.
     """
     first = np.argmax(used)
     count = 0

@@ -128,14 +128,14 @@ def signed_distance(cameras: Cameras, pixels: Array, point: Array, gap: float) -
     camera = cameras.intrinsics[0]
     x, y, z = transformed(move, point)
     u, v, _, _, _, _ = project(camera, x, y, z)
-    other = cameras.extrinsics[1]
+    right = cameras.extrinsics[1]
     along_x = 0.0
     along_y = 0.0
     for i in range(3):
         # The right camera's centre, relative to the left one's, in axes that both share.
         centre = 0.0
         for j in range(3):
-            centre += move[j, i] * move[j, 3] - other[j, i] * other[j, 3]
+            centre += move[j, i] * move[j, 3] - right[j, i] * right[j, 3]
         along_x += move[0, i] * centre
         along_y += move[1, i] * centre
     across = along_x * (pixels[0, 1] - v) - along_y * (pixels[0, 0] - u)

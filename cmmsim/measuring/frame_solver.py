@@ -1,4 +1,4 @@
-"""Poses of a body from its observed stickers, without stickers that contradict the others.
+"""Poses of a body, with covariances, from observed stickers without those that contradict the rest.
 
 The taught places are fitted to the observed stickers. Stickers are rejected one by one, the worst
 one first, in two cases:
