@@ -61,7 +61,7 @@ def floats(
 
 
 def rows(name: str, value: object, width: int) -> np.ndarray:
-    """Value as finite floats of shape (width,) or (N, width). Raises ShapeError."""
+    """Value as finite floats of shape (width,) or (N, width). Raises ShapeError otherwise."""
     return floats(name, value, (width,), ("N", width))
 
 
@@ -228,7 +228,7 @@ def within(quantity: Any) -> Within:
     return limits
 
 
-# Range from a grain of silicon to a thousand tonnes.
+# Ranges for machines from a grain of silicon to a thousand tonnes.
 Mass = Annotated[float, Within(1e-12, 1e6, "kg", zero=True)]
 Inertia = Annotated[float, Within(1e-24, 1e9, "kg m^2", zero=True)]
 FirstMoment = Annotated[float, Within(-1e9, 1e9, "kg m")]

@@ -98,12 +98,12 @@ def described_changes(robot: Robot, parameters: np.ndarray) -> list[str]:
     if not inertias.changes:
         return []
     effects = acceleration_changes(robot, parameters, inertias.values)
-    said = {}
+    texts = {}
     for body, change in inertias.changes.items():
         # A relative effect of at most 1e-9 is rounding.
-        felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
-        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'no effect on the motion'}"
-    return [f"changed {line}" for line in grouped(said)]
+        effect = f"accelerations differ by up to {100 * effects[body]:.2g} %"
+        texts[body] = f"{change}; {effect if effects[body] > 1e-9 else 'no effect on the motion'}"
+    return [f"changed {line}" for line in grouped(texts)]
 
 
 def warn_of_changes(robot: Robot) -> None:
@@ -226,10 +226,10 @@ def travel_states(
         drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ basis.T
         pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
     pose = pose[:STATES]
-    drawn = robot.travel_limit * rng.standard_normal((2, STATES, joints, 1))
+    joint_motion = robot.travel_limit * rng.standard_normal((2, STATES, joints, 1))
     twist, acceleration = (
         np.linalg.solve(robot.joint_jacobian(pose) @ basis, rates)[..., 0] @ basis.T
-        for rates in drawn
+        for rates in joint_motion
     )
     twist = TRAVEL_RATE * twist
     acceleration = TRAVEL_ACCELERATION * acceleration

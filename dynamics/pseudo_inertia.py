@@ -37,7 +37,7 @@ def pseudo_inertia(bodies: np.ndarray) -> np.ndarray:
 
 
 def inertial_parameters(pseudo: np.ndarray) -> np.ndarray:
-    """Full bodies (..., 10) of pseudo-inertias (..., 4, 4). Inverse of `pseudo_inertia`."""
+    """Full bodies (..., 10) of pseudo-inertias (..., 4, 4). This inverts `pseudo_inertia`."""
     second = np.diagonal(pseudo[..., :3, :3], axis1=-2, axis2=-1)
     moments = second.sum(axis=-1, keepdims=True) - second
     products = np.stack([-pseudo[..., row, column] for row, column in PAIRS], axis=-1)
@@ -80,7 +80,7 @@ def log_cholesky_slope(coordinates: np.ndarray) -> np.ndarray:
 
 
 def log_cholesky(body: np.ndarray) -> np.ndarray:
-    """Log-Cholesky coordinates (10,) of a full body (10,). Inverse of `from_log_cholesky`.
+    """Log-Cholesky coordinates (10,) of a full body (10,). This inverts `from_log_cholesky`.
 
     Raises numpy.linalg.LinAlgError for a body that cannot exist.
     """
@@ -162,8 +162,8 @@ def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
 def nearest_body(body: np.ndarray, smallest: float) -> np.ndarray:
     """Full body (10,) that exists, with the same mass and centre of mass.
 
-    A mass below `smallest`, kg, is raised to it. Principal second moments of the mass, about its
-    centre, are raised to at least `smallest` / 2, kg m^2.
+    A mass below `smallest`, kg, is raised to it, and only the first moment is then kept. Principal
+    second moments of the mass, about its centre, are raised to at least `smallest` / 2, kg m^2.
     """
     mass = max(body[0], smallest)
     centre, inertia = about_centre(np.array([mass, *body[1:]]))

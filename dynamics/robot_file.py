@@ -94,7 +94,7 @@ class RobotFile(Strict):
     @model_validator(mode="before")
     @classmethod
     def _by_family(cls, values: Any) -> Any:
-        """Complete the types of the legs, and the chart, from the family. Raises ValueError."""
+        """Complete the types of the legs, and the chart, from the family, which must be known."""
         if not isinstance(values, dict) or "legs" not in values:
             return values
         name = values.get("family")
@@ -279,7 +279,7 @@ def _parsed_robot(text: str, source: str, folder: Path) -> RobotDescription:
 
 
 def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
-    """Geometry of a robot file in a folder. Raises RobotFileError or ParameterError."""
+    """Geometry of a robot file in a folder. Raises RobotFileError or ParameterError for faults."""
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -306,7 +306,7 @@ def _geometry(content: RobotFile, folder: Path) -> RobotGeometry:
 
 
 # Largest ratio of a position of home, of the travel of sliders, or of the length of a leg at
-# coordinate zero, to the size of the robot, beyond which it is likely in mm.
+# coordinate zero, to the size of the robot. A larger number is likely in mm.
 MOST_SIZES = 50.0
 # Largest travel of joints that turn, and angle of home, rad. Larger ones are likely in degrees.
 MOST_TRAVEL = 4 * np.pi
@@ -344,7 +344,7 @@ def _check_units(content: RobotFile) -> None:
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
-    """Name and text of a robot file. Raises RobotFileError."""
+    """Name and text of a robot file. Raises RobotFileError if there is no such file."""
     if not isinstance(name_or_path, str | PathLike):
         raise RobotFileError(
             f"a robot is given by its name or the path of its file, got {shown(name_or_path)}"

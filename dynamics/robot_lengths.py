@@ -2,8 +2,8 @@
 
 Seen from above, joints keep their directions from the middle of the robot, other than the base
 joints of a planar robot. Cranks and sliders keep their axes. All joint coordinates are zero at
-home. There, a crank with a vertical axis is at right angles to its link, as seen from above,
-because it then moves the platform best. All other cranks keep their direction. `scaled_bodies` says
+home. There, a crank with a vertical axis is at right angles to its link, as seen from above, which
+gives the actuator a large leverage. All other cranks keep their direction. `scaled_bodies` says
 what becomes of the bodies.
 """
 
@@ -172,7 +172,7 @@ def _square_crank(span: np.ndarray, crank: float, side: float) -> np.ndarray:
 
 
 def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> np.ndarray:
-    """Base joint of a planar leg, its crank square to its link at home. Raises RobotFileError."""
+    """Base joint of a planar leg with crank square to link. Raises RobotFileError if none fits."""
     base_radius, platform_radius = (new[name] for name in RADII)
     span = np.hypot(new["crank"], new["link"])
     nearest, farthest = abs(base_radius - platform_radius), base_radius + platform_radius
@@ -193,7 +193,7 @@ def _turned_to_fit(leg: Leg, platform: np.ndarray, new: Mapping[str, float]) -> 
 
 
 def _height(leg: Leg, new: Mapping[str, float]) -> float:
-    """Height of the platform, m, at which a leg's coordinate is zero. Raises RobotFileError."""
+    """Platform height, m, at which a leg's coordinate is zero. Raises RobotFileError if none is."""
     name = "leg" if "leg" in new else "link"
     begin = leg.base_joint
     if "crank" in new:
@@ -231,7 +231,7 @@ def _check_stroke(leg: Leg) -> None:
 
 
 def _within_limits(robot: Robot) -> Robot:
-    """Robot whose travel limit keeps sampled poses from singularities. Raises RobotFileError."""
+    """Robot whose travel limit avoids singularities. Raises RobotFileError if no limit does."""
     limits = [robot.travel_limit]
     while (limit := float(f"{TRAVEL_FACTOR * limits[-1]:.3g}")) >= LEAST_TRAVEL * limits[0]:
         limits.append(limit)

@@ -141,10 +141,9 @@ def measure_travel(
 ) -> WorkspaceMeasures:
     """Measures of poses for random joint coordinates within the travel limit.
 
-    The travel limit is that of the robot, unless another one is given.
-
-    The search for each pose begins at home. Joint coordinates without a pose are omitted, so that
-    there can be fewer rows than samples.
+    The travel limit is that of the robot, unless another one is given. The search for each pose
+    begins at home. Joint coordinates without a pose are omitted, so that there can be fewer rows
+    than samples.
     """
     limit = robot.travel_limit if travel_limit is None else travel_limit
     # the seed is fixed, because a report of a robot must not change from run to run
@@ -240,7 +239,7 @@ def check_motion(
 
 
 def _increasing(times: ArrayLike, count: int) -> np.ndarray:
-    """Times (count,) that increase. Raises ShapeError."""
+    """Times (count,) that increase. Raises ShapeError otherwise."""
     values = floats("times", times, (count,))
     back = np.flatnonzero(np.diff(values) <= 0)
     if len(back):

@@ -205,7 +205,8 @@ def test_figures_in_sentences_of_the_documentation_are_those_of_kept_runs():
             f"{reached} of 25 searches end in the same optimum",
         ],
     }
-    assert f"as those of `{short['scenario']}`" in " ".join(README.split()) and widths < 0.5
+    assert f"as those of `{short['scenario']}`" in " ".join(README.split())
+    assert widths < 0.5
     missing = [
         f"{name}: {sentence}"
         for name, sentences in wanted.items()

@@ -66,7 +66,7 @@ def checked_directions(
 
 
 def checked_times(times: object, frames: int) -> np.ndarray:
-    """Checked times (frames,) of frames, s, which must increase. Raises SimulationError."""
+    """Times (frames,) of frames, s, that increase. Raises SimulationError otherwise."""
     checked = floats("times", times, (frames,), error=SimulationError)
     not_later = np.flatnonzero(np.diff(checked) <= 0)
     if len(not_later):

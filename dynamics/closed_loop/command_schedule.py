@@ -3,7 +3,7 @@
 Commands keep their order. A command that would overtake an earlier one waits, and arrives together
 with it. If several commands arrive together, only the one issued last acts. With the linear hold, a
 command ramps from the value of the command issued before it over one frame period, and then remains
-constant. A command that arrives during the ramp of the earlier one first jumps to its end.
+constant. If the ramp of that earlier command has not ended, the new ramp begins with a jump.
 """
 
 from functools import lru_cache

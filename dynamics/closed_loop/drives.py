@@ -162,10 +162,10 @@ class Drives:
         Lowest and highest command that the drives take, rad or m. Commands are rounded to steps,
         and then cut at these limits. The default is no limits.
     friction_offset : tuple of float
-        Half of the Coulomb friction of each joint in its positive direction minus that in its
-        negative direction, N m or N. It acts as a constant torque in the negative direction, which
-        the integral of the drive balances. The torques that a run records are those of the motors
-        minus this offset. The default is no offset.
+        Half of the difference of each joint's Coulomb friction, positive minus negative direction,
+        N m or N. It acts as a constant torque in the negative direction, which the integral of the
+        drive balances. The torques that a run records are those of the motors minus this offset.
+        The default is no offset.
 
     Raises
     ------

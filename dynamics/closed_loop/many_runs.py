@@ -249,7 +249,7 @@ def prepare(robot: Robot) -> None:
 def _repeat(
     problem: LoopProblem, noises: np.ndarray, compiled: object
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do a run of a problem for each noise. Raises SimulationError."""
+    """Do a run of a problem for each noise. Raises SimulationError for noises of a wrong shape."""
     shape: Shape = ("N", problem.frames, 6)
     noises = floats("noises", noises, shape, error=SimulationError)
     use_kernels = flag("compiled", compiled, SimulationError)
@@ -267,7 +267,7 @@ def _cores() -> int:
 
 
 def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[Item]:
-    """List of the given items, or of a single given item. Raises SimulationError."""
+    """List of the items, or of a single item. Raises SimulationError for items of another kind."""
     if isinstance(given, kind):
         return [given]
     check_type(name, given, Sequence, SimulationError)

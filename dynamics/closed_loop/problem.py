@@ -295,7 +295,7 @@ def _problem(
 
 
 def _checked_sensor(sensor: Sensor, frames: int) -> Sensor:
-    """Checked sensor of a run with a number of frames. Raises SimulationError."""
+    """Sensor for a number of frames. Raises SimulationError if it has another number or is none."""
     if isinstance(sensor, IdealSensor):
         lost = sensor.lost
         return IdealSensor(
@@ -375,7 +375,7 @@ def _check_latencies(timing: FrameTiming, name: str, latencies: np.ndarray | Non
 
 
 def _rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:
-    """Contiguous array of a shape, or None. Raises SimulationError."""
+    """Rows as a contiguous array, or None. Raises SimulationError for another shape."""
     if rows is None:
         return None
     return np.ascontiguousarray(floats(name, rows, shape, error=SimulationError))

@@ -58,8 +58,8 @@ def pose_response(
 ) -> Callable[[float], np.ndarray]:
     """Frequency response from the desired to the true coordinates, near rest at a pose (6,).
 
-    Returns a function of the angular frequency, rad/s. Its result is the complex matrix (m, m) for
-    values at the frames. The desired rate is the difference of the desired coordinates of two
+    Returns a function of the angular frequency, rad/s. Its result is a complex matrix (m, m), for
+    coordinates at frames. The desired rate is the difference of the desired coordinates of two
     frames, divided by the period. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)

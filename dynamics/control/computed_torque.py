@@ -136,10 +136,10 @@ def _measured(assignment: Assignment) -> Command:
     at_rest = assignment.holding - assignment.model.robot.static_torque(
         pose, assignment.model.dynamic
     )
-    way = _decaying_errors(assignment, 0.0, last, np.zeros_like(last))
+    recovery = _decaying_errors(assignment, 0.0, last, np.zeros_like(last))
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
-        nonlocal last, elapsed, integral, way
+        nonlocal last, elapsed, integral, recovery
         elapsed += period
         if measured is not None:
             now = chart.coordinates(measured)
@@ -147,10 +147,12 @@ def _measured(assignment: Assignment) -> Command:
             last = now
             elapsed = 0.0
             integral = integral + period * (chart.coordinates(assignment.desired(time)[0]) - now)
-            way = _decaying_errors(assignment, time, now, rates)
-            way = replace(way, correction=INTEGRAL_FACTOR * feedback.bandwidth**3 * integral)
+            recovery = _decaying_errors(assignment, time, now, rates)
+            recovery = replace(
+                recovery, correction=INTEGRAL_FACTOR * feedback.bandwidth**3 * integral
+            )
         arrival = time + assignment.settings.timing.latency_s
-        return _torque(assignment, replace(way, begin=arrival), assignment.motion) + at_rest
+        return _torque(assignment, replace(recovery, begin=arrival), assignment.motion) + at_rest
 
     return command
 
@@ -166,12 +168,12 @@ def _decaying_errors(
 
 
 def _torque(
-    assignment: Assignment, way: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
+    assignment: Assignment, recovery: DecayingErrors, dry: Motion, viscous: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """Mean torque (n,) over the first frame of a recovery motion, N m or N.
 
     The signs of dry friction are those of the motion `dry`. `viscous` (n,) are coefficients of
     viscous friction, N m s/rad or N s/m, in addition to those of the model.
     """
-    span = spans(assignment.model, way, np.array([way.begin]), assignment.period, dry)
+    span = spans(assignment.model, recovery, np.array([recovery.begin]), assignment.period, dry)
     return np.asarray(span.torque[0] + viscous * (span.end[0] - span.begin[0]) / assignment.period)

@@ -1,9 +1,9 @@
 """Design of gains: bandwidth and damping of a loop near rest, and gains for desired values.
 
 The bandwidth, rad/s, is the lowest frequency of an oscillating desired pose at which the error
-reaches 1/sqrt(2) of the oscillation, in the worst direction. The damping is the smallest damping
-ratio of the eigenvalues of the map from frame to frame. Both are computed for the linear loop
-(`closed_loop.stability`), without dry friction.
+reaches 1/sqrt(2) of the oscillation, for one of the eigenvectors of the response. The damping is
+the smallest damping ratio of the eigenvalues of the map from frame to frame. Both are computed for
+the linear loop (`closed_loop.stability`), without dry friction.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from dynamics.robot import Robot
 # Ratio of the error to the desired motion at the bandwidth.
 HALF_POWER = 2**-0.5
 DECAYED = 1e-3  # magnitude of eigenvalues below which a motion has decayed within a frame
-SLOWEST = 1e-2  # bandwidth, rad/s, at which the search for a stable lower one ends
+SLOWEST = 1e-2  # bandwidth, rad/s, at which the search for a lower, stable bandwidth ends
 # Largest accepted relative deviation of the error of a designed servo from HALF_POWER, and largest
 # accepted shortfall of its damping.
 DESIGN_TOLERANCE = 0.02
@@ -65,7 +65,7 @@ def design_servo(
 ) -> ServoGains:
     """Gains of the visual servo for a bandwidth, rad/s, and a minimum damping, at a pose (6,).
 
-    Raises SimulationError, with the best values found, if there are no such gains.
+    Raises SimulationError, with the nearest values found, if there are no such gains.
     """
 
     def servo(logs: np.ndarray) -> ServoGains:
@@ -349,7 +349,7 @@ def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float
 
 
 def _error_ratio(response: np.ndarray) -> float:
-    """Ratio of the error to the desired motion in the worst direction, for a response (m, m)."""
+    """Largest ratio of error to desired motion among the eigenvectors of a response (m, m)."""
     return float(np.abs(np.linalg.eigvals(np.eye(len(response)) - response)).max())
 
 

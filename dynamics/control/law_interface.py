@@ -120,7 +120,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class LawInLoop:
-    """Result of a law: a feedforward for the servo, or a controller. With neither, the servo acts.
+    """Result of a law: a feedforward for the servo, a controller, or neither for the servo alone.
 
     Parameters
     ----------

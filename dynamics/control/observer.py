@@ -58,8 +58,8 @@ class Observer:
 
     `model` is the law's model of the robot. `pose` (6,) is the pose at rest at the start, and
     `holding` (n,) is the command that holds it. `latencies` (frames,) are the latencies of the
-    commands; the latency of a command is not used before the command is issued. `noise(frame)` is
-    the covariance (6, 6) of a measured pose. `common` (6, 6) is the covariance of the error that
+    commands; the latency of a command is not used before the frame of this command. `noise(frame)`
+    is the covariance (6, 6) of a measured pose. `common` (6, 6) is the covariance of the error that
     all measured poses have in common.
     """
 
@@ -223,8 +223,8 @@ class Observer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """State and covariance at a later time, s.
 
-        `by_scale`, the derivatives of the covariance with respect to the scales, is updated in
-        place if given.
+        `by_scale` has the derivatives of the covariance with respect to the scales, and is updated
+        in place, or is None.
         """
         now = self._time
         while now < time - SAME_TIME * self._period:

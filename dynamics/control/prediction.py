@@ -88,7 +88,7 @@ class Prediction:
         command_rate: np.ndarray,
         length: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """State after a time, s, during which a command (n,) and its rate act.
+        """State after a step of a `length`, s, in which a command (n,) and its rate act.
 
         Also returns the map (size, size) from errors of the state before to errors after. The
         covariance (size, size) of the state determines how well the velocities of joints are known.

@@ -89,7 +89,7 @@ class Connection:
         """
         if body == self.first:
             return self.freedoms
-        return tuple(one._replace(axis=-one.axis) for one in self.freedoms[::-1])
+        return tuple(freedom._replace(axis=-freedom.axis) for freedom in self.freedoms[::-1])
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def simplified(mechanism: Mechanism) -> Mechanism:
     """Merge welded bodies, and replace bodies that are only part of a joint by that joint."""
     solids = list(mechanism.solids)
     connections = list(mechanism.connections)
-    while weld := next((one for one in connections if not one.freedoms), None):
+    while weld := next((c for c in connections if not c.freedoms), None):
         keep, gone = sorted((weld.first, weld.second))
         solids[keep] = solids[keep] if keep == BASE else _together(solids[keep], solids[gone])
         connections = _moved(connections, weld, gone, keep)
@@ -151,8 +151,8 @@ def platform_of(mechanism: Mechanism) -> int:
     Raises RobotFileError if several bodies have the most joints, or if none has two or more.
     """
     joint_counts = dict.fromkeys(range(1, len(mechanism.solids)), 0)
-    for one in mechanism.connections:
-        for body in {one.first, one.second} - {BASE}:
+    for connection in mechanism.connections:
+        for body in {connection.first, connection.second} - {BASE}:
             joint_counts[body] += 1
     most = max(joint_counts.values(), default=0)
     candidates = [body for body, number in joint_counts.items() if number == most]
@@ -178,7 +178,7 @@ def legs_of(
     while remaining:
         members = _reached(mechanism, remaining[0], {BASE, platform})
         remaining = [body for body in remaining if body not in members]
-        if not any({one.first, one.second} & members for one in mechanism.connections):
+        if not any({c.first, c.second} & members for c in mechanism.connections):
             continue
         number += 1
         try:
@@ -192,7 +192,7 @@ def _leg(
     mechanism: Mechanism, members: set[int], platform: int, from_platform: np.ndarray
 ) -> MechanismLeg:
     """Leg that consists of the member bodies."""
-    joined = sum(bool({one.first, one.second} & members) for one in mechanism.connections)
+    joined = sum(bool({c.first, c.second} & members) for c in mechanism.connections)
     # with more loops, the number of paths would grow without limit
     if joined > len(members) + 2:
         raise RobotFileError(
@@ -209,7 +209,10 @@ def _leg(
     for body in sorted(members - {body for path in paths for body, _ in path}):
         raise RobotFileError(f"{solids[body].name} is on no path from the base to the platform")
     actuated = [
-        one for body, joint in paths[0] for one in joint.seen_from(body) if one.actuator is not None
+        freedom
+        for body, connection in paths[0]
+        for freedom in connection.seen_from(body)
+        if freedom.actuator is not None
     ]
     if len(actuated) != 1:
         raise RobotFileError(f"it has {len(actuated)} actuated joints, must have one")
@@ -235,7 +238,9 @@ def _leg(
                 raise RobotFileError("its two bars are not parallel")
             # Two equal bars move as one bar in their middle.
             point = (kinds[0][1] + kinds[1][1]) / 2
-        joints.append(kind + "*" * sum(one.actuator is not None for one in steps[0][1].freedoms))
+        joints.append(
+            kind + "*" * sum(freedom.actuator is not None for freedom in steps[0][1].freedoms)
+        )
         points.append(point)
         axes.append(axis)
         bodies.append([solids[body] for body in dict.fromkeys(body for body, _ in steps)])
@@ -284,26 +289,25 @@ def _joint(freedoms: tuple[Freedom, ...]) -> tuple[str, np.ndarray, np.ndarray]:
     A missing axis is NaN. Raises RobotFileError for friction without an actuator, and for hinges
     that form no universal or ball joint.
     """
-    for one in freedoms:
-        if one.actuator is None and any(one.friction):
+    for freedom in freedoms:
+        if freedom.actuator is None and any(freedom.friction):
             raise RobotFileError(
-                f"{one.name} has friction {max(one.friction):g}, must have none without an actuator"
+                f"{freedom.name} has friction {max(freedom.friction):g}, must have none without an "
+                "actuator"
             )
-    kinds = [one.kind for one in freedoms]
-    axes = np.array([one.axis for one in freedoms] + [np.full(3, np.nan)])[:2]
+    kinds = [freedom.kind for freedom in freedoms]
+    axes = np.array([freedom.axis for freedom in freedoms] + [np.full(3, np.nan)])[:2]
     if len(kinds) == 1:
         return kinds[0], freedoms[0].point, axes
     if kinds not in (2 * ["hinge"], 3 * ["hinge"]):
         return "-".join(kinds), freedoms[0].point, axes
-    directions = np.array([one.axis for one in freedoms])
+    directions = np.array([freedom.axis for freedom in freedoms])
     # the point that is nearest to the axes of all hinges
     normal_matrix = sum(np.eye(3) - np.outer(axis, axis) for axis in directions)
-    right_hand_side = sum(
-        (np.eye(3) - np.outer(one.axis, one.axis)) @ one.point for one in freedoms
-    )
+    right_hand_side = sum((np.eye(3) - np.outer(f.axis, f.axis)) @ f.point for f in freedoms)
     point = np.linalg.lstsq(normal_matrix, right_hand_side, rcond=None)[0]
-    distance = max(float(np.linalg.norm(np.cross(one.axis, point - one.point))) for one in freedoms)
-    names = ", ".join(one.name for one in freedoms)
+    distance = max(float(np.linalg.norm(np.cross(f.axis, point - f.point))) for f in freedoms)
+    names = ", ".join(freedom.name for freedom in freedoms)
     if distance > SAME:
         raise RobotFileError(
             f"the axes of the hinges {names} are {2 * distance:.3g} m apart, must meet in a point"
@@ -329,10 +333,10 @@ def _reached(mechanism: Mechanism, start: int, walls: set[int]) -> set[int]:
     pending = [start]
     while pending:
         body = pending.pop()
-        for one in mechanism.connections:
-            if body in (one.first, one.second) and one.other(body) not in reached | walls:
-                reached.add(one.other(body))
-                pending.append(one.other(body))
+        for c in mechanism.connections:
+            if body in (c.first, c.second) and c.other(body) not in reached | walls:
+                reached.add(c.other(body))
+                pending.append(c.other(body))
     return reached
 
 
@@ -344,11 +348,11 @@ def _hub(
     Such a body has a mass of at most `limit`, kg, and two connections, which consist of hinges.
     """
     for body in range(1, len(solids)):
-        joined = [one for one in connections if body in (one.first, one.second)]
+        joined = [c for c in connections if body in (c.first, c.second)]
         if (
             len(joined) == 2
             and solids[body].mass <= limit
-            and all(f.kind == "hinge" for one in joined for f in one.freedoms)
+            and all(freedom.kind == "hinge" for c in joined for freedom in c.freedoms)
         ):
             return body, (joined[0], joined[1])
     return None
@@ -356,7 +360,7 @@ def _hub(
 
 def _moved(connections: list[Connection], gone: Connection, old: int, new: int) -> list[Connection]:
     """Connections without `gone`, in which body `new` replaces body `old`."""
-    kept = [one for one in connections if one is not gone]
+    kept = [c for c in connections if c is not gone]
     numbers = {old: new}
     return [
         Connection(numbers.get(c.first, c.first), numbers.get(c.second, c.second), c.freedoms)
@@ -369,8 +373,8 @@ def _together(a: Solid, b: Solid) -> Solid:
     mass = a.mass + b.mass
     centre = (a.mass * a.centre + b.mass * b.centre) / mass if mass else a.centre
     inertia = np.zeros((3, 3))
-    for one in (a, b):
-        shift = one.centre - centre
-        inertia += one.inertia + one.mass * (shift @ shift * np.eye(3) - np.outer(shift, shift))
+    for solid in (a, b):
+        shift = solid.centre - centre
+        inertia += solid.inertia + solid.mass * (shift @ shift * np.eye(3) - np.outer(shift, shift))
     name = a.name if not b.mass else f"{a.name}+{b.name}"
     return Solid(name, mass, centre, inertia, a.axes, a.rod or b.rod, a.shapes + b.shapes)

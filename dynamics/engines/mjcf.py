@@ -3,9 +3,9 @@
 The platform has a free joint. The bodies of each leg form a chain from the base on, with the joints
 of the leg's segments. A `connect` equality joins the end of each leg to the platform, and the
 platform thus has only the degrees of freedom that the legs allow. Motors act on the actuated
-joints, whose coordinates are those of `inverse_kinematics`. Their viscous friction is written as
-joint damping, and their Coulomb friction as friction loss. A link that consists of two equal bars
-is written as two bodies.
+joints, whose coordinates are those of `inverse_kinematics`. The viscous friction of these joints is
+written as joint damping, and their Coulomb friction as friction loss. A link that consists of two
+equal bars is written as two bodies.
 
 MuJoCo's ball joints let bodies spin freely about their own axes, which eq. 12 excludes. No torque
 causes this spin as long as Ixx = Iyy, and it stays zero. The export adds no damping against it,

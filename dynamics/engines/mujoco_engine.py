@@ -71,7 +71,7 @@ class MujocoRobot:
             self._parts = parts_of(robot.geometry)
             ends = [end_names(part) for part in self._parts.all if part.last]
             self._ends = np.array(
-                [[self.model.site(one[key]).id for one in ends] for key in ("site1", "site2")]
+                [[self.model.site(names[key]).id for names in ends] for key in ("site1", "site2")]
             )
             self._bodies = [self.model.body(part.name) for part in self._parts.all]
         except KeyError as error:
@@ -131,7 +131,7 @@ class MujocoRobot:
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
         """Set the state of all bodies from a pose (6,) and a twist (6,) of the platform.
 
-        Links do not spin about their own axes (eq. 12).
+        Links on ball joints do not spin about their own axes (eq. 12).
         """
         pose = floats("pose", pose, (6,))
         twist = floats("twist", twist, (6,))

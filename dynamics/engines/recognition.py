@@ -279,9 +279,9 @@ def _travel(
 ) -> float:
     """Travel limit, rad or m, from the ranges in the file.
 
-    Without ranges it is the largest home coordinate plus a default margin, and a note says so.
-    Raises RobotFileError for a range that does not contain both the home coordinate and its
-    negative.
+    Without ranges, it is the largest magnitude of a home coordinate plus a default margin, and a
+    remark is added to `notes`. Raises RobotFileError for a range that does not contain both the
+    home coordinate and its negative.
     """
     limits = []
     for mechanism_leg in mechanism_legs:

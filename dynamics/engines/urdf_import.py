@@ -9,7 +9,7 @@ tree, whose root is the fixed base. The YAML file has these keys:
   too.
 - name_mot: the actuated joints.
 - joint_name and joint_type: joints with another type than in the URDF file, and these types. A type
-  is SPHERICAL, FIXED, or UJOINT_XY (hinges about x, then y, of the frame of the joint).
+  is SPHERICAL, FIXED, or, for example, UJOINT_XY (hinges about x, then y, of the joint's frame).
 
 Home is the configuration near zero coordinates in which the loops are closed.
 """
@@ -61,8 +61,8 @@ class _Joint:
     """Joint of the tree.
 
     `place` (4, 4) is its frame in the frame of the parent at coordinate zero. `axes` (2, 3) are its
-    axes in its own frame; only a universal joint uses the second. `span` is the range of its
-    coordinate, or None if the file states none.
+    axes in its own frame; only a universal joint uses the second. `friction` has the dry and the
+    viscous friction. `span` is the range of its coordinate, or None if the file states none.
     """
 
     name: str
