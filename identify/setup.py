@@ -25,7 +25,7 @@ from identify.errors import EstimationError, ScenarioError, WriteError
 from identify.estimation.result import IdentificationResult
 from identify.excitation.constraints import MotionConstraints
 from identify.excitation.criteria import criterion_of
-from identify.excitation.design import Design, design_trajectories
+from identify.excitation.design import DesignTask, design_trajectories
 from identify.experiment.plant import (
     KnownLoop,
     Plant,
@@ -208,13 +208,13 @@ class Setup:
         return self.sensor_plan.untaught(self.robot, self.seed, self.progress)
 
     @cached_property
-    def design(self) -> Design:
+    def design(self) -> DesignTask:
         """The task of choosing trajectories."""
         scenario = self.scenario
-        return Design(
+        return DesignTask(
             robot=self.robot,
             settings=scenario.excitation,
-            unseen=scenario.validation,
+            validation=scenario.validation,
             limits=MotionConstraints(self.robot, scenario.excitation, self.sensor_plan.sight),
             criterion=partial(criterion_of, self.robot, scenario),
         )

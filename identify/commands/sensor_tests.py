@@ -81,7 +81,7 @@ def acceptance(
       cmmsim acceptance mine.toml --standard vdi --limit-um 30
       cmmsim acceptance --volume 0.6 --renderer analytic --seed 3
     """
-    from identify.verification.acceptance import acceptance_entry, do, prepare
+    from identify.verification.acceptance import acceptance_content, prepare, run_tests
     from identify.verification.acceptance_report import acceptance_markdown
     from identify.verification.sensor_figures import acceptance_figures
 
@@ -89,8 +89,8 @@ def acceptance(
     folder = context.with_resource(
         new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}")
     ).path
-    do(run, terminal_progress(quiet))
-    entry = acceptance_entry(run)
+    run_tests(run, terminal_progress(quiet))
+    entry = acceptance_content(run)
     figures = {f"figures/{name}.png": figure for name, figure in acceptance_figures(run).items()}
     save_files(
         folder, {"acceptance.json": entry, "acceptance.md": acceptance_markdown(entry), **figures}

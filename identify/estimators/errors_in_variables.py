@@ -16,10 +16,10 @@ minimises |A x~|^2 / |E x~|^2, with A = (W | tau) and E the sampled errors of A.
 R^-1 times the first right singular vector of E R^-1 (generalised total least squares, Van Huffel
 and Vandewalle, "The total least squares problem", SIAM 1991, chapter 10).
 
-Directions that the motion does not determine better than the initial guess are fixed at the guess
-first (truncation), because noise would dominate them. Both methods remove the bias, but not the
-scatter. If the errors are large, the normal matrix minus the second moments of the errors is nearly
-singular, and the standard deviations are large.
+Total least squares first fixes directions at the initial guess if the motion does not determine
+them SHOWN times better (truncation), because noise would dominate them. Both methods remove the
+bias, but not the scatter. If the errors are large, the normal matrix minus the second moments of
+the errors is nearly singular, and the standard deviations are large.
 """
 
 import time

@@ -48,7 +48,7 @@ class Evidence:
 
     @property
     def run(self) -> LoopModel:
-        """First record. Estimators of this package that use joint channels read only this one."""
+        """Model of the first record, the only one that estimators with joint channels use."""
         return self.problem.runs[0]
 
     def joint_channels(self) -> JointChannels:

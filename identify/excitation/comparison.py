@@ -11,7 +11,7 @@ from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import WorstCase
 from identify.excitation.criteria import log_observability, observability_index
-from identify.excitation.design import Design
+from identify.excitation.design import DesignTask
 from identify.excitation.information import Knowledge, log_information
 from identify.excitation.search import FEWEST_MEMBERS, SEARCHES
 from identify.excitation.trajectory_unknowns import sample_times
@@ -33,12 +33,12 @@ class Entry:
     trajectory                      Trajectory that was found.
     value                           Value of the criterion that the method maximised.
     observability                   Observability index (eq. 39).
-    information                     D of the simulated loop; None if the loop is unstable at the
+    information                     D of the simulated loop, or None if the loop is unstable at the
                                     initial guess.
     seconds                         Duration of the search.
     evaluations, gradients, iterations
-                                    Evaluations of the criterion and of its gradient, and
-                                    iterations.
+                                    Numbers of evaluations of the criterion and of its gradient, and
+                                    of iterations.
     reason                          Reason why the search stopped.
     worst                           Instants at which the trajectory comes nearest to each limit.
     """
@@ -67,7 +67,9 @@ class Comparison:
     entries: tuple[Entry, ...]
 
 
-def compare_methods(design: Design, known: Knowledge, seed: int, progress: Progress) -> Comparison:
+def compare_methods(
+    design: DesignTask, known: Knowledge, seed: int, progress: Progress
+) -> Comparison:
     """Run the search of every method, and compute the information of each result.
 
     Raises the errors of `design_trajectories`.

@@ -94,16 +94,16 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
     return cast(Criterion, make(robot, scenario, unknowns, typical))
 
 
-def _check_criterion(part: str, made: object, *given: Any) -> None:
-    """Raise ScenarioError if the object that a user's own function made is no criterion of z.
+def _check_criterion(part: str, returned: object, *given: Any) -> None:
+    """Raise ScenarioError if the object that a user's own function returned is no criterion of z.
 
     given: arguments of the function, which are robot, scenario, unknowns and typical z.
     """
     unknowns, typical = given[2:]
-    if not isinstance(made, Criterion):
-        raise ScenarioError(f"{part} must return a Criterion, returned {type(made).__name__}")
+    if not isinstance(returned, Criterion):
+        raise ScenarioError(f"{part} must return a Criterion, returned {type(returned).__name__}")
     for name in ("value", "smooth"):
-        function = getattr(made, name)
+        function = getattr(returned, name)
         wanted = f"{part} must have a CasADi function {name} of z ({unknowns.size},) to one number"
         if not isinstance(function, ca.Function):
             raise ScenarioError(f"{wanted}, but has {type(function).__name__}")
@@ -112,7 +112,7 @@ def _check_criterion(part: str, made: object, *given: Any) -> None:
             raise ScenarioError(f"{wanted}, but has {function}")
         if np.isnan(float(function(typical))):
             raise ScenarioError(f"{wanted}, but its value is NaN at an admissible trajectory")
-    if made.judge is not None and not callable(made.judge):
+    if returned.judge is not None and not callable(returned.judge):
         raise ScenarioError(f"{part} must have a function for judge, or None")
 
 

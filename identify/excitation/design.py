@@ -81,20 +81,20 @@ RANDOM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Design:
+class DesignTask:
     """Task of choosing trajectories for a robot.
 
-    robot      Robot that shall follow the trajectories.
-    settings   Form of the trajectories, and the search method of the exciting trajectory.
-    unseen     Number and length of the validation trajectories.
-    limits     Limits of the motion.
-    criterion  Function (unknowns, typical) that returns the criterion of the search, see
-               `identify.excitation.criteria`.
+    robot       Robot that shall follow the trajectories.
+    settings    Form of the trajectories, and the search method of the exciting trajectory.
+    validation  Number and length of the validation trajectories.
+    limits      Limits of the motion.
+    criterion   Function (unknowns, typical) that returns the criterion of the search, see
+                `identify.excitation.criteria`.
     """
 
     robot: Robot
     settings: Excitation
-    unseen: Validation
+    validation: Validation
     limits: MotionConstraints
     criterion: Callable[[Unknowns, Array], Criterion]
 
@@ -132,7 +132,7 @@ class Design:
 
 
 def design_trajectories(
-    design: Design, seed: int, progress: Progress | None = None
+    design: DesignTask, seed: int, progress: Progress | None = None
 ) -> TrajectorySet:
     """Design the exciting trajectory and the validation trajectories.
 
@@ -157,19 +157,19 @@ def design_trajectories(
     return TrajectorySet(
         seed=seed,
         excitation=found.trajectory(problem),
-        validation=unseen_trajectories(design, seed),
+        validation=validation_trajectories(design, seed),
         observability_index=observability_index(index, found.z),
         first_index=indices[0],
         median_index=float(np.median(indices)),
     )
 
 
-def unseen_trajectories(design: Design, seed: int) -> tuple[FourierTrajectory, ...]:
+def validation_trajectories(design: DesignTask, seed: int) -> tuple[FourierTrajectory, ...]:
     """Return the validation trajectories. They are random, without a search."""
+    duration_s, count = design.validation.duration_s, design.validation.count
     stream = child(seed, UNSEEN)
-    unseen = design.unseen
     return tuple(
         admissible_trajectories(
-            design.robot, design.settings, unseen.duration_s, unseen.count, stream, design.check
+            design.robot, design.settings, duration_s, count, stream, design.check
         )
     )

@@ -15,12 +15,12 @@ from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.experiment.sensor_in_loop import sight_lines
 
-# Factor between the distances of the cameras from their target that are tried, and their number.
-FARTHER = 1.05
-DISTANCES = 25
 B = TypeVar("B", bound=Body)
-NEGLIGIBLE_M = 0.03  # distance, m, of a leg's end from a plane that is not moved for it
-CLEAR_M = 0.05  # distance, m, of the stickers of the base from the base joints
+
+FARTHER = 1.05  # ratio of successive distances of the cameras from their target that are tried
+DISTANCES = 25  # number of these distances
+NEGLIGIBLE_M = 0.03  # largest distance, m, of a leg's end outside a plane that is not moved for it
+CLEAR_M = 0.05  # least distance, m, of the stickers of the base in front of the base joints
 DIGITS = 4  # number of decimals of positions, m
 
 
@@ -58,9 +58,9 @@ def fitted(file: SensorFile, robot: Robot) -> SensorFile:
         # the stated distance is that of the unmoved cameras
         update = {"position": position, "target": _rounded(target), "distance": None}
         rig = file.rig.model_copy(update=update)
-        made = file.model_copy(update={"platform": platform, "base": base, "rig": rig})
-        if all((now >= before).all() for now, before in zip(_seen(made), wanted, strict=True)):
-            return made
+        tried = file.model_copy(update={"platform": platform, "base": base, "rig": rig})
+        if all((now >= before).all() for now, before in zip(_seen(tried), wanted, strict=True)):
+            return tried
     raise ScenarioError(
         f"cameras of {file.name} up to {factor * np.linalg.norm(away):.3g} m from their target do "
         f"not see all stickers of the platform of {robot.name} at home and of the base: move "

@@ -215,7 +215,7 @@ class Plant:
             raise LoopFailure(f"{error}; {verdict}", error.frame, error.saturated) from None
 
     def without_latency(self) -> Plant:
-        """Return the plant in a loop without latency and dropout, as control laws then know."""
+        """Return the plant in a loop without latency and dropout, of which control laws know."""
         none = ("latency_s", "latency_jitter_s", "latency_std_s", "dropout")
         timing = self.runs.timing.model_copy(update=dict.fromkeys(none, 0.0))
         settings, known = (

@@ -32,9 +32,10 @@ from identify.scenario.sections import RIG_KNOWN, Rig
 
 # Largest ratio of focal lengths, or of baselines, at which two rigs count as the same.
 LARGEST_RATIO = 1.5
-# Largest angle [rad] of right cameras, or of baselines, at which two rigs count as the same.
+# Largest angle [rad] between right cameras, or between baselines, of two such rigs.
 ANGLE = np.deg2rad(10.0)
-SHARE = 0.1  # largest distance of principal points of such rigs, as a fraction of the image size
+# Largest distance between principal points of two such rigs, as a fraction of the image size.
+SHARE = 0.1
 
 
 def known_rig(

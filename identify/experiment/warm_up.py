@@ -45,7 +45,7 @@ def warm_up(
     depends on the number of joints, not on the robot. A robot with as many joints as an earlier one
     waits until the earlier one is compiled, and then finds the loop in the cache.
 
-    Raises the errors of a run before its first frame, IdentifyError if a process dies, and
+    Raises the errors of `load_robot` for further robots, IdentifyError if a process fails, and
     WriteError if code cannot be stored.
     """
     tasks: dict[str, Task] = {
@@ -100,7 +100,7 @@ def _side_by_side(
     spawn = get_context("spawn")
     unkept = spawn.SimpleQueue()
     waiting = [
-        spawn.Process(target=_do, args=(task, unkept), name=name, daemon=True)
+        spawn.Process(target=_run_task, args=(task, unkept), name=name, daemon=True)
         for name, task in tasks.items()
     ]
     running: list[SpawnProcess] = []
@@ -132,7 +132,7 @@ def _side_by_side(
             process.kill()
 
 
-def _do(task: Task, unkept: "SimpleQueue[str]") -> None:
+def _run_task(task: Task, unkept: "SimpleQueue[str]") -> None:
     """Run a task, and put its warnings about code that cannot be stored into a queue."""
     end_with_parent()
     with warnings.catch_warnings(record=True) as given:

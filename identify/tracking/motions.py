@@ -18,7 +18,7 @@ from dynamics.files import read_bytes
 from dynamics.kinematics.platform import POSE_NAMES, Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.excitation.design import Design, unseen_trajectories
+from identify.excitation.design import DesignTask, validation_trajectories
 from identify.experiment.law_in_loop import NamedMotion
 from identify.loop_parameters import of_actuators
 from identify.trajectory import box_of
@@ -54,7 +54,7 @@ class CoordinateMotion:
         return self.chart.lifted(self.coordinates[2](t))
 
 
-def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMotion]:
+def motions(design: DesignTask, seed: int, own: Path | None = None) -> list[NamedMotion]:
     """Return the validation trajectories of a design, a circle and a square.
 
     With a file ``own``, only the motion through its poses is returned, see `read_motion`. Raises
@@ -65,10 +65,10 @@ def motions(design: Design, seed: int, own: Path | None = None) -> list[NamedMot
     if own is not None:
         fastest = of_actuators(robot, limits, "max_joint_velocity")
         return [read_motion(own, robot, fastest)]
-    duration = design.unseen.duration_s
+    duration = design.validation.duration_s
     named: list[NamedMotion] = [
         NamedMotion(f"unseen {k}", path, duration)
-        for k, path in enumerate(unseen_trajectories(design, seed), start=1)
+        for k, path in enumerate(validation_trajectories(design, seed), start=1)
     ]
     box = box_of(
         robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad

@@ -28,7 +28,7 @@ from dynamics.closed_loop.start_state import (
 )
 from identify.arrays import Array
 from identify.estimation.common_error_estimates import errors_of_run
-from identify.excitation.design import Design, unseen_trajectories
+from identify.excitation.design import DesignTask, validation_trajectories
 from identify.experiment.plant import Plant
 from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import SensorPlan
@@ -223,7 +223,7 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
         advance(counter.value - done)
 
 
-def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: int) -> Array:
+def errors_of_model(parameters: ArrayLike, plant: Plant, design: DesignTask, seed: int) -> Array:
     """Return the pose errors (runs, N, 6) [m, rad] of a model against the plant.
 
     Both run on the validation trajectories of a seed, each with its own friction law and
@@ -237,7 +237,7 @@ def errors_of_model(parameters: ArrayLike, plant: Plant, design: Design, seed: i
     robot = plant.nominal
     settings = plant.loop.side.settings
     values = checked_loop_parameters(robot, parameters, settings.drives.law)
-    times = plant.runs.timing.frame_times(design.unseen.duration_s)
-    references = [path.reference(times) for path in unseen_trajectories(design, seed)]
+    times = plant.runs.timing.frame_times(design.validation.duration_s)
+    references = [path.reference(times) for path in validation_trajectories(design, seed)]
     model = [model_run(robot, settings, values, reference) for reference in references]
     return np.array(model) - np.array([plant.run(reference).pose for reference in references])

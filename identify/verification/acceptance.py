@@ -36,7 +36,8 @@ from identify.progress import Progress
 from identify.random_streams import RESAMPLING, mixed_generator
 from identify.reporting.goal_causes import Advice
 
-# Number of standard deviations that the largest of 35 errors exceeds by chance in one of 60 tests.
+# Number of standard deviations up to which noise explains a length error. By chance, the largest of
+# the 35 errors of a test exceeds this number in one of 60 tests.
 STDS = 3.5
 BLOCK = 10  # number of neighbouring frames of the bar that are resampled together
 
@@ -73,8 +74,8 @@ class Standard:
     steps
         Function that returns the number of steps of the test in a volume. It raises
         AcceptanceError for a volume without room for the test.
-    test
-        Function that runs the test.
+    measure
+        Function that runs the test and returns its result.
     figures
         Function that returns the entry of ``acceptance.json``.
     """
@@ -82,7 +83,7 @@ class Standard:
     title: str
     key: str
     steps: Callable[[MeasuringVolume], int]
-    test: Callable[..., Any]
+    measure: Callable[..., Any]
     figures: Callable[[Any, AcceptanceRun], dict[str, Any]]
 
 
@@ -141,7 +142,7 @@ def prepare(
 def parse_volume(text: str) -> np.ndarray:
     """Return the sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``.
 
-    Raises AcceptanceError for any other text.
+    Raises AcceptanceError if the text is neither one nor three finite numbers.
     """
     try:
         sides = np.array([float(part) for part in text.lower().split("x")])
@@ -156,17 +157,17 @@ def parse_volume(text: str) -> np.ndarray:
     return np.broadcast_to(sides, 3).copy()
 
 
-def do(run: AcceptanceRun, progress: Progress) -> None:
+def run_tests(run: AcceptanceRun, progress: Progress) -> None:
     """Run the tests of a prepared run, and store their results and durations in it."""
     for name in run.standards:
         standard = STANDARDS[name]
         start = time.perf_counter()
         with progress.stage(standard.title, standard.steps(run.volume)) as advance:
-            run.found[name] = standard.test(run.under_test, run.volume, advance=advance)
+            run.found[name] = standard.measure(run.under_test, run.volume, advance=advance)
         run.seconds[name] = time.perf_counter() - start
 
 
-def acceptance_entry(run: AcceptanceRun) -> dict[str, Any]:
+def acceptance_content(run: AcceptanceRun) -> dict[str, Any]:
     """Return the content of ``acceptance.json``, without tests that were not run."""
     volume = run.volume
     return {
@@ -203,7 +204,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
     return {
         "limit_um": run.limit_um,
         "met": met,
-        "advice": None if met else asdict(_why_too_long(test, run)),
+        "advice": None if met else asdict(_why_inaccurate(test, run)),
         "largest_error_um": 1e6 * largest.error,
         "largest_error_at": {"line": largest.line, "length_mm": 1e3 * largest.true},
         "mean_error_um": float(errors.mean()),
@@ -233,7 +234,7 @@ def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
     }
 
 
-def _why_too_long(test: LengthTest, run: AcceptanceRun) -> Advice:
+def _why_inaccurate(test: LengthTest, run: AcceptanceRun) -> Advice:
     """Return the likeliest cause of the largest length error, and the command to type next."""
     largest = test.largest
     exposures = len(largest.measured)
@@ -272,9 +273,9 @@ def _bar(test: BarTest, run: AcceptanceRun) -> dict[str, Any]:
                 "frames": len(bar.time),
                 "lost_frames": bar.lost,
                 "given_up": bar.given_up,
-                "position_rms_um": _rms_norm(bar.errors[:, :3]),
-                "orientation_rms_urad": _rms_norm(bar.errors[:, 3:]),
-                "distance_rms_um": _rms_norm(bar.distance_errors[:, None]),
+                "position_rms_um": 1e6 * _rms_norm(bar.errors[:, :3]),
+                "orientation_rms_urad": 1e6 * _rms_norm(bar.errors[:, 3:]),
+                "distance_rms_um": 1e6 * _rms_norm(bar.distance_errors[:, None]),
             }
             for bar in test.runs
         ],
@@ -294,7 +295,7 @@ def _relative_errors(test: BarTest, moving: bool, rng: np.random.Generator) -> d
 
 
 def _rms_norm(errors: np.ndarray) -> float:
-    return float(1e6 * np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
 
 def _latency(test: LatencyTest, run: AcceptanceRun) -> dict[str, Any]:

@@ -41,7 +41,7 @@ from identify.record.suspicions import lag_of, suspicions
 from identify.record.telemetry import CommandLog, PoseLog, ReferenceLog, Rows, Telemetry
 from identify.scenario.sections import Identification
 
-# Ratio of the number of command rows to that of pose rows above which commands are repeated.
+# Ratio of the number of command rows to that of pose rows above which rows repeat commands.
 ONCE = 1.5
 MOST_FRAMES = 10_000  # largest number of frames for which the model runs
 
@@ -118,7 +118,7 @@ class LoggedRun:
         return np.stack([self.time[:-1][wide], self.time[1:][wide]], axis=1)
 
     def commands_at(self, time: Array) -> Array:
-        """Return the most recent commands (K, n) at times (K,), at first the first command."""
+        """Return the latest commands (K, n) at times (K,), or the first command if earlier."""
         commands = self.telemetry.commands
         rows = np.searchsorted(commands.time, time, side="right") - 1
         return np.asarray(commands.command[np.maximum(rows, 0)])

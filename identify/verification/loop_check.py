@@ -103,15 +103,15 @@ def _advised(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings
     """Return a finding with gains of the drives for which the loop is stable, if there are any."""
     layout = robot.layout
     try:
-        made = design_drives(robot, [parameters[layout.dynamic]], [settings])
+        design = design_drives(robot, [parameters[layout.dynamic]], [settings])
     except SimulationError as error:
         return Finding("drives by design", False, None, str(error), limit=1.0, relation=">")
-    lp, li, ld = made.gains
+    lp, li, ld = design.gains
     text = (
         f"with joint_pid = {{ lp = {lp:.3g}, li = {li:.3g}, ld = {ld:.3g} }} in the robot file the "
-        f"loop is stable, and the servo's gains can be {made.margin:.3g} times as large"
+        f"loop is stable, and the servo's gains can be {design.margin:.3g} times as large"
     )
-    return Finding("drives by design", True, made.margin, text, limit=1.0, relation=">")
+    return Finding("drives by design", True, design.margin, text, limit=1.0, relation=">")
 
 
 def check_steps(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
@@ -163,14 +163,14 @@ def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
     if wanted is not None:
         try:
             gains = design_servo(model, settings, home, wanted, control.servo_damping)
-            made = servo_figures(model, replace(settings, servo=gains), home)
+            loop = servo_figures(model, replace(settings, servo=gains), home)
             text = (
                 f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a "
-                f"bandwidth of {made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}; "
-                f"{made.gain_margin:.3g} times these gains make the loop unstable"
+                f"bandwidth of {loop.bandwidth:.3g} rad/s with a damping of {loop.damping:.3g}; "
+                f"{loop.gain_margin:.3g} times these gains make the loop unstable"
             )
             yield Finding(
-                "servo by design", made.radius < 1, made.gain_margin, text, limit=1.0, relation=">"
+                "servo by design", loop.radius < 1, loop.gain_margin, text, limit=1.0, relation=">"
             )
         except SimulationError as error:
             yield Finding("servo by design", False, None, str(error), limit=1.0, relation=">")

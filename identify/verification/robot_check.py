@@ -38,7 +38,7 @@ SAMPLES = 2000  # number of random vectors of joint coordinates over the travel
 # Largest ratio between the length of a mesh and the reach of its body, in either direction.
 MOST_MESH_RATIO = 20.0
 # Least share of the joint coordinates within the travel that must have a pose. Findings over the
-# travel describe these poses only. With the built-in robots it is 0.999 and more.
+# travel describe these poses only. The built-in robots have a share of 0.999 and more.
 LEAST_CLOSED = 0.9
 NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that counts as zero
 

@@ -32,7 +32,7 @@ SATURATED = 0.01
 STUCK = 3  # smallest number of equal commands in a row that count as staying
 FOLLOWS = 0.8  # smallest mean correlation of the joints with their commands
 BEFORE_S = 0.1  # largest time, s, by which the motion can seem to precede its commands
-CLOCK = 0.05  # largest offset of the clocks, in frames, in addition to STDS
+CLOCK = 0.05  # largest offset of the clocks, in frames, in addition to that of STDS
 STDS = 3.0  # largest offset and drift of the clocks in stated standard deviations
 SHOWN_GROUPS = 0.5  # smallest fraction of the groups of parameters that the motion must show
 # Decimals of times, s, in rounded logs, by the name of their step, the coarsest first.
@@ -335,7 +335,7 @@ def _rms(values: Array) -> float:
 def _at_ends(values: Array) -> NDArray[np.bool_]:
     """Return for the rows between first and last change whether a command stays at an end.
 
-    It stays at an end of its range if at least STUCK successive rows are equal.
+    It does so if at least STUCK successive rows have its largest value, or its smallest value.
     """
     changes = np.flatnonzero(np.diff(values))
     if not len(changes):

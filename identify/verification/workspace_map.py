@@ -156,7 +156,7 @@ def _plane(
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
     """Return the largest negative and positive change of a pose component from home.
 
-    The travel limit or the reach ends the change, at the latest three times `side`.
+    The change ends at the travel limit or the reach, and is at most three times `side`.
     """
     steps = np.linspace(0, 3 * side, points)
     ends = []

@@ -27,7 +27,7 @@ def accepted(request, tmp_path_factory):
     out, bar = tmp_path_factory.mktemp("acceptance") / "out", STANDARDS["e3064"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(
-            STANDARDS, "e3064", replace(bar, test=partial(bar.test, seconds=request.param))
+            STANDARDS, "e3064", replace(bar, measure=partial(bar.measure, seconds=request.param))
         )
         arguments = ("--renderer", "analytic", "--limit-um", "0.01", "--out", out, "--quiet")
         return command("acceptance", *arguments), out

@@ -234,7 +234,7 @@ def test_bad_input_is_one_line_before_any_work_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     work = (
-        "identify.verification.acceptance.do",
+        "identify.verification.acceptance.run_tests",
         "identify.verification.workspace_map.map_workspace",
     )
     for name in (

@@ -24,7 +24,7 @@ from identify.excitation.constraints import (
 )
 from identify.excitation.design import (
     design_trajectories,
-    unseen_trajectories,
+    validation_trajectories,
 )
 from identify.excitation.trajectory_unknowns import unknowns
 from identify.scenario import load_scenario, scenario_from_toml
@@ -155,7 +155,7 @@ def test_a_run_too_short_to_show_every_parameter_has_no_index():
 
 
 @pytest.mark.slow
-def test_seed_decides_everything_and_unseen_trajectories_depend_on_nothing_else(robot):
+def test_seed_decides_everything_and_validation_trajectories_depend_on_nothing_else(robot):
     a, b, c = designed(), designed.__wrapped__(), designed(seed=4)
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)
     assert not np.allclose(a.excitation.sine, c.excitation.sine)
@@ -164,7 +164,7 @@ def test_seed_decides_everything_and_unseen_trajectories_depend_on_nothing_else(
     for others in (
         b.validation,
         designed(candidates=1).validation,
-        unseen_trajectories(design_of(QUICK, robot), 3),
+        validation_trajectories(design_of(QUICK, robot), 3),
     ):
         for one, other in zip(designed().validation, others, strict=True):
             np.testing.assert_array_equal(one.sine, other.sine)

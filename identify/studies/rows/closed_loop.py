@@ -95,7 +95,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     taught = exactly_taught(plan.file) if options.teaching == "exact" else None
     sensor = plan.make(setup.robot, number, taught)
     design = setup.design
-    duration = design.unseen.duration_s
+    duration = design.validation.duration_s
     stream = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
     trajectory = admissible_trajectories(
         design.robot, design.settings, duration, 1, stream, design.check

@@ -150,7 +150,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingO
             model, parameters=model.parameters * (1.0 + options.off * signs), doubt=GUESSED_DOUBT
         )
     # `motions` also returns a circle and a square, which are not used here.
-    unseen = motions(setup.design, number)[: setup.design.unseen.count]
+    unseen = motions(setup.design, number)[: setup.design.validation.count]
 
     def followed(law: str, known: KnownModel) -> list[TrackingRun]:
         return [
