@@ -1,6 +1,6 @@
 """Errors of the dynamics package.
 
-Messages state the value, the limit, and the leg or name, where there are such.
+Messages state the value and the limit, and the leg or the name if there is one.
 """
 
 LONGEST = 4000  # number of characters above which the middle of a message is left out

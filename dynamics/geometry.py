@@ -107,7 +107,7 @@ class RobotGeometry:
 
     @cached_property
     def layout(self) -> ParameterLayout:
-        """Dynamic parameters of a robot with this geometry."""
+        """Layout of the parameters of a robot with this geometry."""
         return parameter_layout(self.legs, self.full_bodies, self.own_gains, self.passive_friction)
 
     @property

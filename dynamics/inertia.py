@@ -216,8 +216,8 @@ def travel_states(
     at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
     while len(pose) < STATES:
-        # Far from home, poses from this linear map are out of reach. The first random factor brings
-        # some of the poses nearer to home.
+        # Far from home, poses from this linear map can be out of reach. The first random factor
+        # brings some of the poses nearer to home.
         angles = (
             robot.travel_limit
             * rng.uniform(0, 1, (STATES, 1))

@@ -35,7 +35,7 @@ def impossible_kinds(layout: ParameterLayout, bodies: np.ndarray) -> set[str]:
 def rod_moments(mass: float, length: float, along: str) -> np.ndarray:
     """Moments of inertia (3,) of a uniform round rod of steel about its centre, kg m^2.
 
-    `along` is the name of the moment about its length, m. The mass, kg, determines the radius.
+    `along` names the moment about the axis of the rod. Mass, kg, and length, m, give the radius.
     """
     radius_squared = mass / (np.pi * STEEL * length)
     moments = np.full(3, mass * (3 * radius_squared + length**2) / 12)
@@ -93,5 +93,5 @@ def _stretched(body: np.ndarray, mass_factor: float, ratio: float, along: str | 
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """Values to four significant digits."""
+    """Values rounded to four significant digits."""
     return np.array([float(f"{value:.4g}") for value in values])

@@ -182,7 +182,7 @@ def _delay(latency: float, period: float) -> Instant:
 
 
 def _fixed(values: object, kind: type) -> np.ndarray:
-    """Read-only array."""
+    """Values as a read-only array."""
     array: np.ndarray = np.array(values, dtype=kind)
     array.setflags(write=False)
     return array

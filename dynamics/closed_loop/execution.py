@@ -50,7 +50,7 @@ MACHINE_CODE = (
 # Kernels that other kernels call by address.
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
 UNSTABLE = " (the loop is unstable)"
-# Reasons why a run ended early, by status. `failure` adds a leg and its reach margin.
+# Reasons why a run ended early, by status. `failure` adds the leg to those about reach.
 FAILURES = {
     LEFT_REACH: f"the robot left the reachable set{UNSTABLE}:",
     SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or "
@@ -91,7 +91,7 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
 def run_repeats(
     problem: LoopProblem, noises: np.ndarray, compiled: bool = True
 ) -> list[ClosedLoopRun | LoopFailure]:
-    """Do one run for each noise (runs, frames, 6) of the ideal sensor, LANES runs at a time."""
+    """Do one run for each of the noises (runs, frames, 6) of the ideal sensor, LANES at a time."""
     results: list[ClosedLoopRun | LoopFailure] = []
     for group in np.split(noises, range(LANES, len(noises), LANES)):
         results += _run_together(problem, group, compiled)
@@ -374,7 +374,7 @@ def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
 
 
 def failure(problem: LoopProblem, status: int, frame: int, now: Any, record: Any) -> LoopFailure:
-    """Error of a run that ended with a status. It names the leg with the least reach margin."""
+    """Error of a run that ended with a status. It names the leg if a leg was out of reach."""
     why = FAILURES[status]
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         evaluated = now.known.inputs[: problem.sizes.coordinates]

@@ -1,4 +1,4 @@
-"""Joints: laws of dry and viscous friction, and springs between motors and cranks.
+"""Joints: laws of dry and viscous friction, and springs between motors and driven bodies.
 
 The friction of a joint with the velocity theta_dot is, in N m or N (in eq. 24, dry is the sign),
 
@@ -134,7 +134,7 @@ class FrictionLaw:
         return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
-# Largest magnitude of eigenvalue times step length. The Runge-Kutta method is unstable above 2.8.
+# Largest product of eigenvalue magnitude and step. The Runge-Kutta method is unstable above 2.8.
 LARGEST_STEP = 1.0
 
 
@@ -172,7 +172,7 @@ class JointElasticity:
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
     def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the rigid bodies, less the inertia of its motor for each driven body.
+        """Parameters (r,) of the rigid bodies, without the inertia of the motors of driven bodies.
 
         Raises SimulationError if the actuator of a leg drives more than one body.
         """

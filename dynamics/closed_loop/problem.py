@@ -129,7 +129,7 @@ class LoopProblem:
 
     @cached_property
     def sizes(self) -> Sizes:
-        """Sizes of the robot's equation of motion."""
+        """Sizes of the robot and its drives, for which the kernels of the run are compiled."""
         motion, served = (
             robot.functions["equation_of_motion"] for robot in (self.robot, self.servo_robot)
         )
@@ -267,7 +267,7 @@ def _problem(
     _check_reach(robot, reference)
     frames = len(reference.poses)
     parameters = checked_loop_parameters(robot, parameters, settings.drives.law)
-    # raises an error if the drives have zero errors of another number of joints
+    # raises an error if the drives have zeros for another number of joints
     settings.drives.zeros(robot.layout.joints)
     feedforward = _rows("feedforward", feedforward, (frames, robot.layout.joints))
     if latencies is not None:
@@ -295,7 +295,7 @@ def _problem(
 
 
 def _checked_sensor(sensor: Sensor, frames: int) -> Sensor:
-    """Sensor for a number of frames. Raises SimulationError if it has another number or is none."""
+    """Checked sensor. Raises SimulationError for another type, or another number of frames."""
     if isinstance(sensor, IdealSensor):
         lost = sensor.lost
         return IdealSensor(

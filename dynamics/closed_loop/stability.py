@@ -60,7 +60,7 @@ def pose_response(
 
     Returns a function of the angular frequency, rad/s. Its result is a complex matrix (m, m), for
     coordinates at frames. The desired rate is the difference of the desired coordinates of two
-    frames, divided by the period. Raises the same errors as `closed_loop.equilibrium`.
+    consecutive frames, divided by the period. Raises the same errors as `closed_loop.equilibrium`.
     """
     near = _near_rest(robot, parameters, pose, settings.drives)
     size = near.jacobian.shape[1]
@@ -81,7 +81,7 @@ def _state_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
 
 
 def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """Map (s, s) of `frame_map`, beside the effect (s, m) of the frame's desired coordinates.
+    """Matrix (s, s + m): the map of `frame_map`, then the effect of the desired coordinates.
 
     In this function, a quantity such as `state` or `commands` is the matrix that maps the state and
     the desired coordinates at the beginning of the frame to this quantity.
@@ -175,7 +175,7 @@ def lowest_frame_rate(
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
-    """Text on a run that ended early: largest eigenvalue, and frame rate from which it is < 1."""
+    """Text on the stability of a run that ended early, with its largest eigenvalue."""
     arguments = robot, parameters, settings, pose
     radius = spectral_radius(*arguments)
     hz = settings.timing.frame_rate_hz

@@ -1,4 +1,4 @@
-"""One time step of a robot with its drives, and of the covariance of its state.
+"""One time step of a robot with its drives, and the effect of errors of its state.
 
 The state has coordinates q (m,), their rates (m,) and the integral of the joint PID (n,). It also
 has constant values. They are a torque (n,) and viscous friction (n,) at the joints, in addition to
