@@ -62,13 +62,16 @@ def excitation_errors(folder: Path) -> str:
 def accuracy(folder: Path) -> str:
     """This project's own accuracy figures, in the units and words of the pages."""
     saved = read_saved(folder / "accuracy.json")
-    text = str(markdown_table(saved.figures))
+    table = str(markdown_table(saved.figures))
+    # The page names the figures without their tests, but with the parameters of a test.
+    row = re.compile(r"^\| [^|[]*(\[\w+\])? \| ([^|]*) \|", re.MULTILINE)
+    text = row.sub(lambda found: f"| {found[2]}{found[1] or ''} |", table)
     words = {
         "95% interval": "95 % interval",
         "| um |": "| µm |",
         "| urad |": "| µrad |",
-        " [planes]": ", by planes",
-        " [registration]": ", by registration",
+        "[planes]": ", by planes",
+        "[registration]": ", by registration",
         "starting model on unseen motion": "initial model and ideal sensor, further motions",
         "identified model on unseen motion": "identified model and ideal sensor, further motions",
     }

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from math import isfinite
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import pytest
@@ -16,7 +15,7 @@ import pytest
 from identify.errors import IdentifyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
@@ -41,7 +40,7 @@ class Figure:
     Attributes
     ----------
     test : str
-        Name of the test, see `test_name`.
+        Name of the test, from `identify.accuracy.session.test_name`.
     name : str
         Name of the figure, unique within its test.
     value : float
@@ -138,20 +137,6 @@ class Figure:
         return self.interval[1] if side > 0 else self.interval[0]
 
 
-def test_name(file: Path, place: str) -> str:
-    """Return the name of a test: its file, from its outermost package on, and `place`.
-
-    Unlike a node id, the name depends neither on the folder from which pytest runs nor on the
-    folder of the package. `place` is the part of a node id after the file, such as `test_x[1]`.
-    """
-    parts = [file.name]
-    folder = file.parent
-    while (folder / "__init__.py").is_file():
-        parts.insert(0, folder.name)
-        folder = folder.parent
-    return "::".join(["/".join(parts), *([place] if place else [])])
-
-
 def with_unit(text: str, unit: str) -> str:
     """Append a unit to the text of a number."""
     return f"{text} {unit}".rstrip()
@@ -171,9 +156,15 @@ class Accuracy:
     A figure beyond its limit fails the test at once.
     """
 
-    def __init__(self, test: str, properties: list[tuple[str, object]]) -> None:
+    def __init__(
+        self,
+        test: str,
+        properties: list[tuple[str, object]],
+        saved_counts: Mapping[tuple[str, str], int] | None = None,
+    ) -> None:
         self._test = test
         self._properties = properties
+        self._saved_counts = saved_counts or {}
         self._names: set[str] = set()
 
     def record(
@@ -277,6 +268,10 @@ class Accuracy:
         passes. The intervals are wider than that of `sample`, because several of them are judged
         (Bonferroni).
 
+        With ``--accuracy-compare``, at least as many values are drawn as the saved figure has, if
+        `most` allows. A better method needs fewer values to decide its limit, but with fewer values
+        its interval would be too wide to show a small deterioration.
+
         Parameters
         ----------
         name : str
@@ -314,6 +309,7 @@ class Accuracy:
         counts = [FIRST]
         while counts[-1] < most:
             counts.append(min(2 * counts[-1], most))
+        least = self._saved_counts.get((self._test, name), FIRST)
         confidence = 1 - (1 - CONFIDENCE) / len(counts)
         numbers = np.empty(0)
         for count in counts:
@@ -324,7 +320,7 @@ class Accuracy:
                 )
             numbers = np.concatenate([numbers, drawn])
             mean, interval = mean_interval(numbers, confidence)
-            if not interval[0] <= limit <= interval[1]:
+            if count >= least and not interval[0] <= limit <= interval[1]:
                 break
         self._add(name, unit, limit, better, value=mean, interval=interval, count=len(numbers))
 

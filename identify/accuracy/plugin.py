@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from identify.accuracy.figure import PROPERTY, Accuracy, AccuracyError, test_name
-from identify.accuracy.session import AccuracySession
+from identify.accuracy.figure import PROPERTY, Accuracy, AccuracyError
+from identify.accuracy.saved import Key, find_saved
+from identify.accuracy.session import AccuracySession, saved_folder, test_name
 
 if TYPE_CHECKING:
     from cmmsim import Sensor, Taught
@@ -52,7 +53,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="fail if a figure is worse than the saved figure by more than RATIO of it, such as "
         "0.1 (for samples: if both whole intervals are), if it has fewer values, if a sample has "
         "become a single number or the reverse, or if its test ran or was skipped without "
-        "recording it",
+        "recording it; fail also if none of the saved figures was measured",
     )
     add(
         "--accuracy-dir",
@@ -96,8 +97,20 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(AccuracySession(config), "cmmsim_accuracy_session")
 
 
+@pytest.fixture(scope="session")
+def _accuracy_saved_counts(request: pytest.FixtureRequest) -> Mapping[Key, int]:
+    """Numbers of values of the figures that --accuracy-compare names, by test and name."""
+    name = request.config.getoption("accuracy_compare")
+    if name is None:
+        return {}
+    return {
+        figure.key: figure.count
+        for figure in find_saved(saved_folder(request.config), name).figures
+    }
+
+
 @pytest.fixture
-def accuracy(request: pytest.FixtureRequest) -> Accuracy:
+def accuracy(request: pytest.FixtureRequest, _accuracy_saved_counts: Mapping[Key, int]) -> Accuracy:
     """Recorder of figures of accuracy.
 
     Returns
@@ -113,7 +126,7 @@ def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     properties = request.node.user_properties
     # If a plugin repeats a failed test, the figures of the earlier try are still there.
     properties[:] = [entry for entry in properties if entry[0] != PROPERTY]
-    return Accuracy(_name(request.node), properties)
+    return Accuracy(_name(request.node), properties, _accuracy_saved_counts)
 
 
 @pytest.fixture

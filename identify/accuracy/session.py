@@ -20,7 +20,6 @@ from identify.accuracy.figure import (
     AccuracyError,
     Figure,
     percent,
-    test_name,
     with_unit,
 )
 
@@ -29,7 +28,8 @@ UNDECIDED = "undecided"
 # Largest number of values, as a multiple of the present one, that a remedy asks for.
 MOST_TIMES = 100
 FOLDER = ".accuracy"  # folder of the saved figures
-HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit", "margin")
+HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "n", "unit", "limit", "margin")
+UNIT = HEADER.index("unit")
 
 
 def terminal_table(
@@ -87,9 +87,12 @@ def _open_question(figure: Figure) -> str:
 
 
 def markdown_table(figures: Sequence[Figure]) -> str:
-    """Return figures as a Markdown table. Names include the parameters of parametrised tests."""
-    rows = [(_full_name(figure), *_cells(figure)) for figure in figures]
-    lines: list[Row] = [HEADER, ("---", "--:", "--:", "---", "--:", "--:"), *rows]
+    """Return figures as a Markdown table, each with its test."""
+    rows = [(figure.test, figure.name, *_cells(figure)) for figure in figures]
+    header: Row = ("test", *HEADER)
+    left = ("test", "figure", "unit")
+    rule = tuple("---" if name in left else "--:" for name in header)
+    lines: list[Row] = [header, rule, *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
@@ -102,6 +105,7 @@ def _cells(figure: Figure) -> Row:
     return (
         f"{figure.value:.4g}",
         interval,
+        "" if figure.interval is None else str(figure.count),
         figure.unit,
         figure.limit_text,
         f"{margin} {mark}".strip(),
@@ -118,7 +122,7 @@ def _compared(comparison: saved.Comparison | None) -> Row:
 
 def _aligned(row: Row, widths: Sequence[int]) -> str:
     """Join a row with names and units aligned left, and other cells aligned right."""
-    left = (0, 3)
+    left = (0, UNIT)
     cells = (
         c.ljust(w) if i in left else c.rjust(w)
         for i, (c, w) in enumerate(zip(row, widths, strict=True))
@@ -126,9 +130,28 @@ def _aligned(row: Row, widths: Sequence[int]) -> str:
     return "  ".join(cells).rstrip()
 
 
-def _full_name(figure: Figure) -> str:
-    name, bracket, parameters = figure.test.rpartition("::")[2].partition("[")
-    return f"{figure.name} [{parameters}" if name and bracket else figure.name
+def test_name(file: Path, place: str) -> str:
+    """Return the name of a test: its file, from its outermost package on, and `place`.
+
+    Unlike a node id, the name depends neither on the folder from which pytest runs nor on the
+    folder of the package. `place` is the part of a node id after the file, such as `test_x[1]`.
+    """
+    parts = [file.name]
+    folder = file.parent
+    while (folder / "__init__.py").is_file():
+        parts.insert(0, folder.name)
+        folder = folder.parent
+    return "::".join(["/".join(parts), *([place] if place else [])])
+
+
+def saved_folder(config: pytest.Config) -> Path:
+    """Return the folder of the saved figures, also in a worker of pytest-xdist."""
+    folder = config.getoption("accuracy_dir")
+    if folder:
+        return config.invocation_params.dir / folder
+    root = config.rootpath
+    above = (one / FOLDER for one in (root, *root.parents))
+    return next((one for one in above if one.is_dir()), root / FOLDER)
 
 
 # Words for a test that did not measure a saved figure, by its outcome.
@@ -150,11 +173,7 @@ class AccuracySession:
         self._shared: list[str] = []
         self._root = config.rootpath
         self._lines: list[tuple[str, bool]] = []
-        folder = config.getoption("accuracy_dir")
-        root = config.rootpath
-        above = (one / FOLDER for one in (root, *root.parents))
-        base = next((one for one in above if one.is_dir()), root / FOLDER)
-        self._folder = config.invocation_params.dir / folder if folder else base
+        self._folder = saved_folder(config)
         self._seed = config.getoption("accuracy_seed")
         self._save = config.getoption("accuracy_save")
         self._compare = config.getoption("accuracy_compare")
@@ -238,6 +257,13 @@ class AccuracySession:
 
     def _judge(self, session: pytest.Session) -> None:
         self._report_missing(session)
+        # With --collect-only, as editors use it, no test is run.
+        measuring = not session.config.option.collectonly
+        if self._ratio is not None and measuring and not self.comparisons:
+            self._fail(
+                session,
+                f"nothing is compared: no figure saved as {self._compare} was measured now",
+            )
         for pair in self.comparisons.values():
             if pair.limit_change:
                 self._add_line(pair.limit_change)

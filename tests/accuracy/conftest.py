@@ -59,3 +59,9 @@ def project(pytester, monkeypatch):
         return pytester.runpytest_inprocess(*QUICK, *options)
 
     return run
+
+
+@pytest.fixture
+def saved(pytester):
+    """The file of figures saved as `before`."""
+    return pytester.path / ".accuracy" / "before.json"

@@ -93,19 +93,22 @@ ALL_SKIPPED = [f"{test} (the test was skipped)" for test in TESTS]
             0,
         ),
         (MODULE, (), ALL_SKIPPED, 1),
+        ("def test_it(): pass", (), [f"{test} (the test did not run)" for test in TESTS], 1),
         pytest.param(
             SKIPPED, ("-n", "1", "--dist", "loadgroup"), ALL_SKIPPED[:1], 1, marks=pytest.mark.slow
         ),
     ],
-    ids=["skipped", "fewer", "renamed", "selected", "module", "in a group of a worker"],
+    ids=["skipped", "fewer", "renamed", "selected", "module", "none", "in a group of a worker"],
 )
 def test_figures_that_are_missing_are_named(project, pytester, body, options, missing, guarded):
     """With --accuracy-fail a test that is there has to bring all its figures."""
     pytester.makepyfile(test_other="def test_it(): pass")
     grouped = "\npytestmark = pytest.mark.xdist_group('one')\n"
     project(grouped + FIGURES, *SAVE)
+    nothing = "nothing is compared: no figure saved as before was measured now"
     for guard in GUARDS:
         done = project(grouped + body, *COMPARE, *guard, *options)
+        assert (nothing in done.outlines) == bool(guard and len(missing) == len(TESTS))
         lines = [
             line.removeprefix("  test_mine.py::")
             for line in done.outlines
@@ -165,3 +168,35 @@ def test_huge_numbers_are_short_in_the_table_and_saved(project, pytester):
     assert line.endswith(" 5e+161%    1.01  +1.0e+162%")
     figure = json.loads((pytester.path / ".accuracy" / "huge.json").read_text())["figures"][0]
     assert 0.9e160 < figure["interval"][0] < figure["value"] < figure["interval"][1] < 1.1e160
+
+
+UNTIL = """
+def test_until(accuracy):
+    rng = np.random.default_rng(0)
+    draw = lambda n: {mean} * (1 + 0.5 * rng.standard_normal(n))
+    accuracy.sample_until("error", draw, limit=12, unit="um"{most})
+"""
+
+
+@pytest.mark.parametrize("workers", [(), pytest.param(("-n", "1"), marks=pytest.mark.slow)])
+def test_a_better_method_draws_as_many_values_as_the_saved_one(project, saved, workers):
+    """Alone it would need 20 values, too few to be held to the saved 80."""
+    before, after = UNTIL.format(mean=10.6, most=""), UNTIL.format(mean=3.6, most="")
+    project(before, *SAVE)
+    count = json.loads(saved.read_text())["figures"][0]["count"]
+    assert count > 20
+    assert drawn(project(after)) == 20
+    guarded = (*COMPARE, *GUARDS[1], *workers)
+    same, better = project(before, *guarded), project(after, *guarded)
+    assert (same.ret, drawn(same), same.stdout.str().count("+0.0%")) == (0, count, 1)
+    assert (better.ret, drawn(better)) == (0, count)
+    fewer = project(UNTIL.format(mean=3.6, most=f", most={count // 2}"), *guarded)
+    assert fewer.ret == 1
+    assert f"is a sample of {count // 2} values, was a sample of {count} values" in str(
+        fewer.stdout
+    )
+
+
+def drawn(done):
+    """Number of values of the only figure in the table."""
+    return int(re.search(r"^  error .* \.\. \S+ +(\d+)  um", str(done.stdout), re.MULTILINE)[1])

@@ -170,7 +170,7 @@ def test_the_guides_example_and_its_complete_files_run_where_the_wheel_is_instal
     table = run(
         "venv/bin/python", "-m", "identify.accuracy", ".accuracy/mine.json", cwd=outside
     ).stdout.splitlines()
-    assert table[0] == "| figure | value | 95% interval | unit | limit | margin |"
+    assert table[0] == "| test | figure | value | 95% interval | n | unit | limit | margin |"
     assert len(table) == 2 + len(saved)
 
 

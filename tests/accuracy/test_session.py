@@ -13,12 +13,6 @@ from identify.accuracy.figure import Accuracy
 from tests.accuracy.conftest import COMPARE, FIGURES, QUICK, SAVE
 
 
-@pytest.fixture
-def saved(pytester):
-    """The file of figures saved as `before`."""
-    return pytester.path / ".accuracy" / "before.json"
-
-
 def table(result):
     """Lines of the table of figures."""
     lines = result.outlines
@@ -38,7 +32,7 @@ def test_the_table_shows_value_interval_unit_limit_and_margin(project):
         values.mean(),
         2.00958 * values.std(ddof=1) / np.sqrt(50),
     )  # Student, 49 degrees of freedom
-    assert lines[0] == ["value", "95%", "interval", "unit", "limit", "margin"]
+    assert lines[0] == ["value", "95%", "interval", "n", "unit", "limit", "margin"]
     assert lines[1] == ["test_mine.py::test_pose[planes]"]
     assert lines[2] == [
         "pose",
@@ -46,6 +40,7 @@ def test_the_table_shows_value_interval_unit_limit_and_margin(project):
         f"{mean - reach:.4g}",
         "..",
         f"{mean + reach:.4g}",
+        "50",
         "um",
     ]
     assert lines[3] == ["test_mine.py::test_pose[registration]"]
@@ -206,10 +201,10 @@ def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_mark
     capsys.readouterr()
     assert main([str(saved)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "| figure | value | 95% interval | unit | limit | margin |"
-    assert lines[1] == "| --- | --: | --: | --- | --: | --: |"
-    assert lines[2].startswith("| pose [planes] | ")
-    assert lines[4] == "| bias | 0.002 |  | px | ≤ 0.003 | 33% |"
+    assert lines[0] == "| test | figure | value | 95% interval | n | unit | limit | margin |"
+    assert lines[1] == "| --- | --- | --: | --: | --: | --- | --: | --: |"
+    assert lines[2].startswith("| test_mine.py::test_pose[planes] | pose | ")
+    assert lines[4] == "| test_mine.py::test_sensor | bias | 0.002 |  |  | px | ≤ 0.003 | 33% |"
     assert main(["no.json"]) == "no.json cannot be read: No such file or directory"
     assert main([str(saved.parent)]).endswith(" cannot be read: Is a directory")
     assert main([]).startswith("usage: ")
