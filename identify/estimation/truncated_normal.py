@@ -20,7 +20,7 @@ FAR = 8.0
 DEEP = 100.0
 """Distance of the mean beyond a bound, in standard deviations, above which a series is used.
 
-The exact formulas would lose all digits there.
+Farther beyond, the exact formulas would lose all digits.
 """
 
 SWEEPS = 100

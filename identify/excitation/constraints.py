@@ -8,10 +8,10 @@ if all shares lie between -1 and 1.
     velocity      joint velocity over the largest allowed velocity, by leg
     leverage      smallest allowed leverage of J_a1 over the leverage, by leg (see
                   `dynamics.workspace`)
-    conditioning  2-norm condition number of the scaled J_a2 over its limit; the expressions use
-                  the condition number in a Schatten norm, which is smooth and 0 to 3 % larger
+    conditioning  2-norm condition number of the scaled J_a2 over its limit (the expressions use the
+                  condition number in a Schatten norm, which is smooth and 0 to 3 % larger)
     visibility    angle of incidence, and position in the image, of four stickers per plane for both
-                  cameras; omitted if the stickers are proved visible in the whole box
+                  cameras, unless the stickers are proved visible in the whole box
 
 The form of the trajectory ensures that it starts at home and at rest. If the run lasts a whole
 number of periods (`check_periods`), it also ends there.

@@ -105,7 +105,7 @@ def run_plant(
     trajectory  Desired motion.
     duration_s  Length of the run.
     seed        Seed of the experiment.
-    run         Number of the run; 0 is the excitation.
+    run         Number of the run, 0 for the excitation.
     advance     Function that is called with the number of further frames, 1 by default.
     load        Load on the platform.
     law         Name of the control law. It knows the scenario's initial guess and the stated load.

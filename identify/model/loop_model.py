@@ -151,7 +151,7 @@ class LoopModel(Residuals):
 
     @property
     def latencies(self) -> Array | None:
-        """Latencies (N,) of the model's commands, s. None: all have the latency of the timing.
+        """Latencies (N,) of the model's commands, s, or None if all have that of the timing.
 
         They include the common error of the latency that the model contains.
         """

@@ -23,7 +23,7 @@ class ModelSide:
     model          Parameter set of the initial guess, standard deviations of errors, and the law of
                    the drives, which can be left open.
     timing         Timing of the frames. In addition to the timing in `settings`, it has the
-                   standard deviation of the latency.
+                   standard deviations of the latency and of the clock.
     low_pass       Filter of the measured poses in all linear fits.
     nuisances      Kinds of errors that all poses have in common. They are estimated with the
                    parameters.

@@ -314,7 +314,7 @@ def _check_measured(
     travel = np.repeat(np.ptp(reference.poses, axis=0).reshape(2, 3).max(axis=1), 3)
     # Without travel of the reference there is no scale to compare with.
     usual = np.where(travel > 0, travel, np.inf)
-    # The robot must be at the reference only in the first frame, at rest.
+    # Only in the first frame, at rest, must the robot be at the reference.
     limits = np.full(len(ok), TRAVELS)
     limits[0] = REST_POSE
 

@@ -25,7 +25,7 @@ ANGLES = {"rad": 1.0, "deg": 0.017453292519943295, "turn": 6.283185307179586}
 # Number of columns of each convention, except the Euler sequences, which have three.
 COUNTS = {"quaternion_xyzw": 4, "quaternion_wxyz": 4, "matrix": 9, "rotation_vector": 3}
 
-COVARIANCES = (6, 21, 36)
+COVARIANCES = (6, 21, 36)  # possible numbers of columns of a covariance
 COVARIANCES_SAID = "6 standard deviations, 21 of the upper triangle, or 36 row by row"
 
 # Euler sequences. Two successive turns are never about the same axis.
@@ -36,14 +36,14 @@ EULER = tuple(
     if a != b != c
 )
 
-EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")
+EULER_USUAL = ("euler_XYZ", "euler_ZYX", "euler_xyz", "euler_zyx")  # those that are tried first
 
 # Sequences about three different axes.
 EULER_ORDERS = tuple(
     f"euler_{''.join(letters)}" for axes in ("XYZ", "xyz") for letters in permutations(axes)
 )
 
-CONVENTIONS = (*COUNTS, *EULER_USUAL, "...")
+CONVENTIONS = (*COUNTS, *EULER_USUAL, "...")  # names that a message lists
 
 
 def _check_convention(name: str) -> str:

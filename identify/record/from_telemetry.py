@@ -66,7 +66,7 @@ def record_of(
         "frame_rate_hz": timing.frame_rate_hz,
         "prismatic": robot.layout.prismatic,
     }
-    why = _not_on_grid(telemetry, timing, bool(wrong.any()))
+    why = _not_on_grid(telemetry, timing, has_gross=bool(wrong.any()))
     if why is None:
         assert telemetry.reference is not None
         record = build_record(
@@ -183,8 +183,8 @@ def _check_clocks(telemetry: Telemetry) -> None:
         )
 
 
-def _not_on_grid(telemetry: Telemetry, timing: Timing, gross: bool) -> str | None:
-    """Return why a log makes no record on the grid, or None."""
+def _not_on_grid(telemetry: Telemetry, timing: Timing, has_gross: bool) -> str | None:
+    """Return why a log makes no record on the grid, or None. Raises as `_check_rate` does."""
     reference = telemetry.reference
     poses = telemetry.poses
     if reference is None:
@@ -197,7 +197,7 @@ def _not_on_grid(telemetry: Telemetry, timing: Timing, gross: bool) -> str | Non
         return "the rows are not one frame period apart"
     if timing.clock_offset_std_s or timing.clock_drift_std:
         return "poses and commands have different clocks"
-    if gross:
+    if has_gross:
         return "the servo used wrong poses"
     if not np.isfinite(telemetry.commands.command).all():
         return "some rows hold no command"

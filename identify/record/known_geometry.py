@@ -107,8 +107,8 @@ def _check_same(said: str, found: Robot, nominal: Robot, settings: Geometry) -> 
         )
 
 
-COVARIANCE = "geometry_covariance"
-PREFIX = "geometry."
+COVARIANCE = "geometry_covariance"  # variable of a record with the covariance of the geometry
+PREFIX = "geometry."  # beginning of the names of errors of the geometry
 
 
 @dataclass(frozen=True)

@@ -107,9 +107,9 @@ def store_load(record: xr.Dataset, figures: Array, std: Array) -> None:
 def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
     """Return the load (p,) of a record, and its `load_errors` (p, 7), zero without a load.
 
-    Raises RecordError if a figure is missing or not finite, a mass, moment or standard deviation is
-    negative, no body has these moments, or a standard deviation exceeds its mass or moment; and as
-    `load_parameters` does.
+    Raises RecordError as `load_parameters` does, or if a figure is missing or not finite, a mass,
+    moment or standard deviation is negative, no body has these moments, or a standard deviation
+    exceeds its mass or moment.
     """
     count = len(layout.names)
     stated = record.attrs

@@ -214,8 +214,8 @@ class RunFiles:
     def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
         """Check that a result was made from the present files of these names.
 
-        Files without a digest in the result are not checked. If the first record is checked, all
-        records are. The default result is the result in the folder, if there is one.
+        Files without a digest in the result are not checked. With `experiment.nc`, its further
+        records are checked, too. The default result is that in the folder, if there is one.
 
         Raises OutputFolderError if a file is missing. Raises RecordError if a file has changed (the
         message names the stage to repeat), a file is damaged, or the digests of the result are not

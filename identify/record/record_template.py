@@ -98,7 +98,7 @@ def description_text(
 ) -> str:
     """Return the text of the TOML file for a table, with SECTIONS of a scenario and DESCRIPTION.
 
-    The user replaces the example values. `rate_hz` is the frame rate.
+    `name_or_path` is that of the robot, and `rate_hz` the frame rate. Other values are examples.
     """
     mass = float(robot.parameter_sets["guess"].vector[robot.layout.names.index("platform.mass")])
     made_with = Scenario.model_validate(

@@ -29,8 +29,9 @@ from identify.files.dataset import POSE
 from identify.record.known_geometry import GeometryErrors
 from identify.record.run_error_covariance import covariance_fault, factor, noticed_directions
 
-CHANGES = "common_error"
-COVARIANCE = "common_error_covariance"
+CHANGES = "common_error"  # variable of a record with the changes of the poses
+COVARIANCE = "common_error_covariance"  # variable with the covariance of the errors
+# Names of errors, or beginnings of their names.
 LATENCY = "timing.latency_s"
 ZERO = "zeros.joint"
 SCALE = "scale.commands"

@@ -32,7 +32,7 @@ from identify.trajectory import FourierTrajectory
 from identify.verification.robot_check import NEGLIGIBLE_CHANGE
 
 PARAMETER_SET = "guess"
-DURATION_S = 10.0
+DURATION_S = 10.0  # duration of the run
 # Time after which transients from the start of the run have decayed.
 STEADY_FROM_S = 2.0
 COMMAND_RATE_HZ = 200.0
@@ -44,8 +44,8 @@ EXCITATION = Excitation(
     fundamental_hz=0.1, harmonics=5, position_amplitude_m=0.010, orientation_amplitude_rad=0.040
 )
 
-GOAL_UM = 10.0
-GOAL_URAD = 20.0
+GOAL_UM = 10.0  # largest allowed difference of positions after STEADY_FROM_S
+GOAL_URAD = 20.0  # largest allowed difference of angles after STEADY_FROM_S
 
 # Differences in the paper's figure 8.
 PAPER = {

@@ -125,7 +125,7 @@ class LoggedRun:
 
     @cached_property
     def grid(self) -> Array:
-        """Times (F,) of 2 to MOST_FRAMES even frames from the first pose on, s."""
+        """Times (F,), s, of 2 to MOST_FRAMES frames one period apart, from the first pose on."""
         timing = self.side.timing
         count = int(np.ptp(self.time) * timing.frame_rate_hz) + 1
         steps = np.arange(max(min(count, MOST_FRAMES), 2))

@@ -20,9 +20,9 @@ MOTIVE = "Format Version"  # first cell of an export of Motive
 VICON = ("Segments", "Objects", "Joints", "Model Outputs", "Trajectories", "Devices")
 FRAME = "Frame"  # first column of both exports
 
-SEPARATORS = ",;\t"
+SEPARATORS = ",;\t"  # possible separators of cells
 
-Line = tuple[int, list[str]]
+Line = tuple[int, list[str]]  # number of a line, and its cells
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Body:
-    """Columns of a pose."""
+    """Columns of a pose. The stem has the words that their names have in common."""
 
     place: Place
     stem: str
@@ -77,7 +77,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Joints:
-    """Columns of commands."""
+    """Columns of commands. The stem is what their names have in common."""
 
     place: Place
     stem: str
