@@ -11,6 +11,7 @@ from identify.files.atomic import write_files
 from identify.files.run_folder import RunFolder, load_result, result_json
 from identify.progress import Progress
 from identify.record import recording
+from identify.record.files_of_record import SENSOR_FILE
 from identify.setup import Setup
 from identify.stages.estimate import identify, identify_own
 from identify.stages.plan import begin, excite, is_begun, is_planned, open_run, record_files
@@ -78,6 +79,7 @@ def record(folder: Path, progress: Progress, setup: Setup | None = None) -> cmms
                 scenario.payload if name == run_folder.payload.name else None,
             )
             stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
+            stored.attrs[SENSOR_FILE] = setup.sensor_plan.file.model_dump_json()
             recording.write(run_folder.path / name, stored, experiment.truth)
     return setup.sensor.taught
 

@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import xarray as xr
 
-from dynamics import DynamicsError, Robot, load_robot
+from dynamics import DynamicsError, Robot
 from dynamics.checks import shown
 from dynamics.closed_loop.drives import DriveName
 from dynamics.closed_loop.start_state import checked_loop_parameters
@@ -43,6 +43,7 @@ from identify.model.model_side import ModelSide, model_side, side_of_record
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.conditions import SERVO, command_time_warnings, drift_warnings, recorded_law
+from identify.record.files_of_record import robot_of_record, warn_of_changed_robot
 from identify.record.from_telemetry import reading_notes
 from identify.record.known_geometry import known_geometry
 from identify.record.provenance import recorded_scenario, recorded_seed
@@ -80,7 +81,8 @@ def identify(
         One or several records of the same robot, or the paths of their netCDF files. The scale
         anchor, the seed and a missing scenario are read from the first record.
     robot : Robot, optional
-        Robot with its known geometry. The default is the robot of the scenario.
+        Robot with its known geometry. The default is the robot of the scenario, from its file. If
+        the file is missing, it is the robot that the record holds.
     scenario : Scenario, optional
         Settings of the estimator. The default is the scenario in the first record.
     progress : Progress, optional
@@ -106,6 +108,12 @@ def identify(
         valid for the model.
     dynamics.DynamicsError
         The robot cannot reach a pose of the record.
+
+    Warns
+    -----
+    UserWarning
+        The robot file is missing, or its initial guess or its errors of bodies and joints have
+        changed since the record was made.
 
     Examples
     --------
@@ -209,10 +217,15 @@ def asked_of(
         raise EstimationError("no record to identify from")
     scenario = recorded_scenario(records[0]) if scenario is None else scenario
     _check_type(scenario, Scenario, "identify.load_scenario")
+    of_file = robot is None
     if robot is None:
-        robot = known_geometry(load_robot(scenario.robot), scenario.geometry).robot
+        loaded = robot_of_record(records[0], scenario.robot)
+        robot = known_geometry(loaded, scenario.geometry).robot
     _check_type(robot, Robot, "dynamics.load_robot")
-    return Asked(records, model_side(robot, scenario), scenario.identification)
+    side = model_side(robot, scenario)
+    if of_file:
+        warn_of_changed_robot(records[0], side.robot, scenario.robot)
+    return Asked(records, side, scenario.identification)
 
 
 def _read(record: object) -> xr.Dataset:

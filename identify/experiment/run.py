@@ -31,6 +31,7 @@ from identify.random_streams import (
 )
 from identify.record import recording
 from identify.record.conditions import SERVO, store_finding, store_law
+from identify.record.files_of_record import store_robot_file
 from identify.record.known_geometry import store_geometry_covariance
 from identify.record.load import store_load
 from identify.record.provenance import store_robot
@@ -226,6 +227,7 @@ def _record(
         prismatic=plant.nominal.layout.prismatic,
     )
     store_robot(record, plant.nominal)
+    store_robot_file(record, plant.nominal, plant.loop.side.model.start_parameters)
     if plant.geometry_covariance is not None:
         store_geometry_covariance(record, plant.nominal, plant.geometry_covariance)
     # The first twenty reasons show why frames were lost.

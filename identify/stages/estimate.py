@@ -26,6 +26,7 @@ from identify.files.versions import versions
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.conditions import DRIFT, read_finding
+from identify.record.files_of_record import warn_of_changed_robot
 from identify.record.from_telemetry import GrossErrors
 from identify.record.known_geometry import COVARIANCE as GEOMETRY_COVARIANCE
 from identify.record.known_geometry import known_geometry, store_geometry_covariance
@@ -75,6 +76,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
             check_planned(run_folder.path / name, one, setup, trajectories)
     known = known_geometry(load_robot(scenario.robot), scenario.geometry, run_folder.path)
     asked = asked_of(list(records.values()), known.robot, scenario)
+    warn_of_changed_robot(asked.records[0], asked.side.robot, scenario.robot)
     heading = {
         "scenario": scenario.name,
         "seed": seed,

@@ -29,6 +29,7 @@ from identify.loop_parameters import settled_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed
 from identify.record import recording
+from identify.record.files_of_record import warn_of_changed_sensor, warn_of_changes
 from identify.record.model_runs import build_model_run, model_groups
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.reporting.run_result import (
@@ -83,6 +84,13 @@ def validate(
     seed = setup.seed
     side = setup.side
     plan = setup.sensor_plan
+    warn_of_changed_sensor(files.experiment, plan.file.model_dump_json(), scenario.sensor)
+    plant = setup.plant
+    warn_of_changes(
+        f"robot file {scenario.robot}",
+        true_parameters(excitation_truth),
+        dict(zip(plant.robot.layout.names, map(float, plant.parameters), strict=True)),
+    )
     taught = taught or plan.taught(robot, seed, progress).taught
     duration_s = scenario.validation.duration_s
     runs = run_unseen(

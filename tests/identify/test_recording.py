@@ -13,7 +13,7 @@ import xarray as xr
 from dynamics import load_robot
 from identify import pipeline
 from identify.errors import EstimationError, RecordError, WriteError
-from identify.estimation.identification import identify
+from identify.estimation.identification import asked_of, identify
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.atomic import atomic_contents, write_files, write_text
 from identify.files.dataset import group_names, write_groups
@@ -21,6 +21,7 @@ from identify.files.run_folder import load_result, save_result
 from identify.model.from_record import identified_model
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
+from identify.record.files_of_record import store_robot_file, warn_of_changed_sensor
 from identify.record.load import recorded_payload
 from identify.record.model_runs import build_model_run, read_model_runs
 from identify.record.provenance import check_robot
@@ -429,6 +430,45 @@ def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geo
     ):
         with pytest.raises(RecordError, match=says):
             check_robot(record.assign_attrs(robot_geometry=geometry), rss6())
+
+
+def test_a_robot_file_that_changed_or_went_since_its_record_was_made_is_named(
+    record, tmp_path, recwarn
+):
+    """The record also serves without the file, with the guess that it had, but not with the truth."""
+    passage = '\nname = "rss6"\n'
+    path = synthetic.changed_robot_file(tmp_path / "own.toml", passage, passage)
+    scenario = SHORT.with_overrides({"robot": str(path)})
+    held = record.copy()
+    store_robot_file(held, load_robot(path), "guess")
+    assert "parameters.truth" not in held.attrs["robot_file"]
+    asked_of(held, None, scenario)
+    assert not recwarn.list
+    guess = path.read_text(encoding="utf-8").replace("mass = 24.0", "mass = 25.0", 1)
+    path.write_text(guess.replace("centre_std = 0.0", "centre_std = 0.01"), encoding="utf-8")
+    with pytest.warns(UserWarning, match=r"own.toml has changed .*: unstated.centre_std was 0.0 a"):
+        asked = asked_of(held, None, scenario)
+    assert asked.side.robot.nominal_parameters[0] == 25.0
+    # A robot that the caller gives is meant to be what it is.
+    asked_of(held, load_robot(path), scenario)
+    assert not recwarn.list
+    path.unlink()
+    with pytest.warns(UserWarning, match="the robot that the record holds is used"):
+        asked = asked_of(held, None, scenario)
+    ours = rss6()
+    assert asked.side.robot.geometry == ours.geometry
+    assert asked.side.robot.nominal_parameters.tolist() == ours.nominal_parameters.tolist()
+
+
+def test_a_sensor_file_that_changed_since_its_record_was_made_is_named(record):
+    file = SHORT.sensor_file()
+    held = record.assign_attrs(sensor_file=file.model_dump_json())
+    warn_of_changed_sensor(held, file.model_dump_json(), "s.toml")
+    stated = json.loads(file.model_dump_json())
+    stated["camera"]["dark_noise"] = 52.0
+    stated["a_key_of_a_later_version"] = 1
+    with pytest.warns(UserWarning, match=r"s.toml has changed .* camera.dark_noise was .* is 52"):
+        warn_of_changed_sensor(held, json.dumps(stated), "s.toml")
 
 
 @pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])
