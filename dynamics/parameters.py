@@ -275,7 +275,7 @@ class ParameterLayout:
         )
 
     def without_gains(self, values: ArrayLike) -> ArrayLike:
-        """Dynamic parameters of an array (..., all identified numbers). Others are unchanged."""
+        """Dynamic parameters (..., p) of an array of all parameters. Other arrays are unchanged."""
         if isinstance(values, np.ndarray) and values.shape[-1:] == (len(self.names),):
             return np.asarray(values[..., self.dynamic])
         return values

@@ -219,7 +219,8 @@ def _package_digest() -> bytes:
     """Digest of all files of this package that the code depends on."""
     digest = sha256()
     package = Path(__file__).parent.parent
-    files = [package / "expressions.py", package / "parameters.py"]
+    names = ("closure", "expressions", "geometry", "parameters", "spatial_inertia")
+    files = [package / f"{name}.py" for name in names]
     for folder in ("compiled", "legs", "kinematics", "rigid_body"):
         files += sorted((package / folder).glob("*.py"))
     for file in files:

@@ -42,7 +42,7 @@ Closure = Callable[[np.ndarray, np.ndarray], Sequence[np.ndarray]]
 class ForwardSolution:
     """Result of a search.
 
-    `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) steps of Newton.
+    `pose` (6,) or (N, 6) is the final pose, after `iterations` () or (N,) Newton steps.
     `residual` (n,) or (N, n) is the magnitude of the difference between the given joint coordinates
     and those of the pose, rad or m. It is NaN if a leg cannot reach the pose.
     """

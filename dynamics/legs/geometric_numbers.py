@@ -1,8 +1,8 @@
 """Geometric numbers of a leg: the numbers that determine its kinematics.
 
 Each kind of leg lists the names of its geometric numbers (`Leg.numbers`). They are coordinates of
-its joints, m, its lengths, m, and small rotations of its axis, rad. Rotations are relative to the
-present axis. Their values are thus zero, and only their deviations can differ from zero. The
+its joints, m, its lengths, m, and small rotations of its axes, rad. Rotations are relative to the
+present axes. Their values are thus zero, and only their deviations can differ from zero. The
 rotations `u` and `v` are about axes perpendicular to the axis of the leg. On a crank, `u` is about
 the zero direction, and `crank_zero` is about the crank axis.
 

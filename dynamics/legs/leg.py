@@ -384,7 +384,7 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
 def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
     """Angular velocity (3,) of a body on a universal joint whose axis z (3,) has the rate `z_rate`.
 
-    The body turns about a first axis, a unit vector fixed on the base, and about its of_body x (see
+    The body turns about a first axis, a unit vector fixed on the base, and about its own x (see
     `link_axes`).
     """
     across = ca.cross(ca.SX(axis), z)

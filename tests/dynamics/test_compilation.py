@@ -16,7 +16,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dynamics.compiled import object_files
+from dynamics import load_robot
+from dynamics.closure import closure_function
+from dynamics.compiled import machine_code, object_files
 from dynamics.compiled.kernel import call_columns, entry, kernel, plain
 from dynamics.compiled.lanes import NAMES, ColumnFunction, PartedFunction, graph_of, lane_groups
 from dynamics.compiled.machine_code import compiled_functions
@@ -305,6 +307,26 @@ def test_code_is_compiled_once_per_content(own_cache):
     files = list(own_cache.iterdir())
     assert len(files) == 2
     assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
+
+
+@pytest.mark.slow
+def test_the_digest_has_every_file_that_writes_the_functions_of_a_robot(monkeypatch):
+    """Python's own record of the calls says which files write the expressions."""
+    robot = load_robot("rrr3").with_full_bodies(["all"])
+    geometry = robot.with_passive_friction(["link_joint.viscous"]).geometry
+    called = set()
+    sys.setprofile(lambda frame, *_: called.add(frame.f_code.co_filename))
+    try:
+        _ = *robot_functions(geometry), *motion_functions(geometry), closure_function(geometry)
+    finally:
+        sys.setprofile(None)
+    read = Mock(return_value=b"")
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(str(path)))
+    machine_code._package_digest.__wrapped__()
+    folder = str(Path(machine_code.__file__).parents[1])
+    written = {path for path in called if path.startswith(folder)}
+    assert written
+    assert written <= {call.args[0] for call in read.call_args_list}
 
 
 @pytest.mark.slow
