@@ -24,7 +24,8 @@ class StopCriteria:
     """Criteria of eq. 35 by which a search stops.
 
     cost_tolerance, parameter_tolerance: tol1 and tol2, the relative changes of the cost and of the
-    parameters at or below which a search has converged. max_iterations: largest number of steps.
+    parameters at or below which a search has converged. max_iterations: largest number of steps
+    that lower the cost.
     """
 
     cost_tolerance: float

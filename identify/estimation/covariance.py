@@ -270,9 +270,9 @@ def _noise(
 
     The third result is the number of unstable repetitions. found: linearisation of each run, with
     rows in the units of the scores. If logged commands drive all models, the residuals of noise
-    alone are white, and no experiment is repeated. They also count as white if the residuals of the
-    record are so large that the model's error decides, and the first repetitions confirm this or
-    fewer than FEWEST are stable. Otherwise, too few stable repetitions raise EstimationError.
+    alone are white, and no experiment is repeated. Residuals of the record can be so large that the
+    model's error decides. Those of noise then count as white, if the first repetitions confirm this
+    or fewer than FEWEST are stable. Otherwise, raises EstimationError for fewer than FEWEST.
     """
     runs = zip(problem.runs, found, strict=True)
     white = misfit_of_white(np.concatenate([run.without_common(one.missed) for run, one in runs]))

@@ -253,9 +253,8 @@ def output_error_problem(
     Raises RecordError if the first record has no scale anchor, or a record has no measured poses.
     Raises EstimationError if a record is of another robot or is not suitable for an identification,
     if the first record has another timing or servo, or if the scale anchor is a payload and all
-    records have the same load.
-    Raises ScenarioError if there is no parameter set for the initial guess, or the guess is not
-    valid for the model.
+    records have the same load. Raises ScenarioError if there is no parameter set for the initial
+    guess, or the guess is not valid for the model.
     """
     robot = side.robot
     # The motion depends only on the groups, so only their sensitivities are integrated.

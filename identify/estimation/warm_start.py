@@ -1,6 +1,6 @@
 """Linear warm start: a linear fit that provides a start close to the optimum.
 
-The closed-loop equation is linear in all unknowns, so a single linear fit is enough. Let U be the
+The closed-loop equation is linear in all unknowns, so a linear fit determines them. Let U be the
 logged commands, theta the joint coordinates of the measured poses, Gamma the regressor of the
 dynamic parameters Xi, J_ad the Jacobian of the joints, and lp, li and ld the gains. At every
 instant

@@ -27,7 +27,7 @@ DIGITS = 4  # number of decimals of positions, m
 def fitted(file: SensorFile, robot: Robot) -> SensorFile:
     """Return a sensor file that fits a robot.
 
-    Platform, base and rig are moved as the robot's home is from that of the file. Planes and cuts
+    Platform, base and rig are moved from the home of the file to that of the robot. Planes and cuts
     of the platform are moved outwards to legs that end more than 0.03 m outside, and base and rig
     with them. The cameras are moved away from their target until they see all stickers that they
     saw before. Raises ScenarioError if they never do.

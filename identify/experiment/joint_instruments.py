@@ -162,10 +162,10 @@ def frame_mean(
 ) -> Array:
     """Return the torque (N, n) averaged over one frame around each sample.
 
-    The torque jumps with each command by lp dU + ld dU_dot, or by ld dU_dot if commands ramp. A
-    jump at a time s from a sample, within half a frame T, acts during T/2 - s of the averaging
-    interval. The sample contains either the whole jump or nothing of it. The difference is
-    subtracted from the sample.
+    The torque jumps with each command by lp dU + ld dU_dot, or by ld dU_dot if commands ramp. With
+    the frame period T, a jump at the time s after a sample, from -T/2 to T/2, acts during T/2 - s
+    of the averaging interval. The sample contains either the whole jump or nothing of it. The
+    difference is subtracted from the sample.
 
     torque (N, n)   Samples.
     command (N, n)  Commands of the frames.

@@ -347,7 +347,7 @@ def drawn_load(layout: ParameterLayout, load: Payload, rng: np.random.Generator)
     std = np.array(load.figures_std)
 
     def drawn() -> Array:
-        # The number and the order of the draws are kept, so that a seed always gives the same load.
+        # As in earlier versions, a number is drawn for each parameter, so a seed keeps its load.
         numbers = rng.standard_normal(len(layout.names))
         return figures + std * numbers[[0, 4, 5, 6, 1, 2, 3]]
 

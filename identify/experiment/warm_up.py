@@ -30,7 +30,7 @@ def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
     """Compile robots and the loop around them, unless they are compiled already."""
     with progress.stage("compile the robot", 2 * len(robots)) as advance:
         for robot in robots:
-            dict(robot.functions)  # asks for all of them
+            dict(robot.functions)  # uses all of them, which compiles them
             advance()
             prepare(robot)
             advance()
@@ -73,7 +73,7 @@ def _compile_plant(plant: Plant) -> None:
 def _compile_sensor(plant: Plant, planned: SensorPlan) -> None:
     """Teach the sensor and measure some frames, with the planned renderer and all kernels.
 
-    A record also contains the common errors of its poses.
+    The common errors of the poses are computed, too, because a record contains them.
     """
     motion = _nearby(plant)
     rate_hz = plant.runs.timing.frame_rate_hz

@@ -94,7 +94,7 @@ class LoopModel(Residuals):
         return replace(self, torques=torques if self.torques is None else self.torques + torques)
 
     def having(self, drawn: Array) -> "LoopModel":
-        """Return a copy with common errors (k,), in standard deviations, or the least allowed."""
+        """Return a copy with common errors (k,) in standard deviations, at least `lowest_drawn`."""
         contained = np.maximum(drawn, self.lowest_drawn) if len(drawn) else None
         other = replace(self, drawn=contained, marginal=None)
         if not other.errors_had[other.contained].size:

@@ -18,7 +18,7 @@ from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.record.stored_common_errors import START
 
-FIRST_S = 0.2  # time, s, after the start of a stretch. The poses in this time determine the start.
+FIRST_S = 0.2  # time, s, from the start of a stretch, in which the poses determine the start
 FEWEST = 6  # smallest number of poses that determine the start, if a stretch has so many
 DEGREE = 3  # degree of the polynomial through the first poses
 WIDE = 20.0  # ratio of the prior standard deviations of a start to those of the polynomial

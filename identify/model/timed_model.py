@@ -122,9 +122,10 @@ class TimedModel(LoopModel):
         return of_bodies | self._shown_starts(parameters) | self._shown_clock(parameters)
 
     def in_deciding_stds(self, change: Array) -> Array:
-        """Return a change (k,) of the common errors in their posterior standard deviations.
+        """Return a change (k,) of the common errors in posterior standard deviations.
 
-        The priors are wide, and say nothing about how well the record determines these errors.
+        The parameters count as known. The priors are too wide to say how well the record determines
+        the errors.
         """
         if self.marginal is None:
             return change

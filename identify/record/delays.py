@@ -100,7 +100,7 @@ class ServoDelay:
     seconds      Median delay, s. It is negative if the clock of the poses is ahead by more than the
                  latency.
     drift        Growth of the delay, s per s.
-    spread       Median deviation from the delay and its drift, s.
+    spread       Median of the absolute deviations from the delay with its drift, s.
     correlation  Correlation of the noise in the commands with that of the poses, in joint
                  coordinates.
     resolution   Usual time between two rows of commands, s. If most rows only repeat the command

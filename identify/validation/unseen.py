@@ -101,7 +101,7 @@ def model_run(
     """Return the poses (N, 6) of the model on a reference. All are NaN if the loop is unstable.
 
     ``latencies`` (N,) [s] are the latencies of the commands, by default the latency of the timing.
-    In ``lost`` (N,) frames the servo measures nothing, by default in none.
+    ``lost`` (N,) marks frames in which the servo measures nothing, by default none.
 
     Raises dynamics.DynamicsError for parameters of another shape or outside their range, and for
     poses out of reach.
@@ -232,7 +232,7 @@ def errors_of_model(parameters: ArrayLike, plant: Plant, design: DesignTask, see
     if, the model's loop is unstable.
 
     Raises dynamics.DynamicsError for parameters of another shape, not finite, or outside their
-    range. Raises TrajectoryError if no validation trajectory is within the robot's limits.
+    range. Raises TrajectoryError if too few random trajectories are within the robot's limits.
     """
     robot = plant.nominal
     settings = plant.loop.side.settings

@@ -1,4 +1,4 @@
-"""Checks of a robot without a sensor, and of a sensor without a robot.
+"""Checks of a robot, of a sensor, and of the telemetry of a run.
 
 They include the comparison of a robot's model with MuJoCo, and maps of its workspace.
 """

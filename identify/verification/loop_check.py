@@ -135,7 +135,7 @@ def check_steps(robot: Robot, parameters: Array, around: CheckSettings) -> Itera
 def check_gains(robot: Robot, parameters: Array, around: CheckSettings) -> Iterator[Finding]:
     """Check the gains of the servo and of computed_torque.
 
-    If a bandwidth and a damping are requested, gains of the servo are also designed.
+    If a bandwidth is requested, gains of the servo are also designed for it.
     """
     settings = around.settings
     home = robot.home_pose

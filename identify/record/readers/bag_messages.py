@@ -15,7 +15,7 @@ LISTED = 8  # number of messages of a topic that are searched for the names of i
 MOST = 500  # largest number of columns of a topic, and of listed entries of an array
 NAMES = ("name", "joint_names")  # entries of a message that name those of its arrays
 CHILD = "child_frame_id"  # entry that names a transform among several
-# Name of an entry of a message, and number or name in its brackets, or None.
+# Name of an entry of a message, and what stands in brackets behind it, or None.
 Step = tuple[str, str | None]
 # Number of a message, time as text, or None where a message has no such entry.
 Entry = str | float | None

@@ -48,8 +48,8 @@ class Bag:
     def read(self, topic: str, names: Sequence[str]) -> Stream:
         """Read columns of a topic, without messages that have none of them.
 
-        Raises RecordError if the bag cannot be read, if no message has any of the columns, or, with
-        the columns of the topic, if one is missing.
+        Raises RecordError if the bag cannot be read or no message has any of the columns. If the
+        topic lacks a column, the error names those that it has.
         """
         header = self.headers[topic]
         check_columns(header, names, f"{self.path} {topic}")

@@ -173,8 +173,8 @@ def _poses(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the poses (N, 6) of the platform in the base, and whether (N,) they were measured.
 
-    Other poses are NaN. measured: False for desired poses, which are never lost. Raises RecordError
-    for an invalid mark or rotation, for zeros in place of lost poses, or if all are NaN.
+    Lost poses are NaN. measured: False for desired poses, which may not be lost. Raises RecordError
+    for an invalid mark or rotation, for zeros in place of lost poses, or if all are lost.
     """
     position = np.stack([stream.numbers(name) for name in log.position], axis=1)
     orientation = np.stack([stream.numbers(name) for name in log.orientation], axis=1)
