@@ -8,11 +8,15 @@ record is
 where the log holds the pose of the tracked body in the log's own frame, frame_from_body.
 """
 
+from collections.abc import Sequence
 from itertools import permutations, product
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
+from scipy.spatial.transform import Rotation
 
+from identify.arrays import Array
 from identify.scenario.section import Section, quantity
 
 ASKED = "?"  # value of a key that a proposal leaves to the user
@@ -159,6 +163,25 @@ class PoseColumns(Log):
         "instead of small turns, as in tables of cmmsim measure",
     )
 
+    def in_base(self, position: Array, turned: Rotation) -> Array:
+        """Return the poses (N, 6) of the platform in the base.
+
+        `position` (N, 3), m, and `turned` are those of the tracked body, in axes of the log.
+        """
+        axes = axes_matrix(self.axes)
+        frame = Rotation.from_matrix(axes @ turned.as_matrix() @ axes.T)
+        base, body = (transform(pose) for pose in (self.base_from_frame, self.body_from_platform))
+        moved = base[1] + base[0].apply(position @ axes.T + frame.apply(body[1]))
+        return np.hstack([moved, (base[0] * frame * body[0]).as_euler("XYZ")])
+
+    def in_log(self, poses: Array) -> tuple[Array, Rotation]:
+        """Return the position and rotation of which `in_base` makes the poses (N, 6)."""
+        axes = axes_matrix(self.axes)
+        base, body = (transform(pose) for pose in (self.base_from_frame, self.body_from_platform))
+        frame = base[0].inv() * Rotation.from_euler("XYZ", poses[:, 3:]) * body[0].inv()
+        position = base[0].inv().apply(poses[:, :3] - base[1]) - frame.apply(body[1])
+        return position @ axes, Rotation.from_matrix(axes.T @ frame.as_matrix() @ axes)
+
     @property
     def other_conventions(self) -> tuple[str, ...]:
         """Other conventions with as many columns, for which this one is often mistaken."""
@@ -269,6 +292,19 @@ class Columns(Section):
             self.measured.topic,
         ):
             _check_once([*pose, *command.names])
+
+
+def axes_matrix(names: Sequence[str]) -> Array:
+    """Return A (3, 3), whose rows are the axes of the log that are our x, y and z."""
+    rows = np.zeros((3, 3))
+    for row, name in enumerate(names):
+        rows[row, "xyz".index(name[-1])] = -1 if name.startswith("-") else 1
+    return rows
+
+
+def transform(pose: Sequence[float]) -> tuple[Rotation, Array]:
+    """Return the rotation and the translation, m, of a pose of six numbers."""
+    return Rotation.from_euler("XYZ", pose[3:]), np.array(pose[:3])
 
 
 def _check_once(names: list[str]) -> None:

@@ -152,8 +152,8 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
     They name the unit of angles or the convention of rotations with which the log would fit, if
     there is one.
     """
-    found = suspicions(telemetry, robot)
     columns = about.columns
+    found = suspicions(telemetry, robot, columns)
     if columns is None:
         return found
 

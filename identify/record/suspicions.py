@@ -2,23 +2,29 @@
 
 A pose and the commands at its time give the same joint coordinates, except for the lag of the
 drives and the errors of the geometry. If they do not, the poses are tried in other units, with
-other axes and mirrored, and the commands in other units, directions, orders and zeros.
+other axes and mirrored, and the commands in other units, directions, orders and zeros. For a log
+with ``[columns]``, the sentences have the lines that its file should have.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import permutations, product
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.files.dataset import POSE
 from identify.filtering import interpolated
+from identify.record.columns import Columns, CommandColumns, PoseColumns
 from identify.record.delays import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
+from identify.record.tried_columns import (
+    command_units,
+    other_poses,
+    reordered,
+    signs_line,
+    zeros_line,
+)
 
 TRIED = 200  # number of poses with which other units and axes are tried
 # Lags, s, of the motion behind the commands that are tried with other units and axes.
@@ -42,40 +48,20 @@ FITS = 0.9
 OPPOSES = -0.8
 # Distance, rad, of a joint's offset from whole turns below which it counts as these turns.
 NEAR_TURN = 0.3
+ALIKE = 0.02  # difference of mean correlations up to which units and axes fit equally well
 # Largest offset of a joint from its command, as a fraction of its travel limit, that needs no other
 # zero. Drives without an integral hold a joint away from its command.
 ZERO = 0.5
 SCALE = 2.0  # largest factor between two units that count as the same one. Loops overshoot and lag.
 
-# Factors of positions that are tried.
-LENGTHS_TRIED = {
-    1.0: "",
-    1e-3: "positions in mm and not m",
-    1e-2: "positions in cm and not m",
-    0.1: "positions in mm and not cm",
-    10.0: "positions in cm and not mm",
-    1e3: "positions in m and not mm",
-}
 
-# Factors of angles that are tried.
-ANGLES_TRIED = {
-    1.0: "",
-    np.pi / 180: "angles in degrees and not rad",
-    180 / np.pi: "angles in rad and not degrees",
-}
+def suspicions(telemetry: Telemetry, robot: Robot, columns: Columns | None = None) -> list[str]:
+    """Return what is likely wrong with the units, frames and joints of telemetry, as sentences.
 
-NAMES = ("x", "y", "z")
-
-# Columns whose orders and signs are tried: slice of a pose, names, and the other columns.
-COLUMNS = {
-    "position": (slice(0, 3), NAMES, "orientation"),
-    "angles": (slice(3, 6), POSE[3:], "position"),
-}
-
-
-def suspicions(telemetry: Telemetry, robot: Robot) -> list[str]:
-    """Return what is likely wrong with the units, frames and joints of telemetry, as sentences."""
-    return list(_found(telemetry, robot))
+    ``columns`` is what the description of a log states. Units and axes that would fit are then
+    those that it should state instead.
+    """
+    return list(_found(telemetry, robot, columns))
 
 
 def fits(telemetry: Telemetry, robot: Robot) -> bool:
@@ -143,11 +129,12 @@ def lag_of(telemetry: Telemetry, robot: Robot) -> MotionLag:
     return motion_lag(time, coordinates, commands.time, commands.command)
 
 
-def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
+def _found(telemetry: Telemetry, robot: Robot, columns: Columns | None) -> Iterator[str]:
     poses = telemetry.poses
+    measured, given = (columns.measured, columns.command) if columns else (None, None)
     reached = _reached(_on_chart(poses.pose[poses.ok], robot), robot)
     if reached.mean() < IN_REACH:
-        yield _out_of_reach(telemetry, robot, reached)
+        yield _out_of_reach(telemetry, robot, reached, measured)
         return
     time, coordinates = joint_motion(telemetry, robot)
     commanded = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
@@ -155,17 +142,17 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
     if not moving.all():
         return
     alike = np.diagonal(_correlations(commanded, coordinates))
-    order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates)
+    order = "" if alike.min() > FITS else _other_order(telemetry, time, coordinates, given)
     sure = np.flatnonzero(np.abs(alike) > FITS)
     hint = ""
     if len(sure) < len(alike):
-        hint = order or _fitting(telemetry, robot, alike.mean())
+        hint = order or _fitting(telemetry, robot, alike.mean(), measured)
     elif alike.min() > 0 and unexplained(telemetry, robot) > EXPLAINED:
         # Wrong columns of small angles leave all joints similar to their commands.
-        hint = _fitting(telemetry, robot, alike.mean())
+        hint = _fitting(telemetry, robot, alike.mean(), measured)
     if not hint:
         # A joint whose drive does not follow says nothing about its own zero.
-        yield from _of_joints(sure, commanded, coordinates, alike, robot, order)
+        yield from _of_joints(sure, commanded, coordinates, alike, robot, order, given)
     else:
         yield (
             "the measured motion is not that of the commands (correlations of the joints from "
@@ -173,14 +160,18 @@ def _found(telemetry: Telemetry, robot: Robot) -> Iterator[str]:
         )
 
 
-def _other_order(telemetry: Telemetry, time: Array, coordinates: Array) -> str:
+def _other_order(
+    telemetry: Telemetry, time: Array, coordinates: Array, given: CommandColumns | None
+) -> str:
     """Return a hint about the order of the joints in which all commands fit, or an empty string."""
     for lag in LAGS_S:
         alike = _correlations(_commands_at(telemetry, time - lag), coordinates)
         joints, order = linear_sum_assignment(-alike)
         if (order != joints).any() and alike[joints, order].min() > FITS:
-            listed = ", ".join(str(column + 1) for column in np.argsort(order))
-            return f"in another order they would fit: columns {listed} move joints 1, 2, ..."
+            movers = np.argsort(order)
+            listed = ", ".join(str(column + 1) for column in movers)
+            said = f"in another order they would fit: columns {listed} move joints 1, 2, ..."
+            return said + ("" if given is None else f", {reordered(given, movers)}")
     return ""
 
 
@@ -191,11 +182,13 @@ def _of_joints(
     alike: Array,
     robot: Robot,
     order: str,
+    given: CommandColumns | None,
 ) -> Iterator[str]:
     """Yield sentences on wrong directions, units and zeros of joints (k,) that follow commands.
 
     `alike` (n,) has the correlations of all joints with their commands. Negative ones count, too.
-    `order` is a hint about another order in which the commands would fit, or empty.
+    `order` is a hint about another order in which the commands would fit, or empty. `given` is what
+    a description states of the commands.
     """
     if not len(joints):
         return
@@ -206,29 +199,30 @@ def _of_joints(
         listed = ", ".join(str(joint + 1) for joint in against)
         yield (
             f"the commands of joint {listed} count against the direction of the robot file: their "
-            f"correlation with the poses is {alike[against[0]]:.2f} (columns.command.signs)"
+            f"correlation with the poses is {alike[against[0]]:.2f} {signs_line(given, against)}"
             + (f"; or {order}" if order else "")
         )
         return
     slopes = alike * coordinates.std(axis=0) / commanded.std(axis=0)
     slope = float(np.median(slopes[joints]))
-    for factor, said in (LENGTHS_TRIED if prismatic else ANGLES_TRIED).items():
+    for factor, said in command_units(prismatic, given):
         if said and abs(np.log(slope / factor)) < np.log(SCALE):
             yield (
-                f"the commands are {1 / slope:.3g} times the joint coordinates of the poses: they "
-                f"are {said.partition(' ')[2]} (columns.command.unit)"
+                f"the commands are {1 / slope:.3g} times the joint coordinates of the poses: {said}"
             )
             return
     offsets = np.median(coordinates - commanded, axis=0)
+    whole = np.zeros(len(offsets)) if prismatic else 2 * np.pi * np.round(offsets / (2 * np.pi))
+    whole[np.abs(offsets - whole) >= NEAR_TURN] = 0.0
     for joint, offset in zip(joints, offsets[joints], strict=True):
-        turns = 0 if prismatic else round(offset / (2 * np.pi))
+        turns = round(whole[joint] / (2 * np.pi))
         text = (
             f"the commands of joint {joint + 1} lie {-offset:.4g} {unit} from the joint "
             "coordinates of the poses"
         )
-        if turns and abs(offset - 2 * np.pi * turns) < NEAR_TURN:
+        if turns:
             by = "a turn" if abs(turns) == 1 else f"{abs(turns)} turns"
-            yield f"{text}: its zero is off by {by} (columns.command.zeros)"
+            yield f"{text}: its zero is off by {by} {zeros_line(given, whole)}"
         elif abs(offset) > ZERO * robot.travel_limit:
             yield (
                 f"{text}, {abs(offset) / robot.travel_limit:.0%} of the travel limit: its zero, or "
@@ -236,14 +230,19 @@ def _of_joints(
             )
 
 
-def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]) -> str:
+def _out_of_reach(
+    telemetry: Telemetry,
+    robot: Robot,
+    reached: NDArray[np.bool_],
+    measured: PoseColumns | None,
+) -> str:
     """Return a message that poses are out of reach, with the first row and what would fit."""
     poses = telemetry.poses
     row = int(np.flatnonzero(poses.ok)[np.argmin(reached)])
     place = poses.rows.place(row)
     pose = ", ".join(f"{value:.6g}" for value in poses.pose[row])
     leg = int(np.argmin(robot.reach_margin(_on_chart(poses.pose[row], robot)))) + 1
-    hint = _fitting(telemetry, robot, 0.0)
+    hint = _fitting(telemetry, robot, 0.0, measured)
     return (
         f"{place}: leg {leg} of {robot.name} cannot reach the measured pose [{pose}], m and rad, "
         f"and {1 - reached.mean():.0%} of the poses are out of reach; "
@@ -251,81 +250,40 @@ def _out_of_reach(telemetry: Telemetry, robot: Robot, reached: NDArray[np.bool_]
     )
 
 
-def _fitting(telemetry: Telemetry, robot: Robot, alike: float) -> str:
+def _fitting(telemetry: Telemetry, robot: Robot, alike: float, measured: PoseColumns | None) -> str:
     """Return a hint about units and axes with which the poses would move as the commands do.
 
     It is empty if none fit much better than the present ones, whose mean correlation is `alike`.
+    `measured` is what a description states of the poses.
     """
     poses = telemetry.poses
     rows = np.flatnonzero(poses.ok)
     rows = rows[:: -(-len(rows) // TRIED)]
     commanded = [_commands_at(telemetry, poses.time[rows] - lag) for lag in LAGS_S]
     best = max(alike, FITS - 0.1)
+    nearest = 0.0
     found = ""
-    for said, other in _other_poses(poses.pose[rows]):
+    for said, other in other_poses(poses.pose[rows], measured):
         tried = _on_chart(other, robot)
         reached = _reached(tried, robot)
         if reached.mean() < FITS:
             continue
         joints = robot.inverse_kinematics(tried[reached])
         score = max(np.diagonal(_correlations(one[reached], joints)).mean() for one in commanded)
-        # Smaller changes are tried first. Only a better fit replaces them.
-        if score > best + 0.02:
+        # A pose mirrored in the plane of the base has the same joint coordinates.
+        distance = float(np.abs(np.median(tried, axis=0) - robot.home_pose)[:3].max())
+        # Smaller changes are tried first. Only a better fit, or one nearer to home, replaces them.
+        if score > best + ALIKE or (score > best - ALIKE and distance < nearest / 2):
             best = score
+            nearest = distance
             found = said
     return found
-
-
-def _other_poses(poses: Array) -> Iterator[tuple[str, Array]]:
-    """Yield hints with poses (N, 6) in other units and axes, and with other orders of columns.
-
-    Axes of a frame turn the position and the orientation. Columns in a wrong order, or with a wrong
-    sign, change only one of them.
-    """
-    units = product(LENGTHS_TRIED.items(), ANGLES_TRIED.items())
-    for ((metres, length), (radians, angle)), (axes, matrix) in product(units, _all_axes()):
-        scaled = poses * np.repeat([metres, radians], 3)
-        said = [length, angle, "" if axes == NAMES else f"axes = [{', '.join(axes)}]"]
-        left = " (the frame is left-handed)" if np.linalg.det(matrix) < 0 else ""
-        hint = f"with {' and '.join(filter(None, said))} it would fit{left}"
-        yield hint, _with_axes(scaled, matrix)
-    for what, (part, names, same) in COLUMNS.items():
-        for axes, matrix in _all_axes(names):
-            moved = poses.copy()
-            moved[:, part] = poses[:, part] @ matrix.T
-            hint = (
-                f"with [{', '.join(axes)}] in place of the {what} [{', '.join(names)}], and the "
-                f"{same} as it is, it would fit: columns have another order or sign"
-            )
-            yield hint, moved
 
 
 def _commands_at(telemetry: Telemetry, time: Array) -> Array:
     """Return the commands (N, n), interpolated at times (N,) and held beyond the first and last."""
     commands = telemetry.commands
     return interpolated(time, commands.time, commands.command)
-
-
-def _all_axes(usual: Sequence[str] = NAMES) -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Yield names and matrices (3, 3) of all choices of axes, those with fewest changes first."""
-    found = []
-    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
-        matrix = np.zeros((3, 3))
-        matrix[range(3), order] = signs
-        names = tuple(
-            f"{'-' if sign < 0 else ''}{usual[axis]}"
-            for axis, sign in zip(order, signs, strict=True)
-        )
-        changed = sum(name != own for name, own in zip(names, usual, strict=True))
-        found.append((changed, names, matrix))
-    for _, names, matrix in sorted(found, key=lambda one: one[0]):
-        yield names, matrix
-
-
-def _with_axes(poses: Array, matrix: Array) -> Array:
-    """Return poses (N, 6) whose frame has other axes."""
-    turned = matrix @ Rotation.from_euler("XYZ", poses[:, 3:]).as_matrix() @ matrix.T
-    return np.hstack([poses[:, :3] @ matrix.T, Rotation.from_matrix(turned).as_euler("XYZ")])
 
 
 def _on_chart(poses: Array, robot: Robot) -> Array:

@@ -277,13 +277,17 @@ def test_a_left_handed_log_with_y_up_is_the_same_record_with_its_axes_named(reco
     table.loc[ok, names[:3]] = ours[ok, :3] @ mirror
     table.loc[ok, names[3:]] = Rotation.from_matrix(mirror @ turned @ mirror).as_euler("XYZ")
     table.to_csv(path, index=False)
-    with pytest.raises(RecordError, match=r"axes = \[x, z, y\] it would fit .the frame is left"):
+    right = 'axes = ["x", "z", "y"]'
+    said = f"{re.escape(right)} in .columns.measured. it would fit .the frame is left"
+    with pytest.raises(RecordError, match=said):
         read_own_records([path])
-    change(
-        path.with_suffix(".toml"),
-        "[columns.reference]",
-        'axes = ["x", "z", "y"]\n[columns.reference]',
-    )
+    # The proposal replaces what the file states, also where that moves the poses.
+    described = path.with_suffix(".toml")
+    stated = 'axes = ["-x", "z", "-y"]\nbase_from_frame = [0.001, 0, 0, 0, 0, 0.01]\n'
+    change(described, "[columns.reference]", f"{stated}[columns.reference]")
+    with pytest.raises(RecordError, match=said):
+        read_own_records([path])
+    change(described, stated, f"{right}\n")
     np.testing.assert_allclose(
         telemetry_of(path).poses.pose, ours, rtol=0, atol=TOLERANCE, equal_nan=True
     )
@@ -383,7 +387,7 @@ def test_orders_of_angles_that_a_small_motion_cannot_tell_are_named(record, tmp_
 def test_commands_in_a_wrong_unit_do_not_put_the_convention_in_doubt(record, tmp_path):
     path = as_table(tmp_path, record)
     change(path.with_suffix(".toml"), 'unit = "rad"', 'unit = "deg"')
-    with pytest.raises(RecordError, match=r"are in rad and not degrees \(columns.command.unit\)$"):
+    with pytest.raises(RecordError, match=r'with unit = "rad" in .columns.command. they would fit$'):
         read_own_records([path])
 
 
@@ -488,16 +492,21 @@ WRONG_TABLES = [
     ),
     (
         described_as('position_unit = "m"', 'position_unit = "mm"'),
-        "line 2: leg . of rss6 cannot reach .* with positions in m and not mm it would fit",
+        "line 2: leg . of rss6 cannot reach .* with position_unit = .m. in .columns.measured. it",
     ),
-    (described_as('unit = "rad"', 'unit = "deg"'), "they are in rad and not degrees"),
+    (
+        described_as('position_unit = "m"', 'position_unit = "um"'),
+        "line 2: leg . of rss6 cannot reach .* with position_unit = .m. in .columns.measured. it",
+    ),
+    (described_as('unit = "rad"', 'unit = "deg"'), "with unit = .rad. in .columns.command. they"),
+    (described_as('unit = "rad"', "unit = 0.1"), "with unit = .rad. in .columns.command. they"),
     (
         described_as('unit = "rad"', 'unit = "rad"\nsigns = [1, 1, -1, 1, 1, 1]'),
-        "the commands of joint 3 count against the direction",
+        "the commands of joint 3 count against the direction .* .signs = .1, 1, 1, 1, 1, 1. in",
     ),
     (
         described_as('unit = "rad"', 'unit = "rad"\nzeros = [0, 6.28, 0, 0, 0, 0]'),
-        "the commands of joint 2 lie -6.2.* its zero is off by a turn",
+        "the commands of joint 2 lie -6.2.* off by a turn .zeros = .0, -0.003.*, 0, 0, 0, 0. in",
     ),
     (
         described_as('time = "time_s"', 'time = "time_s"\ntime_unit = "ms"'),

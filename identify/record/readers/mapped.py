@@ -5,7 +5,7 @@ A pose of the log is (R, p), a rotation and a position in the log's own frame. I
 left-handed system right-handed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -27,6 +27,8 @@ from identify.record.columns import (
     CommandColumns,
     Log,
     PoseColumns,
+    axes_matrix,
+    transform,
 )
 from identify.record.csv_record import symmetric
 from identify.record.lost_pose_marks import check_zeros, lost_rows
@@ -200,13 +202,7 @@ def _poses(
         stream.rows.word,
     )
     turned = _rotations(orientation[ok], log, rows)
-    axes = _axes(log.axes)
-    frame = Rotation.from_matrix(axes @ turned.as_matrix() @ axes.T)
-    moved = LENGTHS[log.position_unit] * position[ok] @ axes.T
-    base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
-    whole = base[0] * frame * body[0]
-    poses[ok, :3] = base[1] + base[0].apply(moved + frame.apply(body[1]))
-    poses[ok, 3:] = whole.as_euler("XYZ")
+    poses[ok] = log.in_base(LENGTHS[log.position_unit] * position[ok], turned)
     return poses, ok
 
 
@@ -232,8 +228,8 @@ def _covariances(stream: Stream, log: PoseColumns, poses: Array, robot: Robot) -
         angles = np.stack([stream.numbers(name) for name in log.orientation], axis=1)[good]
         own = _of_turns(own, ANGLES[log.angle_unit] * angles)
     units = np.repeat([LENGTHS[log.position_unit], ANGLES[log.angle_unit]], 3)
-    axes = _axes(log.axes)
-    base, body = (_transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
+    axes = axes_matrix(log.axes)
+    base, body = (transform(pose) for pose in (log.base_from_frame, log.body_from_platform))
     turn = base[0].as_matrix() @ axes
     # Turns are axial vectors, which mirrored axes reverse.
     moved = block_diag(turn, np.linalg.det(axes) * turn) * units
@@ -265,18 +261,6 @@ def _matrices(cells: Array) -> Array:
     if count == len(POSE) ** 2:
         return cells.reshape(-1, len(POSE), len(POSE))
     return symmetric(cells)
-
-
-def _axes(names: Sequence[str]) -> Array:
-    """Return A (3, 3), whose rows are the axes of the log that are our x, y and z."""
-    rows = np.zeros((3, 3))
-    for row, name in enumerate(names):
-        rows[row, "xyz".index(name[-1])] = -1 if name.startswith("-") else 1
-    return rows
-
-
-def _transform(pose: list[float]) -> tuple[Rotation, Array]:
-    return Rotation.from_euler("XYZ", pose[3:]), np.array(pose[:3])
 
 
 def _rotations(cells: Array, log: PoseColumns, rows: Rows) -> Rotation:
