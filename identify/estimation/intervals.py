@@ -114,10 +114,11 @@ class BoundedEstimate:
                 for k in np.flatnonzero(self.at_bound)
             )
         )
+        count = len(self.active_bounds)
         return (
-            f"the estimate is held at {len(self.active_bounds)} bounds, beyond which no robot "
-            f"exists: {said}; each number in brackets is the distance of the unbounded estimate "
-            "beyond the bound, in standard deviations; the intervals take it into account",
+            f"the estimate is held at {'a bound' if count == 1 else f'{count} bounds'} that no robot "
+            f"can pass: {said}; without the bound, the estimate would lie beyond it by the number "
+            "of standard deviations in brackets; the intervals allow for this",
         )
 
 

@@ -30,7 +30,16 @@ DECLARED_STDS = 3.0
 OF_CAMERAS = ("rig", "exposure")
 TEACHING = "teaching"  # kind of the errors of teaching, which every run has, and which are small
 
-COMMON_ERRORS = "the estimated errors that all frames share"
+# Words for kinds of common errors whose names need an explanation.
+KINDS = {
+    "rig": "cameras",
+    "teaching": "taught frames",
+    "exposure": "delay between exposures",
+    "zeros": "joint zeros",
+    "centres": "centres of mass",
+    "products": "products of inertia",
+    "passive_friction": "friction of passive joints",
+}
 
 # Names of the goals.
 UNSEEN_POSITION = "validation motion, position"
@@ -124,15 +133,18 @@ class Unseen:
 def unseen(result: dict[str, Any]) -> Unseen:
     """Return the errors of the model on the validation runs against the true robot."""
     runs = result.get("validation", [])
-    declared = {kind_of(name) for name in result["identification"].get("nuisance_prior_std", {})}
+    names = result["identification"].get("nuisance_prior_std", {})
+    declared = [kind for kind in dict.fromkeys(map(kind_of, names)) if kind != TEACHING]
     predicts = all("position_rms_um" in run.get("predicted", {}) for run in runs)
     # The model alone lacks the other declared errors, which move the robot: the servo follows an
     # error of the cameras, and an error of a centre of mass changes the torques.
-    declared -= {TEACHING}
     estimated = ""
     if predicts and declared:
-        only_cameras = declared.issubset(OF_CAMERAS)
-        estimated = "the estimated errors of the cameras" if only_cameras else COMMON_ERRORS
+        words = [KINDS.get(kind, kind) for kind in declared]
+        if set(declared) <= set(OF_CAMERAS):
+            words = ["the cameras"]
+        listed = " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+        estimated = f"the estimated errors of {listed}"
     rows = [rms_row(run["predicted"] if estimated else run["true"]) for run in runs]
     return Unseen(np.array(rows), np.array([predicted_row(run) for run in runs]), estimated)
 

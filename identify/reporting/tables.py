@@ -18,9 +18,10 @@ from identify.progress import print_advice, print_table
 from identify.record.stored_common_errors import kind_of
 from identify.reporting import paper
 from identify.reporting.goal_causes import advices
-from identify.reporting.goals import check_goals, explanation_goals, unseen
+from identify.reporting.goals import KINDS, check_goals, explanation_goals, unseen
 from identify.reporting.number_format import number, significant, with_deviation
 from identify.reporting.settings import changed_settings, settings_set_anew
+from identify.reporting.verdict import intervals_sentence
 
 AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
@@ -138,17 +139,6 @@ def common_error_table(result: dict[str, Any]) -> Table:
     )
     header = ("error", "prior standard deviation", "estimate ± standard deviation")
     return Table("Errors common to all frames", header, rows, note, folded=True)
-
-
-# Words for kinds of common errors whose names need an explanation.
-KINDS = {
-    "rig": "cameras",
-    "teaching": "taught frames",
-    "exposure": "delay between exposures",
-    "centres": "centres of mass",
-    "products": "products of inertia",
-    "passive_friction": "friction of passive joints",
-}
 
 
 # What names of common errors of a kind do not say.
@@ -375,8 +365,9 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """Print the goals of a run with their values, the common scale, and the path of the report.
+    """Print the goals of a run with their values, and the path of the report.
 
+    The common scale, and how many intervals contain the truth, are between them.
     Missed goals follow with their likeliest causes and the command to type next.
     """
     table = goals_table(result)
@@ -384,8 +375,10 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
     print_table(
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note
     )
-    if said := common_scale_sentence(result.get("identification") or {}):
-        typer.echo(said)
+    identification = result.get("identification") or {}
+    for said in (common_scale_sentence(identification), intervals_sentence(identification)):
+        if said:
+            typer.echo(said)
     for goal in goals:
         if goal.passed and goal.widened:
             typer.echo(f"{goal.name}: {goal.widened}")

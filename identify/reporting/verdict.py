@@ -6,6 +6,7 @@ and the errors of the cameras must agree with their stated noise and be independ
 frame.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,14 +97,16 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
         for goal in missed
         if goal.name not in (goals.RESIDUALS, goals.CHANCE)
     ]
+    if said := intervals_sentence(result["identification"]):
+        sentences.append(said)
     # Without validation runs, the truth is not known, and only the residuals can be judged.
     if not unseen:
         headline = EXPLAINED if explained else _disagreement(None, result)
         return Verdict(explained, headline, (*sentences, NO_TRUTH))
     if not missed:
         estimated = goals.unseen(result).estimated
-        words = f"With {estimated}, the" if estimated else "The"
-        headline = f"{words} identified model moves as the true robot does."
+        once = f", once {estimated} are added to it" if estimated else ""
+        headline = f"The identified model moves as the true robot does{once}."
         return Verdict(True, headline, tuple(sentences))
     if not explained:
         return Verdict(False, _disagreement(consistent, result), tuple(sentences))
@@ -125,6 +128,37 @@ def sentence(goal: goals.Goal) -> str:
     limit = f"{relation} {number(goal.limit)} {goal.unit}".strip()
     value = f"{number(goal.value)} {goal.unit}".strip()
     return f"{goal.name} {value}, required {limit} ({goal.detail})."
+
+
+def intervals_sentence(identification: Mapping[str, Any]) -> str:
+    """Say how many intervals of identified parameters contain the truth, or return "".
+
+    Intervals that miss it can share one cause, the error of the common scale.
+    """
+    judged = {
+        name: entry
+        for name, entry in identification["parameters"].items()
+        if entry["identifiable"] and entry["true"] is not None
+    }
+    missed = [
+        name
+        for name, entry in judged.items()
+        if not entry["interval"][0] <= entry["true"] <= entry["interval"][1]
+    ]
+    if not judged:
+        return ""
+    if not missed:
+        every = f"{len(judged)} of {len(judged)}"
+        return f"All intervals of identified parameters contain the truth, {every}."
+    scale = identification.get("common_scale") or {"gain": None, "shared": {}}
+    alike = sum(name == scale["gain"] or name in scale["shared"] for name in missed)
+    said = (
+        f"{len(judged) - len(missed)} of the {len(judged)} intervals of identified parameters "
+        "contain the truth"
+    )
+    if alike < 2:
+        return f"{said}."
+    return f"{said}; {alike} of the {len(missed)} others share the error of the common scale."
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:

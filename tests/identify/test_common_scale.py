@@ -7,6 +7,7 @@ from identify.estimation.common_scale import deviations, found_errors
 from identify.estimation.identifiability import scale_warnings
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.reporting.tables import common_scale_sentence
+from identify.reporting.verdict import intervals_sentence
 
 
 def test_the_scatter_of_ratios_to_a_gain_is_what_is_left_without_the_scale():
@@ -40,6 +41,31 @@ def test_one_sentence_tells_the_error_that_all_share_from_what_is_left():
     said = common_scale_sentence({"parameters": unknown, "common_scale": SCALE})
     assert "without it have standard deviations of at most 0.4 %" in said
     assert common_scale_sentence({"parameters": ENTRIES, "common_scale": None}) == ""
+
+
+def test_intervals_that_miss_the_truth_are_counted_with_those_that_share_the_scale():
+    intervals = {
+        "joint_pid.lp": [9.0, 9.5],
+        "joint1.coulomb": [0.091, 0.092],
+        "platform.mass": [13.19, 13.21],
+    }
+    entries = {name: one | {"interval": intervals[name]} for name, one in ENTRIES.items()}
+    found = {"parameters": entries, "common_scale": SCALE}
+    assert intervals_sentence(found) == (
+        "1 of the 3 intervals of identified parameters contain the truth; 2 of the 2 others share "
+        "the error of the common scale."
+    )
+    alone = found | {"common_scale": None}
+    assert intervals_sentence(alone).endswith(
+        "3 intervals of identified parameters contain the truth."
+    )
+    mass = {"parameters": {"platform.mass": entries["platform.mass"]}}
+    assert (
+        intervals_sentence(mass)
+        == "All intervals of identified parameters contain the truth, 1 of 1."
+    )
+    unknown = {name: entry | {"true": None} for name, entry in entries.items()}
+    assert intervals_sentence({"parameters": unknown}) == ""
 
 
 def test_a_scale_that_is_badly_known_is_warned_of_whatever_makes_it_so():

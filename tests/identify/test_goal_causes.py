@@ -215,7 +215,10 @@ def test_the_declared_effect_of_cameras_that_are_known_only_so_well_is_no_missed
     assert advised(result) == []
     said = verdict(result, None)
     assert said.good
-    assert said.headline.startswith("With the estimated errors of the cameras, the identified")
+    assert said.headline == (
+        "The identified model moves as the true robot does, once the estimated errors of the "
+        "cameras are added to it."
+    )
     # A shift beyond what is declared is missed still.
     result["sensor"].update(position_rms_um=[1201.0, 54.0, 152.0])
     result["validation"][1]["predicted"].update(position_rms_um=[4.3, 1.2, 0.9])
@@ -243,4 +246,6 @@ def test_a_model_without_the_centres_that_were_estimated_beside_it_is_not_judged
     goal = check_goals(result)[0]
     assert goal.passed
     assert goal.value == 0.9
-    assert "with the estimated errors that all frames share" in goal.detail
+    assert (
+        "with the estimated errors of centres of mass and friction of passive joints" in goal.detail
+    )
