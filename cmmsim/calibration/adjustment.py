@@ -24,7 +24,7 @@ from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
 from cmmsim.calibration.sightings import Sightings
 from cmmsim.errors import CalibrationError, UnknownOptionError
 from cmmsim.geometry.camera import INTRINSIC_NAMES
-from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
+from cmmsim.geometry.pose import Array, apply, point_jacobian, rotation_exp, skew
 
 # Free distortion terms of each model of distortion, by its name.
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
@@ -327,9 +327,7 @@ def _predict(
     left_from_board = state.left_from_boards[seen.view]
     turned = np.einsum("mij,mj->mi", left_from_board[:, :3, :3], points[seen.point])
     camera_points = turned + left_from_board[:, :3, 3]
-    point_by_board = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(camera_points), 3, 3)), -skew(turned)], axis=2
-    )
+    point_by_board = point_jacobian(turned)
     if side == 1:
         rotation = state.right_from_left[:3, :3]
         turned = camera_points @ rotation.T

@@ -185,6 +185,14 @@ def skew(vectors: Array) -> Array:
     return result
 
 
+def point_jacobian(arms: Array) -> Array:
+    """Return the derivatives (..., 3, 6) of points for a small error [dt, dphi] of their transform.
+
+    ``arms`` (..., 3) lead from the transform's origin to the points, in output axes.
+    """
+    return np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -skew(arms)], axis=-1)
+
+
 def rotation_exp(vector: Array) -> Array:
     """Return the rotation (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
     angle = float(np.linalg.norm(vector))
@@ -208,6 +216,16 @@ def rotation_log(rotation: Array) -> Array:
     cosine = 0.5 * (np.trace(rotation) - 1.0)
     # for a tiny angle, the rotation vector equals ``axis`` to first order
     return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)
+
+
+def small_movement(moved: Array, transform: Array) -> Array:
+    """Return the small movement [dt, dphi] (6,) that turns a transform (4, 4) into ``moved``.
+
+    A point p in the output frame moves by dt + dphi x p. Unlike a small error, the movement thus
+    turns the transform about the origin of the output frame.
+    """
+    rotation = moved[:3, :3] @ transform[:3, :3].T
+    return np.concatenate([moved[:3, 3] - rotation @ transform[:3, 3], rotation_log(rotation)])
 
 
 def euler_rates_matrix(pose: Array) -> Array:

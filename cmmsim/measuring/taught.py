@@ -38,7 +38,7 @@ class Taught:
     base_from_camera : ndarray, shape (4, 4)
         Transform from the camera frame to the base frame.
     base_covariance : ndarray, shape (6, 6)
-        Covariance of the small error [dt, dphi] of ``base_from_camera``.
+        Covariance of the small error [dt, dphi] of the base frame, in base axes.
     platform_places, place_covariances : ndarray, shapes (n, 3) and (n, 3, 3)
         Places of the platform's stickers in platform axes, m, and their covariances.
     platform_covariance : ndarray, shape (6, 6)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import LostError
 from cmmsim.geometry.disc_image import centre_offset, sticker_outlines
-from cmmsim.geometry.pose import Array, rotation_exp, skew
+from cmmsim.geometry.pose import Array, point_jacobian, rotation_exp
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 
 # The adjustment fails after this many steps. Three are usual.
@@ -34,7 +34,7 @@ RIG = len(PARAMETER_NAMES)  # number of parameters of a rig
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of stickers, m of them, each in both images of a pair.
+    """All m observations of stickers, each in both images of a pair.
 
     pair         (m,), index of the pair
     sticker      (m,), index of the sticker; those of the base precede those of the platform
@@ -248,10 +248,7 @@ def _rows(
     turns = np.where(moves, state.poses[seen.pair, :3, :3], np.eye(3))
     arms = points - state.poses[seen.pair, :3, 3]
     by_places = whiten @ by_points @ turns
-    shifts = np.broadcast_to(np.eye(3), turns.shape)
-    by_poses = (
-        whiten @ by_points @ np.where(moves, np.concatenate([shifts, -skew(arms)], axis=2), 0.0)
-    )
+    by_poses = whiten @ by_points @ np.where(moves, point_jacobian(arms), 0.0)
     by_rig = whiten @ by_rig[..., free]
     residuals = (whiten @ state.residuals(seen)[..., None])[..., 0]
     count = 3 * len(state.places)
@@ -275,8 +272,7 @@ def _rows(
 def _gauge(seen: Observations, state: BundleState, size: int) -> Array:
     """Return six orthonormal columns (size, 6) that span the common movements of the platform."""
     places = state.places[seen.base :]
-    arms = places - places.mean(axis=0)
-    shifts = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], axis=2)
+    movements = point_jacobian(places - places.mean(axis=0)).reshape(-1, POSE)
     gauge = np.zeros((size, POSE))
-    gauge[3 * seen.base : 3 * len(state.places)] = np.linalg.qr(shifts.reshape(-1, POSE))[0]
+    gauge[3 * seen.base : 3 * len(state.places)] = np.linalg.qr(movements)[0]
     return gauge

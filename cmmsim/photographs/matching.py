@@ -212,7 +212,7 @@ def moving(pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: 
     """
     # False candidates share spots with true ones, and would make the search long.
     clear = [own[one.alone[own]] for one, own in zip(pairs, free, strict=True)]
-    best = np.zeros(len(pairs), dtype=bool)
+    found_in = np.zeros(len(pairs), dtype=bool)
     model = np.zeros((0, 3))
     moves = np.zeros((0, 4, 4))
     # The two images of a pair may not belong together, so some pairs are tried as the reference.
@@ -223,15 +223,15 @@ def moving(pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: 
         except LostError as error:
             failure = error
             continue
-        if seen.sum() > best.sum():
-            model, moves, best = shape, shape_moves, seen
-        if best.sum() > 0.5 * len(pairs):
+        if seen.sum() > found_in.sum():
+            model, moves, found_in = shape, shape_moves, seen
+        if found_in.sum() > 0.5 * len(pairs):
             break
-    if not best.any():
+    if not found_in.any():
         raise failure
-    model = _extended(model, pairs, free, moves, best)
+    model = _extended(model, pairs, free, moves, found_in)
     members = np.full((len(model), len(pairs)), NONE)
-    for k in np.flatnonzero(best).tolist():
+    for k in np.flatnonzero(found_in).tolist():
         distances, nearest = cKDTree(apply(moves[k], model)).query(
             pairs[k].points[free[k]], distance_upper_bound=2.0 * TAUGHT_TOLERANCE
         )
@@ -239,7 +239,7 @@ def moving(pairs: Sequence[Candidates], free: Sequence[NDArray[np.int_]], name: 
         order = order[np.isfinite(distances[order])]
         members[nearest[order], k] = free[k][order]
     often = np.sum(members != NONE, axis=1) >= 2
-    return Moving(members[often], model[often], moves, best)
+    return Moving(members[often], model[often], moves, found_in)
 
 
 def _searched(

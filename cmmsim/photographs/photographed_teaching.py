@@ -179,7 +179,7 @@ def _taught(
     name: str,
     known: KnownRig | None,
 ) -> PhotographedTeaching:
-    """Match and adjust the stickers, and fit the planes of the frames.
+    """Match and adjust the stickers of ``whole`` (base, platform), and fit the frames' planes.
 
     Raises LostError if a body is not found, if a plane has too few stickers, if fewer than two
     pairs agree, or if an adjustment does not converge.
@@ -239,7 +239,7 @@ def doubts(
     lost: dict[str, str],
     observer: Observer,
 ) -> list[str]:
-    """Return warnings about doubtful results, one line each."""
+    """Return warnings: of pairs ``missing``, of stickers ``lost``, and of doubtful results."""
     lines = [f"not used: {one}: {reason}" for one, reason in (missing | lost).items()]
     if judged.bundle.factor > LARGEST_FACTOR:
         lines.append(

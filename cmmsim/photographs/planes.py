@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody
 from cmmsim.geometry.plane_frame import FEWEST_STICKERS, PLANE_NAMES
-from cmmsim.geometry.pose import Array, apply_each, invert, rotation_log, skew
+from cmmsim.geometry.pose import Array, apply_each, invert, point_jacobian, small_movement
 from cmmsim.geometry.registration import register
 from cmmsim.measuring.pose_estimator import frames_by_planes
 from cmmsim.measuring.taught import Taught
@@ -33,7 +33,7 @@ class TaughtFrames:
     base_from_camera  (4, 4)
     base_places       (k, 3), positions of the base's stickers in base axes, m
     places            (n, 3), positions of the platform's stickers in platform axes, m
-    covariance        (N, N) with N = 6 + 3 n + 24, of the small error of base_from_camera, of
+    covariance        (N, N) with N = 6 + 3 n + 24, of the small movement of base_from_camera, of
                       ``places``, and of the parameters of the rig
     base_ids          (k,), names of the base's stickers
     platform_ids      (n,), names of the platform's stickers
@@ -114,7 +114,7 @@ def taught_frames(
     slopes = np.zeros((POSE + platform_points.size + RIG, count + RIG))
     more, less = (invert(of_base(base_points, one)) for one in _moved(base_points))
     slopes[:POSE, :split] = np.array(
-        [_small_error(a, b) / (2.0 * STEP) for a, b in zip(more, less, strict=True)]
+        [small_movement(a, b) / (2.0 * STEP) for a, b in zip(more, less, strict=True)]
     ).T
     more, less = (
         apply_each(invert(of_platform(platform_points, one)), one).reshape(platform_points.size, -1)
@@ -135,7 +135,7 @@ def taught_frames(
 
 
 def _moved(points: Array) -> tuple[Array, Array]:
-    """Return the points (3 n, n, 3) with one coordinate after the other enlarged, and reduced."""
+    """Return the points (3 n, n, 3) with each coordinate in turn moved by STEP, and by -STEP."""
     steps = STEP * np.eye(points.size).reshape(-1, *points.shape)
     return points + steps, points - steps
 
@@ -171,13 +171,7 @@ def _effect(bundle: Bundle, seen: Observations, places: Array, turn: Array) -> A
     )
     weights = np.zeros((len(places), 3, 3))
     np.add.at(weights, own.sticker - own.base, each)
-    rows = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(places)], axis=2)
+    rows = point_jacobian(places)
     weighted = rows.swapaxes(1, 2) @ weights
     effect = np.linalg.solve((weighted @ rows).sum(axis=0), np.concatenate(list(weighted), axis=1))
     return np.asarray(effect)
-
-
-def _small_error(moved: Array, other: Array) -> Array:
-    """Return the small movement [dt, dphi] (6,) that turns transform ``other`` into ``moved``."""
-    rotation = moved[:3, :3] @ other[:3, :3].T
-    return np.concatenate([moved[:3, 3] - rotation @ other[:3, 3], rotation_log(rotation)])

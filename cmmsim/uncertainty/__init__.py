@@ -1,1 +1,1 @@
-"""Common errors of all poses, due to the known rig, teaching and drift, and drift detection."""
+"""Common errors of all poses, due to the known rig, teaching and print, and drift detection."""

@@ -1,4 +1,4 @@
-"""Errors that all poses of a run have in common, due to cameras, taught frames and exposure.
+"""Errors that all poses of a run have in common, due to cameras, teaching, print and exposure.
 
 The noise of a measured pose is new in every frame. Other errors are constant during a run, because
 they come from parameters that the estimator assumes to be exact: the rig (24 numbers), the taught
@@ -30,10 +30,11 @@ from cmmsim.geometry.pose import (
     apply_each,
     euler_rates_matrix,
     invert,
+    point_jacobian,
     pose_jacobian,
     pose_to_transform,
-    rotation_log,
     skew,
+    small_movement,
     transforms_of,
 )
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
@@ -45,8 +46,9 @@ from cmmsim.measuring.taught import Taught
 from cmmsim.teaching import teaching_path
 from cmmsim.uncertainty.print_errors import PRINT_NAMES, PrintErrors
 
-# Names of all common errors. Errors of the rig are true minus known parameters. Errors of taught
-# frames are small movements from the true to the taught frame, in the axes of base and platform.
+# Names of all common errors. Errors of the rig are true minus known parameters. Those of the taught
+# base are the small movement from the true to the taught base_from_camera, in base axes. Those of
+# the taught platform are the small movement from its true to its taught frame, in platform axes.
 NAMES = (
     *PARAMETER_NAMES,
     *(f"taught.{body}.{name}" for body in ("base", "platform") for name in PLACE_NAMES),
@@ -87,7 +89,7 @@ class CommonErrors:
 class MeasuringGeometry:
     """Geometry as an estimator knows it.
 
-    ``home`` (6,) is the platform's pose at teaching. ``print`` is None if the print is perfect.
+    ``home`` (6,) is the platform's pose at teaching. ``print`` is None if it knows no print errors.
     """
 
     rig: StereoRig
@@ -161,7 +163,7 @@ class MeasuringGeometry:
     def taught_by_rig(self) -> tuple[Array, Array]:
         """Errors of teaching per unit of the errors of the rig's parameters.
 
-        The first result (6, 24) contains small errors of the taught base_from_camera. The second
+        The first result (6, 24) contains small movements of the taught base_from_camera. The second
         result (24, n, 3) contains errors of the taught positions of the platform's stickers.
         """
         if self.taught.by_rig is not None:
@@ -173,7 +175,9 @@ class MeasuringGeometry:
         )
         twice = 2.0 * np.diag(STEPS)
         errors = (
-            np.stack([_small_error(more, less) for more, less in zip(*frames, strict=True)], axis=1)
+            np.stack(
+                [small_movement(more, less) for more, less in zip(*frames, strict=True)], axis=1
+            )
             / twice
         )
         return errors, (places[0] - places[1]) / twice[:, None, None]
@@ -213,7 +217,7 @@ class MeasuringGeometry:
         )
         moved = np.moveaxis(np.concatenate([0.5 * shifts, -0.5 * shifts], axis=-1), -1, 1)
         frames, places = self._taught_from(self.rig.project(points)[0][:, None] + moved, points)
-        errors = [_small_error(frames[k], frames[2 + k]) for k in range(2)]
+        errors = [small_movement(frames[k], frames[2 + k]) for k in range(2)]
         return np.stack(errors, axis=1), places[:2] - places[2:]
 
     @property
@@ -273,7 +277,7 @@ class MeasuringGeometry:
 
 @dataclass(frozen=True)
 class _View:
-    """Stickers that are seen at the N poses of a run.
+    """Stickers at the N poses of a run. They are those that both cameras see at home.
 
     frames  (N, 4, 4), base_from_platform
     seen    (n,), indices of the stickers
@@ -291,9 +295,9 @@ class _View:
 
     @property
     def levers(self) -> Array:
-        """Matrices (N, 6, 6) that map errors of base_from_camera to errors of base_from_platform.
+        """Matrices (N, 6, 6) that map small movements of base_from_camera to pose errors.
 
-        Both errors are in base axes.
+        The latter are small errors of base_from_platform. Both are in base axes.
         """
         levers = np.tile(np.eye(6), (len(self.frames), 1, 1))
         levers[:, :3, 3:] = -skew(self.frames[:, :3, 3])
@@ -328,7 +332,7 @@ class _View:
         return self._registered((self._by_movement.swapaxes(2, 3) @ of_each).sum(axis=0))
 
     def by_places(self, places: Array) -> Array:
-        """Return the small movements (N, 6, p) of base_from_platform that fit changes of stickers.
+        """Return the small errors (N, 6, p) of base_from_platform that fit changes of stickers.
 
         ``places`` (p, n, 3) are the changes of the taught positions of all stickers.
         """
@@ -342,11 +346,11 @@ class _View:
         return self._registered((rows @ columns).reshape(count, 6, -1))
 
     def _registered(self, pulls: Array) -> Array:
-        """Return the movements (N, 6, p), in base axes, for right-hand sides in camera axes."""
-        movement = np.linalg.solve(self._normal, pulls)
+        """Return small errors (N, 6, p), in base axes, for right-hand sides in camera axes."""
+        errors = np.linalg.solve(self._normal, pulls)
         base_from_camera = self.camera_from_base[:3, :3].T
         return np.concatenate(
-            [base_from_camera @ movement[:, :3], base_from_camera @ movement[:, 3:]], axis=1
+            [base_from_camera @ errors[:, :3], base_from_camera @ errors[:, 3:]], axis=1
         )
 
     @cached_property
@@ -355,9 +359,7 @@ class _View:
 
         The movements are in camera axes, and turn the platform about its origin.
         """
-        eyes = np.broadcast_to(np.eye(3), (*self.arms.shape[:2], 3, 3))
-        rows = np.concatenate([eyes, -skew(self.arms)], axis=3)
-        return (self.slopes @ rows).reshape(2, len(self.arms), -1, 6)
+        return (self.slopes @ point_jacobian(self.arms)).reshape(2, len(self.arms), -1, 6)
 
     @cached_property
     def _normal(self) -> Array:
@@ -387,12 +389,3 @@ def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
         normals = geometry.platform.sticker_normals @ placed[:3, :3].T
         seen.append(faces_camera(apply(placed, geometry.taught.platform_places), normals))
     return np.flatnonzero(np.all(seen, axis=0))
-
-
-def _small_error(moved: Array, other: Array) -> Array:
-    """Return the small movement [dt, dphi] (6,) from transform ``other`` to ``moved``.
-
-    A point p of the output frame moves by dt + dphi x p.
-    """
-    rotation = moved[:3, :3] @ other[:3, :3].T
-    return np.concatenate([moved[:3, 3] - rotation @ other[:3, 3], rotation_log(rotation)])

@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.pose import Array, apply, apply_each, skew, transforms_of
+from cmmsim.geometry.pose import Array, apply, apply_each, point_jacobian, transforms_of
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 from cmmsim.uncertainty.common_errors import MeasuringGeometry
 
@@ -110,7 +110,7 @@ def platform_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> 
     )
     residuals, roots = _whitened(geometry.rig, blocks)
     # orthonormal columns that span the residuals which a change of the pose explains
-    by_pose = np.linalg.qr(_whiten(roots, slopes @ _small_movement(arms)))[0]
+    by_pose = np.linalg.qr(_whiten(roots, slopes @ point_jacobian(arms)))[0]
 
     def without_pose(values: Array) -> Array:
         """Remove the part of values (b, 4k, ...) that a change of the pose explains."""
@@ -139,7 +139,7 @@ def base_rows(geometry: MeasuringGeometry, blocks: Sequence[FrameBlock]) -> Rows
         sticker_slopes.swapaxes(1, 2) @ sticker_slopes,
         sticker_slopes.swapaxes(1, 2) @ sticker_by_rig,
     )
-    by_drift = np.concatenate([by_rig, slopes @ _small_movement(arms)], axis=-1)
+    by_drift = np.concatenate([by_rig, slopes @ point_jacobian(arms)], axis=-1)
     residuals, roots = _whitened(geometry.rig, blocks)
     return Rows(
         residuals,
@@ -187,8 +187,8 @@ def _derivatives(rig: StereoRig, points: Array) -> tuple[Array, Array]:
 def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Array]:
     """Return the means (b, 4k) of observed minus expected pixels over the frames of each block.
 
-    The means are in units of their standard deviations. The second result (b, k) contains the
-    reciprocals of these standard deviations, 1/px.
+    The means are in units of their standard deviations. The second result, ``roots`` (b, k),
+    contains the reciprocals of these standard deviations, 1/px.
     """
     weights = 1.0 / (
         np.array([each for block in blocks for each in block.variances]) + SMALLEST_STD_PX**2
@@ -205,18 +205,10 @@ def _whitened(rig: StereoRig, blocks: Sequence[FrameBlock]) -> tuple[Array, Arra
 def _whiten(roots: Array, slopes: Array) -> Array:
     """Return derivatives (b, 4k, p) of whitened residuals from derivatives of pixels.
 
-    ``slopes`` (2, b, k, 2, p) are the derivatives of pixels.
+    ``slopes`` (2, b, k, 2, p) are the derivatives of pixels, and ``roots`` those of ``_whitened``.
     """
     weighted = (roots[..., None, None] * slopes).swapaxes(0, 1)
     return weighted.reshape(len(roots), 4 * roots.shape[1], -1)
-
-
-def _small_movement(arms: Array) -> Array:
-    """Return derivatives (..., 3, 6) of points for a small movement [dt, dphi] of their body.
-
-    ``arms`` (..., 3) lead from the body's origin to the points.
-    """
-    return np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -skew(arms)], axis=-1)
 
 
 def _offsets(

@@ -103,12 +103,12 @@ class Filter:
         lower, part = _factored(self.precision, self.right)
         return self._constant + 0.5 * float(part @ part) - float(np.log(np.diag(lower)).sum())
 
-    def marginal_information(self, first: int) -> tuple[Array, Array]:
-        """Return marginal information (d, d) and score (d,) of the first d unknowns, d = first."""
-        others = np.linalg.solve(self.precision[first:, first:], self.precision[first:, :first])
+    def marginal_information(self, d: int) -> tuple[Array, Array]:
+        """Return the marginal information (d, d) and score (d,) of the first ``d`` unknowns."""
+        others = np.linalg.solve(self.precision[d:, d:], self.precision[d:, :d])
         return (
-            self.precision[:first, :first] - self.precision[:first, first:] @ others,
-            self.right[:first] - others.T @ self.right[first:],
+            self.precision[:d, :d] - self.precision[:d, d:] @ others,
+            self.right[:d] - others.T @ self.right[d:],
         )
 
 
@@ -188,18 +188,18 @@ class Evidence:
         size = self._size
         drifted = np.delete(np.arange(len(products) - 1), slice(self._size, self._size + RIG))
 
-        def see(one: Filter, columns: slice | NDArray[np.int_]) -> None:
-            one.step(
+        def update(model: Filter, columns: slice | NDArray[np.int_]) -> None:
+            model.step(
                 products[columns][:, columns],
                 products[columns, -1],
                 float(products[-1, -1]),
                 frames,
             )
 
-        see(self._fitting, slice(size + RIG, -1))
-        see(self._wrong, slice(size, -1))
-        for one in self._walking.values():
-            see(one, drifted)
+        update(self._fitting, slice(size + RIG, -1))
+        update(self._wrong, slice(size, -1))
+        for walking in self._walking.values():
+            update(walking, drifted)
 
     @property
     def sensitivity(self) -> Array:
@@ -224,7 +224,7 @@ class Evidence:
 
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
-    """Return information (d, d) and score (d,) about the first d unknowns, without the prior."""
+    """Return information (d, d) and score (d,) of the first d unknowns, without the prior."""
     information, score = filtered.marginal_information(size)
     # without an update, there is no prior to subtract
     if not information.any():

@@ -23,7 +23,7 @@ from cmmsim.uncertainty.known_rig import KnownRig
 CHANCE = 0.01
 # Largest number of frames in a block. The residuals of a block are averaged.
 BLOCK_FRAMES = 6
-# Number of blocks after which they are evaluated. Longer runs therefore need no more memory.
+# Number of blocks that are evaluated together. Longer runs therefore need no more memory.
 BLOCKS_TOGETHER = 64
 # A frame with fewer stickers is not used.
 FEWEST_STICKERS = 4

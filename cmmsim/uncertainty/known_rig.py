@@ -14,7 +14,7 @@ from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
 # Tolerance for rounding errors in a covariance that is scaled to unit variances. Entries may differ
-# by it from symmetry. An eigenvalue may be negative by it times the number of rows.
+# by this from symmetry, and an eigenvalue may be as negative as this times the number of rows.
 ROUNDING = 1e-9
 
 # Covariance (24, 24) of a rig that was calibrated from fifteen photographs of a board. With real
