@@ -86,7 +86,7 @@ def cramer_rao_bound(
         return np.linalg.pinv(fisher, rcond=1e-13, hermitian=True)[:, :2, :2]
 
 
-@lru_cache(maxsize=8)  # of fine grey values, a table takes a second
+@lru_cache(maxsize=8)  # a table of fine grey values takes a second
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
     """Return mean grey values at equal steps, and the information averaged over one grey value.
 

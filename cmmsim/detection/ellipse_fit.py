@@ -172,10 +172,10 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     if count < FEWEST_FOR_A_THREAD or NUMBA_NUM_THREADS == 1:
         fit(slice(0, count))
         return
-    other = threading.Thread(target=fit, args=(slice(count // 2, count),))
-    other.start()
+    second = threading.Thread(target=fit, args=(slice(count // 2, count),))
+    second.start()
     fit(slice(0, count // 2))
-    other.join()
+    second.join()
 
 
 # Largest steps of a fit: centre and shape in px, contrast and ground in grey values of 0 to 255,

@@ -37,7 +37,7 @@ class FitSettings(NamedTuple):
                     is summed, px
     variances       table of noise variances by mean grey value
     first_grey      grey value at which the table begins
-    entries_a_grey  number of table entries per grey value
+    grey_entries    number of table entries per grey value
     black           grey value without light
     """
 
@@ -50,7 +50,7 @@ class FitSettings(NamedTuple):
     smear_step: float
     variances: Array
     first_grey: float
-    entries_a_grey: float
+    grey_entries: float
     black: float
 
 

@@ -31,7 +31,7 @@ def variance_at(mean: float, settings: FitSettings) -> float:
 
     Beyond the ends of the table, it is extrapolated.
     """
-    entry = (mean - settings.first_grey) * settings.entries_a_grey
+    entry = (mean - settings.first_grey) * settings.grey_entries
     k = min(max(int(entry), 0), len(settings.variances) - 2)
     return settings.variances[k] + (entry - k) * (settings.variances[k + 1] - settings.variances[k])
 
@@ -97,7 +97,7 @@ def light_across(
     contrast = parameters[5]
     ground = parameters[6] - settings.black
     mixed = np.zeros((3, EVEN_UNKNOWNS))
-    slope = np.empty(2)
+    by_slope = np.empty(2)
     own_blur = right_blur = 0.0
     end = window.shape[0] - 1
     wide = window.shape[1] - 1
@@ -114,16 +114,16 @@ def light_across(
             share = shares[i, j]
             mean = parameters[6] + contrast * share
             inner = ground + contrast * share
-            slope[0] = inner * x
-            slope[1] = inner * y
+            by_slope[0] = inner * x
+            by_slope[1] = inner * y
             weight = dark if share == 0.0 else bright
             if 0.0 < share < 1.0:
                 weight = 1.0 / variance_at(mean, settings)
                 change = derivatives[i, j]
-                slope[0] -= contrast * variance * change[0]
-                slope[1] -= contrast * variance * change[1]
+                by_slope[0] -= contrast * variance * change[0]
+                by_slope[1] -= contrast * variance * change[1]
                 for k in range(2):
-                    weighted = weight * slope[k] * contrast
+                    weighted = weight * by_slope[k] * contrast
                     for a in range(5):
                         mixed[k, a] += weighted * change[a]
             # The light that a blur brings to a pixel from its neighbours.
@@ -141,14 +141,14 @@ def light_across(
                 if 0.0 < share < 1.0:
                     for a in range(5):
                         mixed[2, a] += weighted * contrast * derivatives[i, j, a]
-            right_x += slope[0] * residual
-            right_y += slope[1] * residual
-            own_xx += weight * slope[0] * slope[0]
-            own_xy += weight * slope[0] * slope[1]
-            own_yy += weight * slope[1] * slope[1]
+            right_x += by_slope[0] * residual
+            right_y += by_slope[1] * residual
+            own_xx += weight * by_slope[0] * by_slope[0]
+            own_xy += weight * by_slope[0] * by_slope[1]
+            own_yy += weight * by_slope[1] * by_slope[1]
             for k in range(2):
-                mixed[k, 5] += weight * slope[k] * share
-                mixed[k, 6] += weight * slope[k]
+                mixed[k, 5] += weight * by_slope[k] * share
+                mixed[k, 6] += weight * by_slope[k]
     taken = mixed.copy()
     for k in range(3):
         solve_factored(lower, taken[k])
@@ -173,8 +173,8 @@ def light_across(
     g_y = spread_xy * right_x + spread_yy * right_y
     light[0] = -taken[0, 0] * g_x - taken[1, 0] * g_y
     light[1] = -taken[0, 1] * g_x - taken[1, 1] * g_y
-    # The shift is -T' g. T is the part of ``taken`` for slope and centre, and g is the slope. With
-    # the covariance S of g, the covariance of the shift is T' S T.
+    # The shift is -T' g. T is the part of ``taken`` for slope and centre, and g the fitted slope of
+    # the light. With the covariance S of g, the covariance of the shift is T' S T.
     for k in range(3):
         a = 0 if k < 2 else 1
         b = 0 if k < 1 else 1

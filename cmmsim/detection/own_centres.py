@@ -23,7 +23,7 @@ NEAR_PX = 1.0
 def likely_fault(windows: Array, corners: Array, centres: Array) -> tuple[str, bool]:
     """Return a text on the likely fault of centres (n, 2), and True if the fault is certain.
 
-    The text is empty if there is no fault. ``windows`` (n, h, h) are grey values with one bright
+    The text is empty if no fault is likely. ``windows`` (n, h, h) are grey values with one bright
     spot each, and ``corners`` (n, 2) the first pixels (x, y) of the windows. Centres are in px of
     the whole image. A constant offset is not certain to be a fault.
     """

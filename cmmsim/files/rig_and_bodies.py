@@ -169,7 +169,7 @@ class MarkedBody:
 def marked_body(name: str, body: Body) -> MarkedBody:
     """Return the body that a section of a sensor file describes.
 
-    Raises SensorFileError for a direction of length zero.
+    Raises SensorFileError for a normal of length zero, and for an ``across`` along the normal.
     """
     planes = [getattr(body.planes, plane) for plane in PLANE_NAMES]
     normals = np.stack([unit(p.normal) for p in planes])

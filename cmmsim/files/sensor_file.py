@@ -160,7 +160,7 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     _refuse_idle_noise(changes or {}, content, source)
     camera = content.get("camera")
     if isinstance(camera, dict) and "grey_noise_percent" in camera:
-        # The schema computes it from the percentage, which a complete file may state alone.
+        # The schema computes dark_noise from the percentage, which a complete file can state alone.
         camera.setdefault("dark_noise", 0.0)
     file = _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
     return with_meshes(file, source)
