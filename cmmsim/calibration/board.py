@@ -1,4 +1,4 @@
-"""Calibration boards: the content of a board file (TOML), and the positions of its points.
+"""Calibration boards: the content of a board file (TOML), and the positions of a board's points.
 
 The board frame has its origin at the first point. Its x axis points from column to column, its y
 axis from row to row, and its z axis away from an observer who looks at the front. All points lie in

@@ -1,11 +1,11 @@
 """Detection of a board in a picture: the visible points and their pixels.
 
-Corners of squares are found by OpenCV, see square_detection. A first search for dots uses a
-single threshold. It succeeds if the threshold separates all dots from the background, and if the
-dots lie on the perspective image of a grid. The four sharpest corners of the dots' convex hull are
-then the corners of the board, and a homography identifies the other dots. If this search fails,
-OpenCV searches for the dots. It tries two dozen thresholds and supports asymmetric grids, but is
-six times as slow.
+Corners of squares are found by OpenCV, see square_detection. A first search for dots at right
+angles uses a single threshold. It succeeds if the threshold separates all dots from the background,
+and if the dots lie on the perspective image of a grid. The four sharpest corners of the dots'
+convex hull are then the corners of the board, and a homography identifies the other dots. If this
+search fails, and for asymmetric grids, OpenCV searches for the dots. It tries two dozen thresholds
+and is six times as slow.
 
 A fit of a bright ellipse to each dot refines its centre. The result is the centre of the dot's
 ellipse in the image, which differs from the image of the dot's centre (see
@@ -46,16 +46,16 @@ FIT_ITERATIONS = 5
 # this part beyond GROUND_FROM dot radii belong to the background.
 WINDOW_REACH = 2.2
 GROUND_FROM = 1.2
-# Standard deviations of blur that are tried, and the largest number of dots that this takes.
+# Standard deviations of blur that are tried, on at most PROBED dots.
 SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)
 PROBED = 12
-# A fit is rejected if its centre is farther than this from the rough centre, in dot radii.
+# A fit is rejected if its centre moved by more than this, in dot radii, and by more than 0.5 px.
 LARGEST_MOVE = 0.3
 # The radius comes from the fits if more than this fraction of them succeed, otherwise from the
 # covered area.
 FEWEST_FITTED = 0.5
-# The area of a dot is measured in its cell, a disc around it. Number of samples along each side of
-# the square that encloses the cell:
+# The area of a dot is measured in its cell, a disc around it. The square that encloses the cell has
+# this number of samples along each side.
 CELL_SIDE = 41
 # The mean of these percentiles of a cell's grey values separates background from dot.
 EXTREME_PERCENTILES = (2.0, 98.0)
@@ -192,7 +192,7 @@ def _refine(
 ) -> tuple[Array, Array]:
     """Return fitted centres (n, 2) px, and ratios (n,) of the fitted to the expected radii.
 
-    Both are NaN for dots whose fit failed. Dots with windows of the same size are fitted together.
+    The dots are expected at ``rough`` centres with ``shapes`` (n, 2, 2). A failed fit gives NaN.
     """
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
     # the window must not contain neighbouring dots

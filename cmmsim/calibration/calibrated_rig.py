@@ -1,4 +1,4 @@
-"""Result of a calibration: its values, as text for TOML and JSON, and the completed sensor file."""
+"""Result of a calibration, as tables of a sensor file, for JSON, and as a completed sensor file."""
 
 import json
 import os

@@ -25,10 +25,10 @@ from cmmsim.radiometry.stereo_images import StereoFrame
 # outer squares fill this margin. A bright rim of width RIM, in spacings, surrounds them.
 MARGIN = 1.0
 RIM = 0.35
-# Picture elements along the side of a square. OpenCV rounds the sides of markers to whole elements.
+# Number of picture elements along the side of a square. OpenCV rounds sides of markers to elements.
 SQUARE = 80
 THICKNESS = 0.008  # m
-# Reflectances.
+# Reflectances of the bright and the dark parts of a board.
 BRIGHT = 0.86
 DARK = 0.06
 # The normal of the front points against the board's z axis.
@@ -44,7 +44,7 @@ GRAZING = 0.35
 # Largest number of poses tried for one pair, and number of poses that are examined together.
 TRIES = 4000
 AT_ONCE = 200
-# Samples per pixel and axis in the images of dots.
+# Number of samples per pixel and axis in the images of dots.
 SUPERSAMPLING = 12
 
 

@@ -71,7 +71,7 @@ def find_charuco(grey: NDArray[np.uint8], board: Board) -> Array | None:
 def _refined(
     grey: NDArray[np.uint8], board: Board, rough: Array, index: Array, outlines: Array
 ) -> Array:
-    """Return refined corners (n, 2) px of a ChArUco board.
+    """Return refined corners (n, 2) px, from ``rough`` ones of the points ``index`` of a board.
 
     OpenCV refines corners in windows so small that they exclude the markers. Here the markers with
     ``outlines`` (m, 4, 2) px are painted over, so that the windows can be as large as those of a

@@ -152,7 +152,7 @@ def _with_agreeing_orders(
     ``from_left`` and ``from_right`` are the poses left_from_board and right_from_board, by the
     pair's index. Return the pairs with the points in this order, the poses right_from_board in this
     order, and right_from_left (4, 4). In a pair that agrees in no order, the reason MISFIT replaces
-    both views. Raises CalibrationError if fewer than FEWEST_VIEWS or less than half of them agree.
+    both views. Raises CalibrationError if fewer than half of the pairs or FEWEST_VIEWS pairs agree.
     """
     orders = board.symmetries
     symmetry_motions = [_symmetry_motion(board, order) for order in orders]

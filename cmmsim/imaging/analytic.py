@@ -88,13 +88,13 @@ def scene_of(drawable: Drawable) -> "Scene":
 
 
 def _joined(parts: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
-    """Join arrays (k, 3), and return the joined array and the index at which each part begins."""
+    """Join s arrays (k, 3), and return the joined array and the s + 1 limits of its parts."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
     return np.ascontiguousarray(np.concatenate([np.zeros((0, 3)), *parts])), starts
 
 
 def _faces(faces: Sequence[tuple[Array, Array]]) -> tuple[Array, Array, NDArray[np.int_]]:
-    """Return normals and offsets of the faces of all solids, and the first index of each solid."""
+    """Return normals and offsets of the faces of all s solids, and the s + 1 limits of solids."""
     normals, starts = _joined([normal for normal, _ in faces])
     return normals, np.concatenate([np.zeros(0), *(offset for _, offset in faces)]), starts
 

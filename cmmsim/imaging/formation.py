@@ -229,7 +229,7 @@ class ImageFormation:
     def _blurred(
         self, side: Side, fine: NDArray[np.float32], size: int, margin: int, sub_pixels: int
     ) -> NDArray[np.float32]:
-        """Return windows (k, size, size), blurred and averaged over pixels.
+        """Return windows (k, size, size) of ``fine`` ones with margins, blurred and averaged.
 
         With defocus, each window has the point spread of the sticker nearest to its middle.
         """
@@ -267,7 +267,7 @@ class ImageFormation:
 
     @cached_property
     def _sticker_bodies(self) -> NDArray[np.int_]:
-        """Body (n,) of each sticker."""
+        """Index (n,) of each sticker's body."""
         stacks = [isinstance(patch, DiscStack) for patch in self.drawable.patches]
         return self.drawable.body_index[stacks]
 

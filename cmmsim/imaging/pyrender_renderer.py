@@ -1,4 +1,4 @@
-"""Rendering of many small windows in one pass.
+"""Renderer ``pyrender``: many small windows are drawn in one pass.
 
 pyrender supplies the OpenGL context, the mesh buffers and the flat shader. The frame buffers have
 one channel only, which draws faster than pyrender's four. One large frame buffer, the atlas, has a

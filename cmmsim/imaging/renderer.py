@@ -23,7 +23,7 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene_bodies import Patch
 
-# m: what is nearer or farther than these planes need not be drawn.
+# m: what has a smaller or a larger depth than these need not be drawn.
 NEAR = 0.2
 FAR = 10.0
 
@@ -219,7 +219,7 @@ class Drawable:
 class DrawWindows(Protocol):
     """Function that draws the radiance (n, h, w) float32, 0 to 1, of n views of one size.
 
-    Row 0 is the top row of a window.
+    Row 0 is the top row of a window. Where no patch is seen, the radiance is ``background``.
     """
 
     def __call__(

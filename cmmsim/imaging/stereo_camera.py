@@ -140,8 +140,7 @@ class VirtualStereoCamera:
 
         For each exposure, the windows have first pixels ``corners`` (2, n, 2) in the left and the
         right image. ``sweeps`` is the result of ``row_sweeps``. The first moments of all exposures
-        are drawn together, then the second ones, and so on. In this way no more memory is needed
-        than without motion.
+        are drawn first, then the second ones, and so on, with no more memory than without motion.
         """
         swept_by = [None] * len(moments) if sweeps is None else sweeps
         light = self._drawn(
@@ -224,7 +223,7 @@ class VirtualStereoCamera:
 
     @cached_property
     def patterns(self) -> Sequence[FixedPattern | None]:
-        """Fixed patterns of the left and of the right camera; None if the pixels do not differ."""
+        """Fixed patterns of the left and of the right camera; None without noise or differences."""
         prnu = self.noise.prnu
         dsnu = self.noise.dsnu
         if not (self.noise.enabled and (prnu > 0.0 or dsnu > 0.0)):
