@@ -66,13 +66,13 @@ class ComparisonTruth:
     side                 Robot and loop that the estimator assumes.
     true (p,)            True parameters.
     combinations (k, p)  Combinations of the dynamic parameters that the record identifies.
-    unseen               Validation runs of the plant.
+    validation           Validation runs of the plant.
     """
 
     side: ModelSide
     true: Array
     combinations: Array
-    unseen: tuple[tuple[xr.Dataset, xr.Dataset], ...]
+    validation: tuple[tuple[xr.Dataset, xr.Dataset], ...]
 
     def group_errors(self, parameters: Array) -> Array:
         """Return the relative errors (k,) of the base parameters that the record identifies."""
@@ -89,7 +89,7 @@ class ComparisonTruth:
         example a gain of zero.
         """
         errors = []
-        for record, truth in self.unseen:
+        for record, truth in self.validation:
             try:
                 poses = model_on_record(self.side, parameters, record)
             except (ParameterError, SimulationError):
@@ -163,13 +163,13 @@ def compare_on_run(
         result = load_result(folder.result)
         side = side.with_drive(settled_drive(result.get("identification")))
     channels = instrumented(record, truth, scenario.timing, instruments, seed)
-    unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
+    validation = zip(files.validation, read_truth_runs(folder.validation), strict=True)
     scores = compare_on_record(
         (record, truth),
         channels,
         side,
         scenario.identification,
-        list(unseen),
+        list(validation),
         estimators,
         progress,
     )
@@ -195,13 +195,13 @@ def compare_on_record(
     channels: xr.Dataset,
     side: ModelSide,
     settings: Identification,
-    unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
+    validation: Sequence[tuple[xr.Dataset, xr.Dataset]],
     estimators: Mapping[str, Estimator],
     progress: Progress,
 ) -> list[Score]:
     """Score estimators on a record with its truth and the channels of its joints.
 
-    `unseen` are the (record, truth) pairs of validation runs, which determine the pose distance.
+    `validation`: (record, truth) pairs of validation runs, which determine the pose distance.
     """
     record, truth = experiment
     known = true_parameters(truth)
@@ -209,21 +209,21 @@ def compare_on_record(
     true = np.array(true_values(known, layout.names))
     problem = output_error_problem([record], side, settings)
     evidence = Evidence(problem, joint_channels(channels, record), true[layout.joint_pid])
-    return compare(evidence, examination(evidence, side, true, unseen), estimators, progress)
+    return compare(evidence, examination(evidence, side, true, validation), estimators, progress)
 
 
 def examination(
     evidence: Evidence,
     side: ModelSide,
     true: Array,
-    unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
+    validation: Sequence[tuple[xr.Dataset, xr.Dataset]],
 ) -> ComparisonTruth:
     """Return the truth of a comparison from true parameters (p,) and (record, truth) pairs.
 
     Raises EstimationError if the record identifies no base parameter, or if there is no validation
     run.
     """
-    if not unseen:
+    if not validation:
         raise EstimationError("there is no validation run by which to judge the estimators")
     robot = side.robot
     base = structure(robot)
@@ -240,7 +240,7 @@ def examination(
         raise EstimationError(
             "the record identifies no base parameter: there is nothing to compare"
         )
-    return ComparisonTruth(side, true, base.combinations[shown], tuple(unseen))
+    return ComparisonTruth(side, true, base.combinations[shown], tuple(validation))
 
 
 def compare(
