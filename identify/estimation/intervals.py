@@ -115,10 +115,11 @@ class BoundedEstimate:
             )
         )
         count = len(self.active_bounds)
+        bounds = "a bound" if count == 1 else f"{count} bounds"
         return (
-            f"the estimate is held at {'a bound' if count == 1 else f'{count} bounds'} that no robot "
-            f"can pass: {said}; without the bound, the estimate would lie beyond it by the number "
-            "of standard deviations in brackets; the intervals allow for this",
+            f"the estimate is held at {bounds} that no robot can pass: {said}; without the bound, "
+            "the estimate would lie beyond it by the number of standard deviations in brackets; "
+            "the intervals allow for this",
         )
 
 
