@@ -24,8 +24,7 @@ class StopCriteria:
     """Criteria of eq. 35 by which a search stops.
 
     cost_tolerance, parameter_tolerance: tol1 and tol2, the relative changes of the cost and of the
-    parameters at or below which a search has converged. max_iterations: largest number of steps
-    that lower the cost.
+    parameters at or below which a search has converged. max_iterations: most steps of a search.
     """
 
     cost_tolerance: float

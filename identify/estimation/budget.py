@@ -105,11 +105,10 @@ class Budget:
     def to_dataframe(self) -> pd.DataFrame:
         """Return the table, with a row for each source of each quantity.
 
-        Of each quantity, the source that adds most comes first, and sources that add nothing are
-        left out. The column `added` is the standard uncertainty that the source adds, and `share`
-        its fraction of the variance. Both are negative in the row of covariances if these make the
-        quantity better known. `combined` and `expanded` are the uncertainties of the quantity from
-        all sources.
+        The source that adds most comes first, and sources that add nothing are left out. The column
+        `added` is the standard uncertainty that the source adds, and `share` its fraction of the
+        variance. Both are negative in the row of covariances if these make the quantity better
+        known. `combined` and `expanded` are the uncertainties of the quantity from all sources.
         """
         import pandas as pd
 

@@ -34,8 +34,7 @@ from identify.scenario.sections import RIG_KNOWN, Rig
 LARGEST_RATIO = 1.5
 # Largest angle [rad] between right cameras, or between baselines, of two such rigs.
 ANGLE = np.deg2rad(10.0)
-# Largest distance between principal points of two such rigs, as a fraction of the image size.
-SHARE = 0.1
+SHARE = 0.1  # largest distance between their principal points, as a fraction of the image size
 
 
 def known_rig(

@@ -124,8 +124,7 @@ class TimedModel(LoopModel):
     def in_deciding_stds(self, change: Array) -> Array:
         """Return a change (k,) of the common errors in posterior standard deviations.
 
-        The parameters count as known. The priors are too wide to say how well the record determines
-        the errors.
+        The parameters count as known. The priors are too wide to tell how certain the errors are.
         """
         if self.marginal is None:
             return change

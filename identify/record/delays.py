@@ -101,8 +101,7 @@ class ServoDelay:
                  latency.
     drift        Growth of the delay, s per s.
     spread       Median of the absolute deviations from the delay with its drift, s.
-    correlation  Correlation of the noise in the commands with that of the poses, in joint
-                 coordinates.
+    correlation  Correlation of the noises of commands and poses, both in joint coordinates.
     resolution   Usual time between two rows of commands, s. If most rows only repeat the command
                  before, a command can have been written up to this time before its first row.
     """

@@ -192,11 +192,10 @@ def _known_in_common(
 ) -> tuple[Array, Array, Array]:
     """Return what is known beforehand about the common errors of a run's poses.
 
-    The errors are a linear function of k independent numbers. With learned errors, the covariance
-    of the errors is known, and otherwise that of the numbers. The first result is the most likely
-    values (k,) of the numbers. The second is the matrix (k, k) from the quantities of known
-    covariance to the numbers. The third is the covariance (p + k, p + k) of the parameters and
-    these quantities.
+    The errors are a linear function of k independent numbers. The covariance of learned errors is
+    known, and otherwise that of the numbers. The first result is the most likely values (k,) of the
+    numbers. The second is the matrix (k, k) from the quantities of known covariance to the numbers.
+    The third is the covariance (p + k, p + k) of the parameters and these quantities.
     """
     names = run.common.all_names
     if names and tuple(learned) == names:
