@@ -180,13 +180,11 @@ class _Atlas:
         reaching = drawable.reaching(views)
         laid = known.solids.painted(views, reaching)
         reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
-        places = [
+        cells = [
             ((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))
         ]
         grounds = known.solids.levels[np.where(laid.ringed < 0, laid.solid, laid.ringed)]
-        self._clear(
-            np.where(laid.filled, grounds, background), places, bool((laid.solid < 0).any())
-        )
+        self._clear(np.where(laid.filled, grounds, background), cells, bool((laid.solid < 0).any()))
         self._program._bind()
         clip_from_bodies = np.ascontiguousarray(views.clip_from_bodies(), dtype=np.float32)
         shown = [np.flatnonzero(row).tolist() for row in reaching]
@@ -194,7 +192,7 @@ class _Atlas:
         address = clip_from_bodies.ctypes.data
         strides = clip_from_bodies.strides
         for k, (place, deep, ringed) in enumerate(
-            zip(places, laid.solid < 0, laid.ringed >= 0, strict=True)
+            zip(cells, laid.solid < 0, laid.ringed >= 0, strict=True)
         ):
             if k and k % per_piece == 0:
                 self._gl.glFlush()
@@ -235,7 +233,7 @@ class _Atlas:
             self._draw_elements(triangles, patches[p].indices, unsigned, patches[p].backwards)
 
     def _clear(
-        self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool
+        self, grounds: NDArray[np.float64], cells: Sequence[tuple[int, ...]], with_depth: bool
     ) -> None:
         """Clear cells (x, y, w, h) to their ``grounds``, and the depth buffer if ``with_depth``."""
         gl = self._gl
@@ -246,7 +244,7 @@ class _Atlas:
         if others:
             gl.glEnable(gl.GL_SCISSOR_TEST)
             for k in others:
-                gl.glScissor(*places[k])
+                gl.glScissor(*cells[k])
                 gl.glClearColor(*[float(grounds[k])] * 3, 1.0)
                 gl.glClear(gl.GL_COLOR_BUFFER_BIT)
             gl.glDisable(gl.GL_SCISSOR_TEST)

@@ -64,18 +64,18 @@ def draw_frames(
     size = min(reach, width), min(reach, height)
     for shown in views.exposures:
         scene = _scene_of(drawable, shown.camera.focal_px * supersampling)
-        places = shown.camera_from_bodies
+        moves = shown.camera_from_bodies
         cells = np.array(
             list(product(shown.windows, range(0, width, size[0]), range(0, height, size[1])))
         )
         low = views.corners[cells[:, 0]] + cells[:, 1:] - 0.5
-        reached = drawable.reaching_windows(shown.camera, places, np.hstack([low, low + size]))
+        reached = drawable.reaching_windows(shown.camera, moves, np.hstack([low, low + size]))
         kept = reached.any(axis=1)
         # OpenCV's pixel coordinates refer to pixel centres, pyrender's to pixel corners.
         centres = supersampling * (shown.camera.centre - low[kept])
         focal_lengths = supersampling * shown.camera.focal_lengths
         drawn = scene.draw(
-            places,
+            moves,
             reached[kept],
             focal_lengths,
             centres,
@@ -262,14 +262,14 @@ def _drawing() -> Any:
                 program.set_uniform("V", np.linalg.inv(pose))
                 program.set_uniform("cam_pos", pose[:3, 3])
                 self._bind_lighting(scene, program, node, RenderFlags.OFFSCREEN)
-                place = scene.get_pose(node)
+                move = scene.get_pose(node)
                 for n, k in enumerate(np.flatnonzero(shown).tolist()):
                     row, column = divmod(k, ATLAS // int(size[0]))
                     GL.glViewport(column * int(size[0]), row * int(size[1]), *size.tolist())
                     program.set_uniform("P", projections[k])
                     if n == 0:
                         self._bind_and_draw_primitive(
-                            primitive, place, program, RenderFlags.OFFSCREEN
+                            primitive, move, program, RenderFlags.OFFSCREEN
                         )
                         primitive._bind()
                         continue
