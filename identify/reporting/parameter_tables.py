@@ -11,11 +11,15 @@ from typing import Any
 from identify.estimation.explanation import MISFIT, Misfit
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, RESTS_ON_PRIOR
 from identify.loop_parameters import is_gain
+from identify.record.stored_common_errors import kind_of
+from identify.reporting.goals import KINDS
 from identify.reporting.number_format import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
 # Remark on an estimate that depends on the initial guess of other parameters.
 ON_GUESS = "rests on the initial guess"
+# Remark on the parameter that the scale anchor measures.
+INPUT = "input"
 
 Entry = dict[str, Any]
 
@@ -27,12 +31,13 @@ def parameter_table(result: dict[str, Any]) -> Table:
     deviation, the interval, the error, and a remark. A column without any entry is left out.
     """
     identification = result["identification"]
+    measured, value = _anchored(identification)
     rows = [
         (
             name,
             p["unit"].replace("^2", "²"),
             *_shown(p, abs(p["initial"] or 0.0)),
-            ON_GUESS if p.get("rests_on_prior") else "",
+            INPUT if name == measured else _remark(p),
         )
         for name, p in identification["parameters"].items()
         if p["identifiable"]
@@ -41,7 +46,9 @@ def parameter_table(result: dict[str, Any]) -> Table:
         "The interval contains the truth in 95 % of such experiments. It excludes values that are "
         "physically impossible. "
     )
-    if any(row[-1] for row in rows):
+    if value:
+        note += f"An {INPUT} was measured beforehand: {measured} as {value}. "
+    if any(row[-1] == ON_GUESS for row in rows):
         note += (
             f"A parameter that {ON_GUESS} is shown by the record only in sums with other "
             "parameters. Its estimate is right if the initial guesses of these are right within "
@@ -69,14 +76,18 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     """
     anchor = identification["scale_anchor"]
     source = ANCHORS.get(anchor, anchor)
-    parameters = identification["parameters"]
-    name = next((one for one in GAINS if one in parameters), GAINS[0])
-    gain = parameters.get(name, {})
-    of_guess = gain.get("prior_share") or 0.0
+    measured, value = _anchored(identification)
+    name = _first_gain(identification)
+    of_guess = identification["parameters"].get(name, {}).get("prior_share") or 0.0
     if not identification.get("drive", {}).get("in_loop", True):
         return "The overall scale is fixed by the commanded torques."
     if anchor == "prior" or of_guess <= RESTS_ON_PRIOR:
-        return f"The overall scale is fixed by {source}."
+        said = f"The overall scale, which poses do not show, is fixed by {source}"
+        if not value:
+            return f"{said}."
+        return (
+            f"{said}: {value}. {measured} is therefore an input, although it counts as identified."
+        )
     return (
         f"The overall scale should be fixed by {source}, but is not: {100 * of_guess:.0f} % of the "
         f"variance of {name} comes from the initial guess, and all values in kg, N m or N are "
@@ -86,6 +97,26 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
 
 # Gain whose variance shows whether the scale is fixed, for shared gains and for gains per joint.
 GAINS = ("joint_pid.lp", "joint1.lp")
+
+
+def _first_gain(identification: Mapping[str, Any]) -> str:
+    return next((one for one in GAINS if one in identification["parameters"]), GAINS[0])
+
+
+def _anchored(identification: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the name of the parameter that the scale anchor measures, and the measured value.
+
+    Both are empty if the anchor measures no parameter.
+    """
+    value = identification.get("scale_anchor_value")
+    names = {"platform_mass": "platform.mass", "joint_gain": _first_gain(identification)}
+    name = names.get(identification["scale_anchor"], "")
+    entry = identification["parameters"].get(name)
+    if value is None or entry is None:
+        return "", ""
+    stated = with_deviation(value, identification["scale_anchor_std"])
+    return name, f"{stated} {entry['unit']}"
+
 
 # Descriptions of the scale anchors.
 ANCHORS = {
@@ -146,6 +177,60 @@ def correlation_table(result: dict[str, Any]) -> Table:
         "errors of friction and gains are therefore strongly correlated.",
         folded=True,
     )
+
+
+def common_error_table(result: dict[str, Any]) -> Table:
+    """Return the errors that all poses of the record have in common.
+
+    Each row has the unit, the prior standard deviation, and the estimate with its standard
+    deviation. There are no rows if the record declares no such errors.
+    """
+    found = result["identification"]
+    rows = []
+    for name, before in found.get("nuisance_prior_std", {}).items():
+        unit, size = FINE.get(name.rpartition("_")[2], ("", 1.0))
+        estimate = size * found["nuisance_estimates"][name], size * found["nuisances"][name]
+        rows.append((name, unit, number(size * before, 2), with_deviation(*estimate)))
+    note = (
+        "True minus known value. Names are those of result.json. Where no unit is stated, the "
+        f"value is in that at the end of its name.{_kinds_noted(found)} A visual "
+        "servo compensates errors of the poses, which the record therefore hardly shows."
+        f"{_shares(found)}"
+    )
+    header = ("error", "unit", "prior standard deviation", "estimate ± standard deviation")
+    table = Table("Errors common to all frames", header, tuple(rows), note, folded=True)
+    return table.without_empty()
+
+
+# Units in which the errors are shown whose names end with a unit, with the size of this unit.
+FINE = {"m": ("µm", 1e6), "rad": ("µrad", 1e6)}
+
+
+# What names of common errors of a kind do not say.
+NOTES = {
+    "geometry": " Geometric errors are in m and rad.",
+    "centres": " Centres of mass are first moments of all bodies of a kind.",
+}
+
+
+def _kinds_noted(found: dict[str, Any]) -> str:
+    """Explain the names of the kinds of common errors that a result has."""
+    kinds = {kind_of(name) for name in found.get("nuisance_prior_std", {})}
+    return "".join(note for kind, note in NOTES.items() if kind in kinds)
+
+
+def _shares(found: dict[str, Any]) -> str:
+    """State which fraction of a parameter's variance each kind of common error causes at most."""
+    identified = [
+        one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
+    ]
+    # Older results have no fractions, or one number for all kinds.
+    parts = [one for one in identified if isinstance(one, dict)]
+    largest = {kind: max(one[kind] for one in parts) for kind in (parts[0] if parts else ())}
+    said = ", ".join(
+        f"{KINDS.get(kind, kind)} {number(100.0 * most, 2)} %" for kind, most in largest.items()
+    )
+    return f" Largest share of the variance of an identified parameter: {said}." if said else ""
 
 
 # Descriptions of the control laws of the drives.

@@ -86,7 +86,7 @@ def sensor_section(data: RunData) -> Section:
             "the distance between the two rays to each sticker."
         )
     # An empty table is omitted.
-    common = [table for table in (tables.common_error_table(data.result),) if table.rows]
+    common = [table for table in (parameter_tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
 

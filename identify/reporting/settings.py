@@ -97,7 +97,7 @@ def _settings(text: str) -> dict[str, _Stated]:
     for line in text.splitlines():
         if line.startswith("["):
             section = line.partition("]")[0].strip("[ ") + "."
-        elif " = " in line:
+        elif " = " in line and not line.startswith("#"):
             key, _, rest = line.partition(" = ")
             # The comment after a value is the description of its setting.
             meaning = rest.rpartition(" # ")[2] if " # " in rest else ""

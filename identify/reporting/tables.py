@@ -15,11 +15,10 @@ import typer
 from identify.estimation.common_scale import ENTRY, found_errors
 from identify.files.run_folder import AXES, actual_row, predicted_row, rms_row
 from identify.progress import print_advice, print_table
-from identify.record.stored_common_errors import kind_of
 from identify.reporting import paper
 from identify.reporting.goal_causes import advices
-from identify.reporting.goals import KINDS, check_goals, explanation_goals, unseen
-from identify.reporting.number_format import number, significant, with_deviation
+from identify.reporting.goals import check_goals, explanation_goals, unseen
+from identify.reporting.number_format import number, significant
 from identify.reporting.settings import changed_settings, settings_set_anew
 from identify.reporting.verdict import intervals_sentence
 
@@ -115,57 +114,6 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
             total = f"{number(sum(stages.values()))} s"
             rows.append((f"time of {', '.join(stages)}", total, "", "", "compiling included"))
     return rows
-
-
-def common_error_table(result: dict[str, Any]) -> Table:
-    """Return the errors that all poses of the record have in common.
-
-    Each row has the prior standard deviation, and the estimate with its standard deviation. There
-    are no rows if the record declares no such errors.
-    """
-    found = result["identification"]
-    rows = tuple(
-        (
-            name,
-            number(before, 2),
-            with_deviation(found["nuisance_estimates"][name], found["nuisances"][name]),
-        )
-        for name, before in found.get("nuisance_prior_std", {}).items()
-    )
-    note = (
-        f"True minus known value, in the unit at the end of the name.{_kinds_noted(found)} A "
-        "visual servo compensates errors of the poses, which the record therefore hardly shows."
-        f"{_shares(found)}"
-    )
-    header = ("error", "prior standard deviation", "estimate ± standard deviation")
-    return Table("Errors common to all frames", header, rows, note, folded=True)
-
-
-# What names of common errors of a kind do not say.
-NOTES = {
-    "geometry": " Geometric errors are in m and rad.",
-    "centres": " Centres of mass are first moments of all bodies of a kind.",
-}
-
-
-def _kinds_noted(found: dict[str, Any]) -> str:
-    """Explain the names of the kinds of common errors that a result has."""
-    kinds = {kind_of(name) for name in found.get("nuisance_prior_std", {})}
-    return "".join(note for kind, note in NOTES.items() if kind in kinds)
-
-
-def _shares(found: dict[str, Any]) -> str:
-    """State which fraction of a parameter's variance each kind of common error causes at most."""
-    identified = [
-        one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
-    ]
-    # Older results have no fractions, or one number for all kinds.
-    parts = [one for one in identified if isinstance(one, dict)]
-    largest = {kind: max(one[kind] for one in parts) for kind in (parts[0] if parts else ())}
-    said = ", ".join(
-        f"{KINDS.get(kind, kind)} {number(100.0 * most, 2)} %" for kind, most in largest.items()
-    )
-    return f" Largest share of the variance of an identified parameter: {said}." if said else ""
 
 
 def excitation_error_table(result: dict[str, Any], repeats_paper: bool = False) -> Table:

@@ -174,7 +174,7 @@ class Plant(_Side):
     )
     command_limits_rad: list[float] | None = Field(
         None,
-        description="lowest and highest command that the drives take, rad, the same for all "
+        description="lowest and highest command that the drives take, rad, equal for all "
         "joints; commands beyond are clipped",
         min_length=2,
         max_length=2,
@@ -333,10 +333,10 @@ class Model(_Side):
         0.0, "1", "standard deviation of static_ratio, estimated beside the parameters", ge=0, le=9
     )
     stribeck_velocity_std_rad_s: float | None = quantity(
-        None, "rad/s", "the same of stribeck_velocity_rad_s", gt=0
+        None, "rad/s", "standard deviation of stribeck_velocity_rad_s", gt=0
     )
     stribeck_velocity_std_m_s: float | None = quantity(
-        None, "m/s", "the same of stribeck_velocity_m_s", gt=0
+        None, "m/s", "standard deviation of stribeck_velocity_m_s", gt=0
     )
     centre_std: float | None = quantity(
         None,
@@ -349,14 +349,16 @@ class Model(_Side):
     product_std: float | None = quantity(
         None,
         "1",
-        "the same of each product of inertia, as a share of the body's mean moment of inertia",
+        "standard deviation of each product of inertia of a centred body, as a share of its mean "
+        "moment of inertia; by default that of the robot file, which is 0 for the built-in robots",
         ge=0,
         le=1,
     )
     passive_viscous_std_N_m_s_rad: float | None = quantity(
         None,
         "N m s/rad",
-        "the same of the viscous friction of passive joints without such a parameter",
+        "standard deviation of the viscous friction of passive joints without such a parameter; by "
+        "default that of the robot file, which is 0 for the built-in robots",
         ge=0,
         le=1e3,
     )

@@ -207,7 +207,11 @@ class Identification(Section):
         "second run",
     )
     anchor_std: float | None = quantity(
-        None, "unit of the anchor", "standard deviation of the anchor", gt=0
+        None,
+        "unit of the anchor",
+        "standard deviation of the anchor; if none is given, a simulated experiment has that of an "
+        "ordinary instrument: 0.005 kg, 0.01 N m/rad or 5 N/m",
+        gt=0,
     )
     start_std: float = quantity(
         1.0,

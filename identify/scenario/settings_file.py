@@ -114,10 +114,10 @@ def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
 def to_toml(model: BaseModel) -> str:
     """Return the TOML text of a two-level pydantic model, with units as comments.
 
-    Plain values come first, and then a table for each section. Fields with the value None have no
-    TOML form and are omitted.
+    Plain values come first, and then a table for each section. A field with the value None has no
+    TOML form. Its line is a comment with no value, which says what then holds.
     """
-    return _text(model, lambda owner, name: None if getattr(owner, name) is None else "")
+    return _text(model, lambda owner, name: "# " if getattr(owner, name) is None else "")
 
 
 def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
@@ -131,25 +131,20 @@ def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
 
 def _text(
     model: BaseModel,
-    before: Callable[[BaseModel, str], str | None],
+    before: Callable[[BaseModel, str], str],
     only: Collection[str] | None = None,
 ) -> str:
-    """Return TOML text. ``before`` returns the prefix of a field's entry, or None for no entry."""
+    """Return TOML text. ``before`` returns the prefix of a field's entry."""
 
     def entries(section: BaseModel) -> list[str]:
         fields = type(section).model_fields.items()
-        return [
-            f"{mark}{_entry(n, getattr(section, n), f)}"
-            for n, f in fields
-            if (mark := before(section, n)) is not None
-        ]
+        return [f"{before(section, n)}{_entry(n, getattr(section, n), f)}" for n, f in fields]
 
     lines = []
     sections = []
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
-        mark = before(model, name)
-        if mark is None or (only is not None and name not in only):
+        if only is not None and name not in only:
             continue
         if isinstance(value, BaseModel):
             sections += ["", f"[{name}]", *entries(value)]
@@ -157,7 +152,7 @@ def _text(
             listed = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
             sections += ["", f"[{name}]  # {field.description or ''}", *listed]
         else:
-            lines.append(f"{mark}{_entry(name, value, field)}")
+            lines.append(f"{before(model, name)}{_entry(name, value, field)}")
     return "\n".join(lines + sections) + "\n"
 
 

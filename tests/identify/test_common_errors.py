@@ -28,7 +28,7 @@ from identify.record.stored_common_errors import (
     read_common_errors,
     store_common_errors,
 )
-from identify.reporting.tables import common_error_table
+from identify.reporting.parameter_tables import common_error_table
 from identify.validation.pose_prediction import predicted_runs
 from identify.validation.unseen import model_run
 from tests.identify.synthetic import (

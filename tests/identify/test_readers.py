@@ -387,7 +387,9 @@ def test_orders_of_angles_that_a_small_motion_cannot_tell_are_named(record, tmp_
 def test_commands_in_a_wrong_unit_do_not_put_the_convention_in_doubt(record, tmp_path):
     path = as_table(tmp_path, record)
     change(path.with_suffix(".toml"), 'unit = "rad"', 'unit = "deg"')
-    with pytest.raises(RecordError, match=r'with unit = "rad" in .columns.command. they would fit$'):
+    with pytest.raises(
+        RecordError, match=r'with unit = "rad" in .columns.command. they would fit$'
+    ):
         read_own_records([path])
 
 

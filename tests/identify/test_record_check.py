@@ -179,7 +179,10 @@ def test_a_log_is_checked_by_its_description_and_a_robot_is_told_from_it(
     out, err = capfd.readouterr()
     found = {one["check"]: one for one in json.loads(out)["findings"]}
     assert not found["units and frames"]["ok"]
-    assert 'with axes = ["x", "-z", "y"] in [columns.measured] it would fit' in found["units and frames"]["text"]
+    assert (
+        'with axes = ["x", "-z", "y"] in [columns.measured] it would fit'
+        in found["units and frames"]["text"]
+    )
     assert "findings about take.csv fail: " in one_line(err)
     assert command("check", "take.csv", "--scenario", "quick") == MISUSED
     assert command("check", "rss6", "--page", "x.html") == MISUSED

@@ -568,10 +568,19 @@ def test_numbers_have_the_digits_that_they_deserve_and_what_is_rounding_is_zero(
 
 def test_the_report_says_what_fixes_the_scale_or_that_its_anchor_does_not(result):
     found = result["identification"]
-    assert (
-        parameter_tables.scale_sentence(found)
-        == "The overall scale is fixed by the weighed mass of the platform."
+    fixed = (
+        "The overall scale, which poses do not show, is fixed by the weighed mass of the platform"
     )
+    assert parameter_tables.scale_sentence(found) == f"{fixed}."
+    assert not any(row[-1] == "input" for row in parameter_tables.parameter_table(result).rows)
+    found |= {"scale_anchor_value": 23.51, "scale_anchor_std": 0.005}
+    weighed = {"unit": "kg", "initial": 24.0, "true": 23.5, "identifiable": True}
+    found["parameters"]["platform.mass"] = weighed | {"estimate": 23.51, "std": 0.005}
+    said = parameter_tables.scale_sentence(found)
+    assert said.startswith(f"{fixed}: 23.5100 ± 0.0050 kg. platform.mass is therefore an input")
+    table = parameter_tables.parameter_table(result)
+    assert [row[0] for row in table.rows if row[-1] == "input"] == ["platform.mass"]
+    assert table.note.endswith("measured beforehand: platform.mass as 23.5100 ± 0.0050 kg. ")
     found["parameters"]["joint_pid.lp"]["prior_share"] = 0.61
     assert "but is not: 61 % of the variance" in parameter_tables.scale_sentence(found)
     found["scale_anchor"] = "prior"
@@ -819,12 +828,18 @@ def test_the_page_says_how_many_quantities_a_motion_shows_and_why_noise_gives_mo
     assert not any("more than 1" in goal.detail for goal in check_goals(result))
 
 
-def test_the_note_on_common_errors_explains_only_the_kinds_that_are_there(result):
+def test_common_errors_are_in_small_units_and_the_note_explains_only_the_kinds_that_are_there(
+    result,
+):
     found = result["identification"]
     for name, centres in (("taught.base.tx_m", False), ("centres.link.mx_kg m", True)):
         for key in ("nuisances", "nuisance_estimates", "nuisance_prior_std"):
             found[key] = {name: 1e-6}
-        assert ("Centres of mass" in tables.common_error_table(result).note) == centres
+        table = parameter_tables.common_error_table(result)
+        assert ("Centres of mass" in table.note) == centres
+        unit = () if centres else ("µm",)
+        size = "1 × 10⁻⁶" if centres else "1"
+        assert table.rows[0][: len(unit) + 2] == (name, *unit, size)
 
 
 def test_a_sum_that_vanishes_but_for_rounding_starts_at_zero(result):

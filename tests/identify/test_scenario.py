@@ -13,6 +13,7 @@ from dynamics import load_robot
 from identify import pipeline
 from identify.errors import ScenarioError
 from identify.estimation.identification import identify
+from identify.estimation.scale_anchor import DEFAULT_STD
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read
@@ -22,6 +23,7 @@ from identify.reporting.run_result import parameter_vector
 from identify.reporting.settings import changed_settings, settings_set_anew
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import ESTIMATOR_SECTIONS, scenario_schema
+from identify.scenario.sections import Identification
 from identify.setup import Setup
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import NAMES, SHORT, changed_robot_file, rss6
@@ -129,6 +131,9 @@ def test_resolved_toml_names_every_value_and_reads_back_equal(name):
         | {PRIOR: {"link2.Izz": {"value": 3e-3, "std": 1e-4}}}
     )
     text = scenario.to_toml()
+    for section, model in Scenario.model_fields.items():
+        for key in getattr(model.annotation, "model_fields", ()):
+            assert f"{key} =" in text.partition(f"\n[{section}]")[2].partition("\n[")[0]
     assert scenario_from_toml(text) == scenario
     assert tomllib.loads(text) == scenario.model_dump(exclude_none=True)
 
@@ -323,11 +328,16 @@ def test_every_number_has_a_unit():
                 assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
 
 
+def test_the_anchor_without_a_stated_deviation_has_that_of_an_ordinary_instrument():
+    said = Identification.model_fields["anchor_std"].description
+    assert all(f"{std:g} {unit}" in said for unit, std in DEFAULT_STD.items())
+
+
 def test_every_comment_of_a_listing_can_be_read_alone():
-    """Keys without a value are left out of a listing, so that the key before may be absent."""
+    """A reader who looks for one key does not read the comment of the key before."""
     lines = [line for line in load_scenario("paper").to_toml().splitlines() if " # " in line]
     assert len(lines) > 60
-    referring = ("the same for", "of that", "side of that")
+    referring = ("the same for", "the same of", "of that", "side of that")
     assert [one for one in lines if any(words in one for words in referring)] == []
     assert any(one.startswith("pose_method") for one in lines)
 
