@@ -133,7 +133,7 @@ def _tell(
     failed = [finding for finding in findings if not finding.ok]
     rows = [
         (
-            "yes" if finding.ok else "NO",
+            "NO" if not finding.ok else "-" if finding.value is None else "yes",
             finding.check,
             "" if finding.limit is None else f"{finding.relation} {finding.limit:.3g}",
             finding.whole,

@@ -25,11 +25,12 @@ RULES = """\
 Units are m, rad and s. A pose is the pose of the platform frame in the base frame of the robot
 file, R = Rx(alpha) Ry(beta) Rz(gamma). The time of a row is the instant at which the sensor saw the
 pose. A command is the joint coordinate that is requested from its row on, with the zero and the
-direction of the robot file. It acts from its command_time_s on, or without that column after the
-latency of [timing]. Between two commands, the drives take the rate of a command as its change in
-one period of timing.frame_rate_hz. In a row without a measured pose the measured columns are empty,
-and in a row in which no command was written, so that the last one was held, the command columns.
-The first row holds a command.
+direction of the robot file. In one table with the poses, it acts from its command_time_s on, or
+without that column one timing.latency_s after its row. In a log of its own, it acts from its own
+time on, and timing.latency_s does not move it. As the rate of a command, the drives take its change
+from the command before, divided by one period of timing.frame_rate_hz. In a row without a measured
+pose the measured columns are empty, and in a row in which no command was written, so that the last
+one was held, the command columns. The first row holds a command.
 
 If rows are one frame of timing.frame_rate_hz apart, if the record begins at rest at its first
 reference pose, and if the servo saw exactly the measured poses, a model can close its own loop.

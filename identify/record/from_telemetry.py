@@ -262,6 +262,11 @@ def _event_times(telemetry: Telemetry, timing: Timing) -> tuple[Array, Array, li
             times = grid
     if commands.written is not None:
         acting = commands.written
+        if timing.latency_s:
+            notes.append(
+                f"timing.latency_s = {timing.latency_s:g} does not move the commands, which have "
+                "times of their own"
+            )
     elif np.array_equal(commands.time, poses.time):
         acting = times + timing.latency_s
     else:

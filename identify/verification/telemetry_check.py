@@ -16,10 +16,12 @@ from identify.estimation.base_parameters import structure
 from identify.files.dataset import POSE
 from identify.progress import Progress, SilentProgress
 from identify.record.checks import LONG_GAP_S, MINIMUM_GOOD_SHARE
+from identify.record.delays import ServoDelay
 from identify.record.frame_times import mean_rate
 from identify.record.from_telemetry import MOST_GROSS
 from identify.record.lost_pose_marks import REPEATED_REMEDY
 from identify.record.suspicions import joint_motion
+from identify.scenario import Timing
 from identify.verification.finding import Finding
 from identify.verification.logged_run import LoggedRun
 
@@ -271,27 +273,12 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         )
         yield Finding("clock offset", True, None, text, unit="s")
         return
-    # Without a time of their own, commands have the times of their poses.
-    expected = 0.0 if logged.telemetry.commands.written is None else timing.latency_s
-    offset = delay.seconds - expected
     step = CLOCK * timing.frame_period_s + delay.resolution * logged.repeats_commands
     allowed = step + STDS * (timing.clock_offset_std_s + timing.latency_std_s)
-    beyond = (
-        ""
-        if abs(offset) <= allowed
-        else "; set timing.clock_offset_std_s to have the offset estimated"
-    )
-    yield Finding(
-        "clock offset",
-        abs(offset) <= allowed,
-        offset,
-        f"the noise of a pose appears in the command {1e3 * delay.seconds:.3f} ms later "
-        f"(correlation {delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
-        f"{1e3 * expected:.3f} ms: the clock of the commands is {1e3 * abs(offset):.3f} ms "
-        f"{'ahead' if offset >= 0 else 'behind'}, or the latency differs{beyond}",
-        limit=allowed,
-        unit="s",
-    )
+    if logged.telemetry.commands.written is None and abs(delay.seconds) <= allowed:
+        yield _without_times(delay, timing)
+        return
+    yield _offset(delay, timing, logged.telemetry.commands.written is not None, allowed)
     duration = float(np.ptp(logged.time))
     grown = delay.drift * duration
     yield Finding(
@@ -301,6 +288,46 @@ def _clocks(logged: LoggedRun) -> Iterator[Finding]:
         f"this delay grows by {1e6 * delay.drift:.1f} us in a second, {1e3 * grown:.3f} ms over "
         "the run",
         limit=step / duration + STDS * timing.clock_drift_std,
+    )
+
+
+def _without_times(delay: ServoDelay, timing: Timing) -> Finding:
+    """Return the finding about the latency of commands that have the times of their poses."""
+    return Finding(
+        "clock offset",
+        True,
+        None,
+        f"the noise of a pose appears in the command of its row (correlation "
+        f"{delay.correlation:.2f}), so that a servo used these poses; without times of the "
+        f"commands, timing.latency_s = {timing.latency_s:g} cannot be checked here, and "
+        "timing.latency_std_s has it estimated",
+        unit="s",
+    )
+
+
+def _offset(delay: ServoDelay, timing: Timing, timed: bool, allowed: float) -> Finding:
+    """Return the finding about the delay of the servo. timed: whether commands have own times."""
+    # Without a time of their own, commands have the times of their poses.
+    expected = timing.latency_s if timed else 0.0
+    offset = delay.seconds - expected
+    remedy = "; set timing.clock_offset_std_s to have the offset estimated"
+    if timed and delay.seconds >= 0:
+        remedy += (
+            f", or, if the clocks agree, timing.latency_s = {delay.seconds:.6f}, which does not "
+            "move commands that have times of their own"
+        )
+    said = "timing.latency_s" if timed else "the time of its row"
+    return Finding(
+        "clock offset",
+        abs(offset) <= allowed,
+        offset,
+        f"the noise of a pose appears in the command {1e3 * delay.seconds:.3f} ms later "
+        f"(correlation {delay.correlation:.2f}, spread {1e3 * delay.spread:.3f} ms); stated are "
+        f"{1e3 * expected:.3f} ms by {said}: the clock of the commands is {1e3 * abs(offset):.3f} "
+        f"ms {'ahead' if offset >= 0 else 'behind'}, or the stated delay is wrong"
+        + (remedy if abs(offset) > allowed else ""),
+        limit=allowed,
+        unit="s",
     )
 
 

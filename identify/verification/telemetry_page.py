@@ -19,7 +19,7 @@ def findings_table(findings: Sequence[Finding]) -> Table:
     rows = tuple(
         (
             one.check,
-            "yes" if one.ok else MISSED,
+            MISSED if not one.ok else "-" if one.value is None else "yes",
             "-" if one.value is None else number(one.value),
             "-" if one.limit is None else number(one.limit),
             "" if one.unit == "1" else one.unit,

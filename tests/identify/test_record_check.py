@@ -122,6 +122,7 @@ def test_what_is_wrong_with_the_commands_is_found_with_its_size(record):
     assert {"saturation", "clock offset", "units and frames"} <= failed
     assert found["saturation"].leg == 3
     assert found["clock offset"].value == pytest.approx(0.012, abs=1e-6)
+    assert "timing.latency_s = 0.016000, which does not move" in found["clock offset"].text
     assert (
         "set timing.clock_offset_std_s to have the offset estimated" in found["clock offset"].text
     )
@@ -145,6 +146,20 @@ def test_a_record_with_times_of_its_own_is_checked_as_one_on_the_grid(record):
     found = findings(recorded_telemetry(timed, "timed.nc"))
     assert all(one.ok for one in found.values())
     assert found["clock offset"].value == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_latency_is_not_verified_without_times_of_the_commands(record):
+    """A command in the row of its pose says nothing about when it acted, and one row later does."""
+    shared = recorded_telemetry(record.drop_vars("command_time"), "shared.nc")
+    found = findings(shared)
+    assert found["clock offset"].ok
+    assert found["clock offset"].value is None
+    assert "timing.latency_s = 0.004 cannot be checked here" in found["clock offset"].text
+    assert "clock drift" not in found
+    later = replace(shared.commands, command=np.roll(shared.commands.command, 1, axis=0))
+    found = findings(replace(shared, commands=later))["clock offset"]
+    assert not found.ok
+    assert found.value == pytest.approx(1 / 60)
 
 
 @pytest.mark.slow
