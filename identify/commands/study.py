@@ -123,7 +123,8 @@ def study(
     which they finish; study.parquet, a table of factors, figures with units, seeds, seconds and
     errors; study.nc, the figures as arrays over factors and repeat; summary.md and summary.json,
     which is also the JSON; and plots as PNG, PDF and SVG. The summaries are renewed while the study
-    runs. With --beside there are also plots of the studies side by side.
+    runs, and after Ctrl-C. With --beside there are also figures/side_by_side_FACTOR, plots of the
+    studies side by side.
 
     \b
     Examples:
@@ -132,8 +133,8 @@ def study(
       cmmsim study --show pixel_noise > mine.toml
       cmmsim study pixel_noise --seed 7 --repeats 5 --out mine
       cmmsim study frame_rate --set scenario.timing.latency_s=0.01 --out late
-      cmmsim study pixel_noise --out few \\
-        --set 'sensor.camera.dark_noise=[800.0,1600.0]' --set repeats=5
+      cmmsim study frame_rate --out few \\
+        --set 'scenario.timing.frame_rate_hz=[15.0,60.0]' --set repeats=5
 
     \b
     To define a kind of row of your own, put a function like this into a module on
@@ -268,7 +269,8 @@ def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
     """If rows or laws failed, say so on standard error, and exit with the status for this."""
     broken = [law for law in laws if law["verdict"] == "failed"]
     if broken:
-        typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
+        lines = "; ".join(map(_law_line, broken))
+        typer.echo(f"{len(broken)} of {len(laws)} laws failed; {lines}", err=True)
     if outcome.failures:
         typer.echo(
             f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}",

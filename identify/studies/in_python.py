@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from identify.errors import StudyError
 from identify.progress import Progress, SilentProgress
 from identify.runtime import cores
 from identify.scenario import Scenario, load_scenario
-from identify.studies.processes import check_memory, local_processes
+from identify.studies.processes import check_memory, end_if_unguarded, local_processes
 from identify.studies.runner import in_this_process, run_study
 from identify.studies.study_design import prepare
 from identify.studies.study_file import Study as StudyFile
@@ -89,13 +90,27 @@ class Study:
         Raises
         ------
         StudyError
-            The study is not valid, its folder or the memory does not suffice, or a row failed.
-            Finished rows are kept if a ``folder`` is given.
+            The study is not valid, its folder or the memory does not suffice, the script has no
+            guard, or a row failed. Finished rows are kept if a ``folder`` is given.
         ScenarioError
             The scenario is not valid, or the factors of the first row contradict each other.
         StudyInterrupted
             Ctrl-C stopped the study.
         """
+        if workers != 0:
+            end_if_unguarded()
+        try:
+            return self._run(workers, folder, progress or SilentProgress())
+        except StudyError as error:
+            text = _with_arguments(str(error))
+            if folder is None:
+                text = text.replace("done and stored", "done, and lost without folder=")
+            error.args = (text,)
+            raise
+
+    def _run(
+        self, workers: int | None, folder: Path | str | None, progress: Progress
+    ) -> pd.DataFrame:
         scenario = self.scenario
         if not isinstance(scenario, Scenario):
             scenario = load_scenario(scenario)
@@ -108,9 +123,14 @@ class Study:
         computing = partial(local_processes, count) if count else in_this_process
         with tempfile.TemporaryDirectory(prefix="cmmsim-study-") as temporary:
             kept = Path(temporary) / "study" if folder is None else Path(folder)
-            outcome = run_study(study, kept, progress or SilentProgress(), computing, shared=shared)
+            outcome = run_study(study, kept, progress, computing, shared=shared)
         if outcome.failures:
             raise StudyError(
                 f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}"
             )
         return outcome.frame.drop(columns=[*BOOKKEEPING])
+
+
+def _with_arguments(text: str) -> str:
+    """Replace options of ``cmmsim study`` in an error by the arguments of `Study.run`."""
+    return re.sub(r"--workers(?: (?=\d))?", "workers=", text.replace("--out", "folder="))

@@ -11,10 +11,11 @@ processes of that executor wait forever.
 """
 
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import current_process, get_context, resource_tracker
 from multiprocessing.connection import wait
 
 import psutil
@@ -67,7 +68,20 @@ MEMORY_SHARE = 0.95  # largest fraction of the installed memory, of which proces
 LOOK_S = 1.0  # interval of the checks of memory, and longest wait for a process to report, s
 # The study fails after this number of consecutive processes that die before they are ready.
 MOST_FAILED_STARTS = 3
+# Exit status of a new process that reached a study while it read the script, see
+# `end_if_unguarded`.
+UNGUARDED = 97
 END_S = 10.0  # longest time to wait for the end of a killed process, s
+
+
+def end_if_unguarded() -> None:
+    """End this process if it is a worker that reads the script of the main process anew.
+
+    A new process first executes the script, except what is below ``if __name__ == "__main__":``. If
+    this starts a study, the script lacks this line. `ProcessExecutor` then says so.
+    """
+    if getattr(current_process(), "_inheriting", False):  # so `multiprocessing` itself finds it out
+        sys.exit(UNGUARDED)
 
 
 class ProcessExecutor:
@@ -82,7 +96,8 @@ class ProcessExecutor:
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches in the order in which they finish, and an empty list after each wait.
 
-        Raises StudyError if processes cannot be started, or repeatedly die before they are ready.
+        Raises StudyError if processes cannot be started, repeatedly die before they are ready, or
+        start the study anew.
         """
         suspects = Suspects()
         try:
@@ -150,9 +165,10 @@ class ProcessExecutor:
         The list is empty if the process has become ready, or if its rows will be computed again.
         """
         cases = worker.cases
-        try:
+        finished: list[Finished] | None = None
+        with suppress(EOFError, OSError):
             finished = worker.receive()
-        except (EOFError, OSError):
+        if finished is None:
             return self._remove_dead(worker, suspects)
         self._failed_starts = 0
         if cases:
@@ -164,6 +180,11 @@ class ProcessExecutor:
         with delay_interrupts():
             self._workers.remove(worker)
             worker.end()
+        if not worker.ready and worker.exit_status == UNGUARDED:
+            raise StudyError(
+                "each worker process executes this script, and would start the study anew: call "
+                'study.run() below if __name__ == "__main__": or with workers=0'
+            )
         if not worker.ready:
             self._failed_starts += 1
             if self._failed_starts >= MOST_FAILED_STARTS:
@@ -195,6 +216,11 @@ class _Worker:
         with _one_thread_each(), shield_children():
             self._process.start()
         theirs.close()
+
+    @property
+    def exit_status(self) -> int | None:
+        """Exit status of the process, or None while it runs."""
+        return self._process.exitcode
 
     def send(self, shared: Shared, cases: list[Case]) -> None:
         """Send rows to compute, unless the list is empty."""

@@ -93,7 +93,8 @@ def run_study(
     folder    Folder of its files.
     progress  Display of the number of finished rows.
     workers   Function that starts the workers.
-    so_far    Function that gets the table of finished rows from time to time while the study runs.
+    so_far    Function that gets the table of finished rows from time to time while the study runs,
+              and after Ctrl-C.
     shared    Common data of the rows, from `prepare`. By default it is prepared from the study.
 
     Returns the table of all rows, failed ones included, with counts. Raises StudyError if the study
@@ -111,10 +112,12 @@ def run_study(
                 shown = _rate_limited(lambda: so_far(tidy_table(study, journal.rows())))
                 _compute_pending(study.name, shared, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
-            # The rows are counted in the file, because Ctrl-C can interrupt their registration.
-            done = sum(1 for _ in journal.rows())
+            # The rows are read from the file, because Ctrl-C can interrupt their registration.
+            done = list(journal.rows())
+            if done:
+                so_far(tidy_table(study, done))
             raise StudyInterrupted(
-                f"stopped: {done} of {len(design)} rows are done and stored"
+                f"stopped: {len(done)} of {len(design)} rows are done and stored"
             ) from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)

@@ -167,7 +167,8 @@ def _markdown(
             "",
             "## Theory",
             "",
-            f"Intervals at {theory.CONFIDENCE:.0%}.",
+            f"Intervals at {theory.CONFIDENCE:.0%}."
+            + (" Verdicts can change with the missing rows." if rows["missing"] else ""),
             "",
             "| law | says | measured | interval | verdict |",
             "|---|---|---|---|---|",

@@ -246,6 +246,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     """Test whether the figure's mean square is proportional to factor ** (2 exponent)."""
     factor = _numeric(str(law.factor), frame)
+    _check_varied(law, frame)
     design = np.column_stack([_other_columns(law, study, frame), 2.0 * np.log(factor)])
     fit = scale_regression(law_data(law, frame) ** 2, design)
     low, high = fit.interval(design.shape[1] - 1, CONFIDENCE)
@@ -271,6 +272,7 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
         raise StudyError(f"the rows have no factor {law.factor!r}")
     values = list(law.order or [])
     chosen = frame[frame[law.factor].isin(values)]
+    _check_varied(law, chosen)
     rank = chosen[law.factor].map(values.index).to_numpy(dtype=float)
     steps = np.column_stack([2.0 * (rank >= k) for k in range(1, len(values))])
     fit = scale_regression(
@@ -327,6 +329,15 @@ def _numeric(name: str, frame: pd.DataFrame) -> Array:
     if not np.all(values > 0.0):
         raise StudyError(f"a power of {name} needs positive numbers")
     return values
+
+
+def _check_varied(law: Law, frame: pd.DataFrame) -> None:
+    """Raise StudyError if the factor of a law has one value in all rows."""
+    values = frame[law.factor].unique()
+    if len(values) == 1:
+        raise StudyError(
+            f"{law.factor} has one value, {values[0]}, in all rows, but the law needs two or more"
+        )
 
 
 def _verdict(holds: bool, half: float) -> str:

@@ -9,7 +9,13 @@ import pytest
 import xarray as xr
 
 import identify
-from identify.errors import EstimationError, RecordError, ScenarioError, StudyError
+from identify.errors import (
+    EstimationError,
+    RecordError,
+    ScenarioError,
+    StudyError,
+    StudyInterrupted,
+)
 from identify.estimation.identification import asked_of
 from identify.experiment.truth import read_truth, true_parameters
 from identify.progress import SilentProgress
@@ -163,6 +169,21 @@ def test_a_study_in_python_has_the_rows_of_the_same_file(tmp_path):
     assert frame.groupby(DARK).mean().index.tolist() == levels
     with pytest.raises(StudyError, match="unknown key"):
         identify.Study(scenario, vary={"sensr.x": [1.0]}).run(workers=0)
+    with pytest.raises(StudyError, match=r"mine\.toml is a file; name another with folder=$"):
+        study.run(workers=0, folder=path)
+
+
+def test_a_study_in_python_that_is_stopped_says_whether_its_rows_are_kept(tmp_path):
+    class Stop(SilentProgress):
+        def stage(self, name, total):
+            raise KeyboardInterrupt
+
+    scenario = identify.load_scenario("quick", **SHORT)
+    study = identify.Study(scenario, kind="static_pose", vary={DARK: [13.0]})
+    kept = {None: "done, and lost without folder=", tmp_path / "a": "done and stored"}
+    for folder, says in kept.items():
+        with pytest.raises(StudyInterrupted, match=f"0 of 1 rows are {says}$"):
+            study.run(workers=0, folder=folder, progress=Stop())
 
 
 def test_entries_and_seeds_of_other_kinds_are_taken_or_refused_in_one_line():

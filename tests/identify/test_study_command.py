@@ -56,24 +56,25 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
 
 
 @pytest.mark.parametrize(
-    ("fails", "figure", "exponent", "status", "says"),
+    ("fails", "figure", "exponents", "status", "says"),
     [
-        ([], "spread_um", 0.0, 0, ""),
-        ([], "spread_um", 3.0, BEYOND_LIMIT, "1 of 1 laws failed; failed: spread_um ~"),
-        ([], "error_um", 1.0, 0, ""),
-        ([1], "spread_um", 0.0, ROWS_FAILED, "8 rows failed; row 1: StudyError: kind 'tests."),
-        ([1], "spread_um", 9.0, ROWS_FAILED, "1 of 1 laws failed"),
+        ([], "spread_um", [0.0], 0, ""),
+        ([], "spread_um", [3.0, 0.0, 4.0], BEYOND_LIMIT, "2 of 3 laws failed; failed: spread_um ~"),
+        ([], "error_um", [1.0], 0, ""),
+        ([1], "spread_um", [0.0], ROWS_FAILED, "8 rows failed; row 1: StudyError: kind 'tests."),
+        ([1], "spread_um", [9.0], ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )
 def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(
-    mine, capsys, fails, figure, exponent, status, says
+    mine, capsys, fails, figure, exponents, status, says
 ):
     """One figure is the standard deviation of 1,000 normal numbers whatever the factor, the other
     hardly known.
     """
-    theory = (
+    theory = "".join(
         f'[[theory]]\nfigure = "{figure}"\nfactor = "sensor.camera.dark_noise"\nexponent = '
         f"{exponent}\n"
+        for exponent in exponents
     )
     mine.write_text(
         mine.read_text().replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory
@@ -84,6 +85,7 @@ def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(
         "undecided: error_um" if figure == "error_um" else ("passed: ", "failed: ")
     )
     assert says in shown.err
+    assert shown.err.count("expected") == sum(exponent > 1.0 for exponent in exponents)
     frame, _ = read_table("a/study.parquet")
     assert frame.index[frame["error"] != ""].tolist() == fails
 

@@ -127,6 +127,25 @@ def test_a_study_in_processes_has_no_port_and_no_file_but_those_of_its_folder(
     assert found == others
 
 
+UNGUARDED = f"""
+import sys
+import identify
+study = identify.Study("quick", kind="{KIND}", vary={{"{DARK}": [13.0]}})
+study.run(workers=2, folder=sys.argv[1])
+"""
+
+
+def test_a_script_without_a_guard_is_told_of_it_in_the_last_line_alone(tmp_path):
+    """Its processes execute it anew, and say nothing themselves."""
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    command = sys.executable, tmp_path / "script.py", tmp_path / "a"
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert 'below if __name__ == "__main__": or with workers=0' in done.stderr.splitlines()[-1]
+    assert done.stderr.count("Traceback") == 1
+    assert not (tmp_path / "a").exists()
+
+
 @pytest.fixture
 def command(tmp_path):
     """A function that starts the command on so many workers and waits until 30 rows are done, or

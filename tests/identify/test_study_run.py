@@ -19,7 +19,7 @@ import xarray as xr
 from filelock import FileLock
 from rich.console import Console
 
-from identify.errors import StudyError
+from identify.errors import StudyError, StudyInterrupted
 from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import RichProgress, SilentProgress
 from identify.scenario import load_scenario
@@ -108,6 +108,22 @@ def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(
         assert min(most, 2) <= len(seen) <= most
         for frame in seen:
             same_numbers(frame, whole[1].iloc[: len(frame)])
+
+
+def test_after_ctrl_c_all_finished_rows_are_shown(whole, tmp_path):
+    """Though the last time between two tables has not passed."""
+
+    def execute(shared, batches):
+        yield compute(shared, batches.next_batch(1))
+        yield compute(shared, batches.next_batch(1))
+        raise KeyboardInterrupt
+
+    seen = []
+    workers = lambda: nullcontext(execute)  # noqa: E731
+    with pytest.raises(StudyInterrupted, match="2 of 18 rows"):
+        run_study(small_study(), tmp_path / "a", SilentProgress(), workers, seen.append)
+    assert len(seen) == 1
+    same_numbers(seen[0], whole[1].iloc[:2])
 
 
 @pytest.mark.parametrize(

@@ -447,7 +447,16 @@ def test_order_of_a_factors_values(good, bad, expected):
             "some is zero in 30 of 120 rows, but the law divides",
         ),
         (power(1.0), {"figure_um": 0.0}, "zero in every row"),
-        (power(1.0), {"x": 2.0}, "do not vary"),
+        (
+            power(1.0),
+            {"x": 2.0},
+            "x has one value, 2.0, in all rows, but the law needs two or more",
+        ),
+        (
+            Law(figure="figure_um", factor="x", order=[2.0, 3.0]),
+            {"x": 2.0},
+            "x has one value, 2.0, in all rows, but the law needs two or more",
+        ),
     ],
 )
 def test_law_of_what_the_rows_do_not_show_is_undecided_with_the_reason(law, changes, reason):
