@@ -67,7 +67,8 @@ class Robot(RobotDynamics):
     nominal_parameters : ndarray, shape (p,)
         The set `guess` of the robot file.
     parameter_sets : dict
-        All sets of the robot file by name.
+        All sets of the robot file by name. `parameter_sets["truth"].dynamic` are the dynamic
+        parameters of a set, `.joint_pid` its gains, and `.vector` both.
     layout : ParameterLayout
         Names, order and units of the parameters.
     geometry : RobotGeometry

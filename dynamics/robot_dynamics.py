@@ -26,7 +26,7 @@ class RobotDynamics(RobotKinematics):
         pose : array_like, shape (6,) or (N, 6)
             Pose of the platform.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -56,7 +56,7 @@ class RobotDynamics(RobotKinematics):
         pose, twist : array_like, shape (6,) or (N, 6)
             Pose and twist of the platform.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -84,7 +84,7 @@ class RobotDynamics(RobotKinematics):
         pose : array_like, shape (6,) or (N, 6)
             Pose of the platform.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -114,7 +114,7 @@ class RobotDynamics(RobotKinematics):
         pose, twist : array_like, shape (6,) or (N, 6)
             Pose and twist of the platform.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -175,7 +175,7 @@ class RobotDynamics(RobotKinematics):
         pose, twist, twist_dot : array_like, shape (6,) or (N, 6)
             Pose of the platform, its twist, and the time derivative of the twist.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -212,7 +212,7 @@ class RobotDynamics(RobotKinematics):
         torque : array_like, shape (n,) or (N, n)
             Torques or forces, N m or N.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------
@@ -246,7 +246,7 @@ class RobotDynamics(RobotKinematics):
         pose : array_like, shape (6,) or (N, 6)
             Pose of the platform.
         parameters : array_like, shape (p,) or (N, p), optional
-            Dynamic parameters.
+            Dynamic parameters, by default those of the set `guess`.
 
         Returns
         -------

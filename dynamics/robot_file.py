@@ -164,6 +164,11 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
     A column is one value for all legs, or a list with one value per leg.
     """
     fields = {plural(name): name for name in KINDS[family.kind].model_fields}
+    missing = [
+        key
+        for key, name in fields.items()
+        if key not in columns and KINDS[family.kind].model_fields[name].is_required()
+    ]
     legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
     for key, value in columns.items():
         name = fields.get(key)
@@ -184,6 +189,8 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
             )
         for number, leg in enumerate(legs):
             leg[name] = value[number] if per_leg else value
+    if missing and columns.get("type", family.kind) == family.kind:
+        raise ValueError(f"legs: {', '.join(missing)}: Field required")
     return legs
 
 

@@ -117,8 +117,9 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
     if set_name not in robot.parameter_sets:
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(
-            f"robot {robot.name} has no parameter set {set_name!r}; it has {valid} "
-            "(plant.parameters names the truth, model.start_parameters the initial guess)"
+            f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}: name one as "
+            "the true robot of a simulated run with --set plant.parameters=guess, or as the "
+            "initial guess with model.start_parameters"
         )
 
 

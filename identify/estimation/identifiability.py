@@ -209,11 +209,11 @@ def scale_warnings(
             "makes it smaller",
         )
     return (
-        f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show the "
-        "measured quantity only in sums with other parameters, and the initial guess of these "
-        f"leaves {gain} uncertain by {std:.1%}; values in kg, N m or N are as uncertain: "
-        "use identification.scale_anchor = joint_gain, or state further weighed masses in "
-        "identification.prior",
+        f"the scale anchor {anchor.name} does not fix the scale of this robot: {gain} is known "
+        f"only to {whole_std:.1%}, of which the initial guess causes {std:.1%}, because poses show "
+        "the measured quantity only in sums with other parameters; all values in kg, N m or N "
+        "share this error: use identification.scale_anchor = joint_gain, or state further weighed "
+        "masses in identification.prior",
     )
 
 

@@ -40,6 +40,10 @@ MOST_MESH_RATIO = 20.0
 # Least share of the joint coordinates within the travel that must have a pose. Findings over the
 # travel describe these poses only. The built-in robots have a share of 0.999 and more.
 LEAST_CLOSED = 0.9
+# Largest ratio of a mass, an inertia or a gain in two sets of parameters, in either direction.
+MOST_SET_RATIO = 100.0
+# Checks that a run repeats before it begins, and that end it.
+REFUSED = ("sensor's platform", "sensor's home", "visible stickers")
 NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that counts as zero
 
 
@@ -54,6 +58,7 @@ def check_robot(
         lambda: _assembly(robot),
         lambda: _holding(robot, parameters, around.settings.drives.torque_limit),
         lambda: _visible(robot),
+        lambda: check_sets(robot),
         lambda: _bodies(robot, parameters),
         lambda: _centres(robot, parameters),
         lambda: check_meshes(robot),
@@ -109,9 +114,11 @@ def run_warning(setup: Setup, progress: Progress | None = None) -> str | None:
     if not failed:
         return None
     more = f"; further faults: {', '.join(one.check for one in failed[1:])}" if failed[1:] else ""
+    ends = any(one.check in REFUSED for one in failed)
+    begins = "" if ends else "; the run begins nevertheless"
     return (
-        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].text}{more}; the run "
-        f"begins nevertheless; cmmsim check {file} shows all findings"
+        f"the check of {robot.name} fails: {failed[0].check}: {failed[0].text}{more}{begins}; "
+        f"cmmsim check {file} shows all findings"
     )
 
 
@@ -175,14 +182,15 @@ def _extremes(
     least = limits.least_leverage
     most = limits.most_condition
     text = (
-        f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
+        f"least leverage of an actuator on its leg {where} is {leverage:.3g}, of leg {leg}; at 0 "
+        "it cannot move the leg"
     )
     yield Finding(
         f"leverage {where}", leverage >= least, leverage, text, limit=least, leg=leg, relation=">="
     )
     condition = float(np.max(measures.platform_condition))
     text = (
-        f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at "
+        f"largest condition of the platform side {where} is {condition:.3g}; at "
         "infinity the platform can move with fixed joints"
     )
     yield Finding(f"condition {where}", condition <= most, condition, text, limit=most)
@@ -237,6 +245,41 @@ def _visible(robot: Robot) -> Iterator[Finding]:
     unseen = f"no motion shows {', '.join(found.unseen)}" if found.unseen else "all are seen"
     text = f"{found.rank} base parameters of {len(robot.parameter_names)}; {unseen}"
     yield Finding("base parameters", found.rank > 0, found.rank, text)
+
+
+def check_sets(robot: Robot) -> Iterator[Finding]:
+    """Check that no mass, inertia or gain of a set is far from that of the guess.
+
+    A set in other units, such as grams, would be stable or unstable for this reason alone. Friction
+    is not compared, because a guess of it can be far too small.
+    """
+    others = [name for name in robot.parameter_sets if name != NOMINAL]
+    if not others:
+        text = (
+            f"the robot file has the set {NOMINAL} only: for a simulated run, name it as the true "
+            f"robot with --set plant.parameters={NOMINAL}"
+        )
+        yield Finding("parameter sets", True, 1.0, text, limit=MOST_SET_RATIO)
+        return
+    layout = robot.layout
+    compared = np.ones(len(layout.names), dtype=bool)
+    compared[layout.dynamic] = False
+    compared[layout.inertial] = True
+    guess = np.abs(robot.parameter_sets[NOMINAL].vector)
+    values = np.abs([robot.parameter_sets[name].vector for name in others])
+    # Zeros, such as first moments of a centred body, have no ratio.
+    known = compared & (guess > 0) & (values > 0)
+    ratios = np.where(known, values / np.where(known, guess, 1.0), 1.0)
+    worst = np.unravel_index(int(np.argmax(np.abs(np.log(ratios)))), ratios.shape)
+    name, own = layout.names[worst[1]], others[worst[0]]
+    ratio = float(max(ratios[worst], 1 / ratios[worst]))
+    text = (
+        f"{name} differs most, by a factor of {ratio:.3g}: {guess[worst[1]]:.4g} in {NOMINAL} and "
+        f"{values[worst]:.4g} in {own}"
+    )
+    if ratio > MOST_SET_RATIO:
+        text += f"; both are in {layout.unit(name)}"
+    yield Finding("parameter sets", ratio <= MOST_SET_RATIO, ratio, text, limit=MOST_SET_RATIO)
 
 
 def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
@@ -330,9 +373,9 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
     leg = int(np.argmax(outside))
     limit = OFF_PLATFORM_M
     most = float(outside[leg])
-    text = f"leg {leg + 1} ends {most:.3g} m outside of the platform that sensor {sensor} sees"
+    text = f"leg {leg + 1} ends {most:.3g} m outside of the platform in the file of sensor {sensor}"
     if most <= 0:
-        text = f"all legs end on the platform that sensor {sensor} sees"
+        text = f"all legs end on the platform in the file of sensor {sensor}"
     elif most > limit:
         text += f": move platform.cuts or planes of the sensor outwards; {OWN_SENSOR}"
     yield Finding(
@@ -347,7 +390,10 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
     # the plane with the fewest stickers beyond the needed number
     plane = min(planes, key=lambda name: len(planes[name][0]) - planes[name][1])
     seen, needed = planes[plane]
-    text = f"both cameras of sensor {sensor} see {len(seen)} stickers of plane {plane} at home"
+    text = (
+        f"both cameras of sensor {sensor} see {len(seen)} stickers of the plane [platform.planes."
+        f"{plane}] at home"
+    )
     if len(seen) < needed:
         text += f": {MOVE_RIG}"
     yield Finding(

@@ -21,7 +21,12 @@ from identify.experiment.fitted_sensor import fitted
 from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
 from identify.setup import Setup
-from identify.verification.robot_check import about_sensor, check_travel, run_warning
+from identify.verification.robot_check import (
+    about_sensor,
+    check_sets,
+    check_travel,
+    run_warning,
+)
 from tests.identify.commands import command, one_line
 
 
@@ -178,7 +183,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
     )
     said = one_line(capfd.readouterr().err)
     assert (
-        "2 of 23 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+        "2 of 24 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
         "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "
@@ -207,6 +212,29 @@ def test_a_robot_that_the_sensor_does_not_see_is_told_how_to_get_a_sensor_of_its
     assert not found["sensor's home"].ok
     assert f"must be near [{where}]; cmmsim new sensor FILE" in found["sensor's home"].text
     assert "cmmsim new sensor" not in found["sensor's platform"].text
+
+
+def test_a_guess_in_grams_fails_the_check_and_a_missing_truth_names_the_setting():
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    grams = text.replace("platform = { mass = 24.0", "platform = { mass = 24000.0")
+    (found,) = check_sets(Robot(parsed_robot(grams, "mine.toml")))
+    assert not found.ok
+    assert found.value == pytest.approx(24000 / 23.5)
+    assert "platform.mass differs most, by a factor of 1.02e+03" in found.text
+    (found,) = check_sets(load_robot("ups6"))
+    assert found.ok
+    (found,) = check_sets(Robot(parsed_robot(text.partition("# What plays")[0], "mine.toml")))
+    assert found.ok
+    assert "--set plant.parameters=guess" in found.text
+
+
+def test_a_run_that_its_sensor_will_end_is_not_said_to_begin(tmp_path):
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    high = text.replace("home_pose = [0.0, 0.0, 0.2,", "home_pose = [0.0, 0.0, 0.255,")
+    (tmp_path / "mine.toml").write_text(high, encoding="utf-8")
+    warned = run_warning(Setup(load_scenario("quick", robot=str(tmp_path / "mine.toml"))))
+    assert "sensor's home" in warned
+    assert "begins" not in warned
 
 
 def test_a_sensor_that_looks_past_the_platform_fails_the_check_with_its_remedy():
