@@ -170,6 +170,16 @@ def test_rounded_times_give_the_mean_rate_and_a_mark_is_a_comment(record, tmp_pa
     assert '# ok = "valid"  # if it is 1' in text
 
 
+@pytest.mark.parametrize(("step", "rate"), [(0.01, "100.0"), (4e6, "250.0"), (1, "60.0")])
+def test_a_rate_follows_from_the_only_likely_unit_of_times(step, rate, record, tmp_path):  # noqa: F811
+    """Times in s and in ns; a step of one can be a count of frames, and leaves the usual rate."""
+    path = as_table(tmp_path, record)
+    table = pd.read_csv(path).rename(columns={"time_s": "stamp"})
+    table.assign(stamp=step * np.arange(len(table))).to_csv(path, index=False)
+    assert proposed(path, path)["measured"]["time_unit"] == "?"
+    assert f"frame_rate_hz = {rate} " in path.with_suffix(".toml").read_text()
+
+
 @pytest.mark.parametrize("form", ["{}_ref", "{}Ref", "desired_{}"])
 def test_desired_poses_are_proposed_by_a_word_before_or_after_their_axis(form, record, tmp_path):  # noqa: F811
     """Beside a pose of which only the position names the body."""
@@ -246,7 +256,6 @@ def test_names_without_units_are_asked_with_the_range_of_their_numbers(record, t
     answer(path, "time_unit", '"s"')
     answer(path, "position_unit", '"m"')
     answer(path, "unit", '"rad"')
-    change(path.with_suffix(".toml"), "frame_rate_hz = 60.0", "frame_rate_hz = 29.97")
     with pytest.raises(
         RecordError, match="line 2: the measured pose is 0 in all cells, as in 1 of 60 rows"
     ):

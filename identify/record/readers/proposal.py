@@ -39,6 +39,10 @@ from identify.record.readers.streams import Header, LoggedFile, Stream
 TIME_WORDS = ("time", "t", "timestamp", "stamp", "secs")  # words for times
 MARKS = ("ok", "valid", "tracked", "visible")  # words for columns that mark measured poses
 
+# Rates, Hz, of cameras, between which the unit of a time without a unit is the only likely one.
+SLOWEST_HZ, FASTEST_HZ = 3.0, 2000.0
+COUNTED = 1e-3  # largest distance from one of a step of times that may be numbers of frames
+
 # Conventions of three angles whose names tell no axes.
 EULER_CHOICES = "euler_XYZ and so on about the body's own axes, or euler_xyz about fixed axes"
 
@@ -227,10 +231,23 @@ def _propose_source(
         steps = np.diff(moments)
         step = float(np.median(steps)) if len(steps) else 0.0
         proposal.add(table, "time_unit", unit, f"s, ms, us, ns or frames; the steps are {step:.6g}")
-        if table == "measured" and proposal.rate_hz is None and unit is not None and step > 0:
+        if table == "measured" and proposal.rate_hz is None and step > 0:
             # If times are rounded, only their mean step gives the right rate.
-            proposal.rate_hz = float(f"{mean_rate(moments) / float(TIMES[unit]):.4g}")
+            proposal.rate_hz = _rate(mean_rate(moments), unit)
     return cells
+
+
+def _rate(rows: float, unit: str | None) -> float | None:
+    """Return the rate, Hz, of a number of rows in one unit of time, which may be unknown.
+
+    Of an unknown unit, the rate is that of the only unit in which a camera can be as fast. Rows
+    that are one unit apart may be counted, and have no rate.
+    """
+    if unit is None and abs(rows - 1) < COUNTED:
+        return None
+    units = TIMES if unit is None else [unit]
+    rates = [float(f"{rows / float(TIMES[name]):.4g}") for name in units]
+    return next((rate for rate in rates if unit or SLOWEST_HZ <= rate <= FASTEST_HZ), None)
 
 
 def _chosen(found: Sequence[Any], label: str | None, what: str, option: str) -> Any:
