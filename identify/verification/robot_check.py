@@ -11,28 +11,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cmmsim.errors import CmmError
-from cmmsim.files import SensorFile
 from dynamics import Robot, built_in_robots, load_robot, workspace
 from dynamics.bodies import parts_of
 from dynamics.errors import RobotFileError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import structure
-from identify.excitation.constraints import MOVE_RIG, seen_by_plane
 from identify.experiment.law_in_loop import feedback
 from identify.experiment.leg_bodies import robot_meshes
-from identify.experiment.sensor_in_loop import (
-    OFF_PLATFORM_M,
-    OWN_SENSOR,
-    platform_distances,
-    sight_lines,
-)
 from identify.loop_parameters import NOMINAL, check_parameter_set, loop_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation
 from identify.setup import Setup
 from identify.verification.finding import Finding
 from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
+from identify.verification.sensor_check import REFUSED, about_sensor
 
 SAMPLES = 2000  # number of random vectors of joint coordinates over the travel
 # Largest ratio between the length of a mesh and the reach of its body, in either direction.
@@ -42,8 +35,6 @@ MOST_MESH_RATIO = 20.0
 LEAST_CLOSED = 0.9
 # Largest ratio of a mass, an inertia or a gain in two sets of parameters, in either direction.
 MOST_SET_RATIO = 100.0
-# Checks that a run repeats before it begins, and that end it.
-REFUSED = ("sensor's platform", "sensor's home", "visible stickers")
 NEGLIGIBLE_CHANGE = 1e-9  # largest relative change of an acceleration that counts as zero
 
 
@@ -364,38 +355,4 @@ def check_meshes(robot: Robot) -> Iterator[Finding]:
         text += ": give the length of one unit of the mesh by scale, 0.001 for mm"
     yield Finding(
         name, ratio <= MOST_MESH_RATIO, ratio, text, limit=MOST_MESH_RATIO, leg=legs[worst] + 1
-    )
-
-
-def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
-    """Check whether the platform in a sensor file is the robot's, and can be seen at home."""
-    outside, away = platform_distances(robot, file)
-    leg = int(np.argmax(outside))
-    limit = OFF_PLATFORM_M
-    most = float(outside[leg])
-    text = f"leg {leg + 1} ends {most:.3g} m outside of the platform in the file of sensor {sensor}"
-    if most <= 0:
-        text = f"all legs end on the platform in the file of sensor {sensor}"
-    elif most > limit:
-        text += f": move platform.cuts or planes of the sensor outwards; {OWN_SENSOR}"
-    yield Finding(
-        "sensor's platform", most <= limit, most, text, limit=limit, unit="m", leg=leg + 1
-    )
-    text = f"at home that platform is {away:.3g} m from the robot's"
-    if away > limit:
-        home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
-        text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
-    yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")
-    planes = seen_by_plane(sight_lines(file), robot.home_pose)
-    # the plane with the fewest stickers beyond the needed number
-    plane = min(planes, key=lambda name: len(planes[name][0]) - planes[name][1])
-    seen, needed = planes[plane]
-    text = (
-        f"both cameras of sensor {sensor} see {len(seen)} stickers of the plane [platform.planes."
-        f"{plane}] at home"
-    )
-    if len(seen) < needed:
-        text += f": {MOVE_RIG}"
-    yield Finding(
-        "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
     )

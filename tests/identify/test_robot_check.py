@@ -21,12 +21,8 @@ from identify.experiment.fitted_sensor import fitted
 from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
 from identify.setup import Setup
-from identify.verification.robot_check import (
-    about_sensor,
-    check_sets,
-    check_travel,
-    run_warning,
-)
+from identify.verification.robot_check import check_sets, check_travel, run_warning
+from identify.verification.sensor_check import about_sensor
 from tests.identify.commands import command, one_line
 
 

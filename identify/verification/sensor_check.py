@@ -1,0 +1,53 @@
+"""Check whether a sensor file describes the platform of a robot, and whether the cameras see it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cmmsim.files import SensorFile
+from dynamics import Robot
+from identify.excitation.constraints import MOVE_RIG, seen_by_plane
+from identify.experiment.sensor_in_loop import (
+    OFF_PLATFORM_M,
+    OWN_SENSOR,
+    platform_distances,
+    sight_lines,
+)
+from identify.verification.finding import Finding
+
+# Checks that a run repeats before it begins, and that end it.
+REFUSED = ("sensor's platform", "sensor's home", "visible stickers")
+
+
+def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
+    """Check whether the platform in a sensor file is the robot's, and can be seen at home."""
+    outside, away = platform_distances(robot, file)
+    leg = int(np.argmax(outside))
+    limit = OFF_PLATFORM_M
+    most = float(outside[leg])
+    text = f"leg {leg + 1} ends {most:.3g} m outside of the platform in the file of sensor {sensor}"
+    if most <= 0:
+        text = f"all legs end on the platform in the file of sensor {sensor}"
+    elif most > limit:
+        text += f": move platform.cuts or planes of the sensor outwards; {OWN_SENSOR}"
+    yield Finding(
+        "sensor's platform", most <= limit, most, text, limit=limit, unit="m", leg=leg + 1
+    )
+    text = f"at home that platform is {away:.3g} m from the robot's"
+    if away > limit:
+        home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
+        text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
+    yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")
+    planes = seen_by_plane(sight_lines(file), robot.home_pose)
+    # the plane with the fewest stickers beyond the needed number
+    plane = min(planes, key=lambda name: len(planes[name][0]) - planes[name][1])
+    seen, needed = planes[plane]
+    text = (
+        f"both cameras of sensor {sensor} see {len(seen)} stickers of the plane [platform.planes."
+        f"{plane}] at home"
+    )
+    if len(seen) < needed:
+        text += f": {MOVE_RIG}"
+    yield Finding(
+        "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
+    )
