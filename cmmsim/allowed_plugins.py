@@ -11,6 +11,7 @@ A module named in a scenario, sensor file or study is therefore imported only if
 """
 
 import importlib
+import inspect
 import os
 import traceback
 from collections.abc import Callable, Mapping
@@ -108,13 +109,27 @@ def import_plugin(option: str, name: str) -> Any:
         advice = "; the folder of the module must be on PYTHONPATH" if missing else ""
         raise CmmError(f"{option} {name!r} cannot be imported: {error}{advice}") from error
     if not hasattr(imported, attribute):
-        names = ", ".join(own for own in vars(imported) if not own.startswith("_"))
+        names = ", ".join(
+            own
+            for own, value in vars(imported).items()
+            if not own.startswith("_") and _can_be_part(value, module)
+        )
         file = getattr(imported, "__file__", None)
         raise CmmError(
             f"{option} {name!r}: the module {file or module} has no {attribute}; it has "
             f"{names[:200] or 'nothing'}"
         )
     return getattr(imported, attribute)
+
+
+def _can_be_part(value: object, module: str) -> bool:
+    """Return True for functions and classes that a module defines, and for objects of a class.
+
+    Imported functions, classes and modules are no parts, and neither are numbers and texts.
+    """
+    if inspect.isroutine(value) or inspect.isclass(value):
+        return getattr(value, "__module__", None) == module
+    return type(value).__module__ != "builtins"
 
 
 @dataclass(frozen=True)

@@ -186,7 +186,7 @@ class TrueCameras:
             sections = self._file.platform, self._file.base
             for body, marked, section in zip(self.scene, self._bodies, sections, strict=True):
                 if section.mesh is not None:
-                    require_convex_near_stickers(body, marked, self.renderer.name)
+                    require_convex_near_stickers(body, marked, section.mesh, self.renderer.name)
         return self._without_images() if self.renderer is STATISTICAL else self._drawing()
 
     def _without_images(self) -> StatisticalStereoCamera:

@@ -24,6 +24,10 @@ from rich.text import Text
 
 # Function ``advance(n=1)`` that reports n more steps of the stage as done.
 Advance = Callable[..., None]
+# Modules that the option --plugin of the running command has named.
+TYPED_PLUGINS: list[str] = []
+# Commands that are advised and have no option --plugin, because they import no part of a user.
+WITHOUT_PLUGINS = ("budget", "export", "workspace")
 
 
 class Progress(Protocol):
@@ -136,7 +140,13 @@ def print_advice(cause: str, command: str, of: str = "") -> None:
     ``of`` names the goals, if they are not clear from the lines above.
     """
     typer.echo(f"likeliest cause{f' ({of})' if of else ''}: {cause}")
-    typer.echo(f"next: {command}")
+    typer.echo(f"next: {with_plugins(command)}")
+
+
+def with_plugins(command: str) -> str:
+    """Return a command of cmmsim with the options --plugin that were typed for this command."""
+    takes_none = command.split()[1] in WITHOUT_PLUGINS
+    return command if takes_none else " ".join([command, *(f"--plugin {m}" for m in TYPED_PLUGINS)])
 
 
 def print_table(

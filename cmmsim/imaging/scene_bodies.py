@@ -146,18 +146,24 @@ def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int)
     return SceneBody(solid_mesh(surface, stickers.body_level / 255.0), drawn, places)
 
 
-def require_convex_near_stickers(body: SceneBody, marked: MarkedBody, renderer: str) -> None:
+def require_convex_near_stickers(
+    body: SceneBody, marked: MarkedBody, mesh: str, renderer: str
+) -> None:
     """Raise SensorFileError if a sticker lies in a hollow of a body.
 
-    The ``renderer``, named in the message, draws the body's convex hull, which hides the sticker.
+    The ``renderer`` draws the convex hull of the body, which hides the sticker. The message names
+    it and the file ``mesh``.
     """
     normals, offsets = ConvexSolid(body.solid.vertices).faces
     heights = (body.sticker_places @ normals.T + offsets).max(axis=1)
     hollow = marked.sticker_ids[heights <= RING_SUNK]
     if len(hollow):
+        which = f"sticker {hollow[0]} lies"
+        if len(hollow) > 1:
+            which = f"stickers {', '.join(hollow)} lie"
         raise SensorFileError(
-            f"{marked.name}: sticker {', '.join(hollow)} lies in a hollow of the mesh, and the "
-            f"renderer {renderer!r} sees the convex hull of a mesh; choose 'pyrender' or 'scene'"
+            f"{marked.name}.mesh {mesh}: {which} in a hollow of the mesh, and the renderer "
+            f"{renderer!r} sees the convex hull of a mesh; choose 'pyrender' or 'scene'"
         )
 
 

@@ -13,6 +13,7 @@ from identify.commands.kinds_of_files import check_kind
 from identify.errors import ScenarioError
 from identify.files.atomic import write_text
 from identify.files.run_folder import as_json
+from identify.progress import TYPED_PLUGINS
 from identify.scenario import Scenario, load_scenario
 
 # Package and folder of the built-in files of each kind.
@@ -164,6 +165,7 @@ Strict = Annotated[
 
 def _allow(modules: list[str] | None) -> None:
     allow_plugin(*modules or ())
+    TYPED_PLUGINS[:] = modules or ()
 
 
 # Modules of the user's own parts, which are allowed before any other option is read.

@@ -34,7 +34,7 @@ from identify.files.run_folder import (
     new_run_folder,
     refuse_finished,
 )
-from identify.progress import print_warnings, terminal_progress
+from identify.progress import print_warnings, terminal_progress, with_plugins
 from identify.runtime import interruptible_imports
 
 # Files that the first two stages write.
@@ -187,7 +187,8 @@ def excite(
 
 def _wrote(path: Path, stage: str) -> None:
     """Print which file of a run was written, and the command of the next stage."""
-    typer.echo(f"wrote {path}; next: cmmsim {stage} --out {path.parent}")
+    command = with_plugins(f"cmmsim {stage} --out {path.parent}")
+    typer.echo(f"wrote {path}; next: {command}")
 
 
 def record(

@@ -34,6 +34,13 @@ def replay(
             metavar="NAME", help="Motion to show: excitation, or a validation run such as run01."
         ),
     ] = "excitation",
+    renderer: Annotated[
+        str | None,
+        typer.Option(
+            help="Renderer of the camera images, as in the scenario.",
+            show_default="that of the run, or analytic for a run without images",
+        ),
+    ] = None,
     quiet: Quiet = False,
     plugin: Plugins = None,
 ) -> None:
@@ -52,7 +59,7 @@ def replay(
     from identify.scene import read_motion, write_page
 
     path = out or run / "replay.html"
-    shown = read_motion(run, motion)
+    shown = read_motion(run, motion, renderer)
     write_page(path, shown, terminal_progress(quiet))
     print_warnings(shown.notes)
     if not quiet:

@@ -17,7 +17,7 @@ from identify.record.known_geometry import known_geometry
 from identify.record.model_runs import EXCITATION
 from identify.record.provenance import RunFiles, check_robot, recorded_seed
 from identify.record.recording import TRUTH_GROUP, poses, run_name
-from identify.scenario import load_scenario
+from identify.scenario import Scenario, load_scenario
 from identify.scene.workcell import Workcell, workcell
 
 # Names of the poses of a motion in the data of the page.
@@ -89,8 +89,10 @@ def motion_names(run: RunFolder) -> list[str]:
     return [EXCITATION, *(run_name(number) for number in range(1, unseen + 1))]
 
 
-def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
+def read_motion(folder: Path | str, name: str = EXCITATION, renderer: str | None = None) -> Motion:
     """Read the motion of a run folder with one of the names of `motion_names`.
+
+    The default renderer of the images is that of the run, or "analytic" for a run without images.
 
     Raises
     ------
@@ -110,7 +112,10 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
         raise RecordError(f"{run.path} has no motion {name!r}; it has {', '.join(names)}")
     record = files.experiment if name == EXCITATION else files.validation[names.index(name) - 1]
     notes: list[str] = []
-    cell = _cell(run, record, notes)
+    scenario = load_scenario(run.whole_scenario)
+    cell = _cell(run, scenario, record, notes)
+    if renderer is None:
+        renderer = "analytic" if scenario.renderer == "statistical" else scenario.renderer
     seen = {MEASURED: poses(record, "measured")}
     truth = _truth(run, name)
     if truth is None:
@@ -131,12 +136,11 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
     title = f"Run {run.path.resolve().name}, {what}: {cell.name}"
     covariance = record["measured_covariance"].values
     seed = recorded_seed(record)
-    return Motion(cell, record["time"].values, seen, covariance, seed, title=title, notes=notes)
+    return Motion(cell, record["time"].values, seen, covariance, seed, renderer, title, notes)
 
 
-def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
+def _cell(run: RunFolder, scenario: Scenario, record: xr.Dataset, notes: list[str]) -> Workcell:
     """Return robot and sensor of a run, or the robot alone with a note if there is no sensor."""
-    scenario = load_scenario(run.whole_scenario)
     robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run.path).robot
     check_robot(record, robot)
     try:

@@ -5,7 +5,10 @@ be typed: the cause is put into the result, and nothing else is wrong.
 import shlex
 
 import pytest
+import typer
 
+from identify.commands.app import app
+from identify.progress import WITHOUT_PLUGINS, print_advice
 from identify.reporting.goal_causes import advices
 from identify.reporting.goals import check_goals
 from identify.reporting.tables import print_goals
@@ -195,6 +198,23 @@ def test_goals_of_one_cause_share_its_line_and_every_missed_goal_has_one(result,
         f"cmmsim replay {tmp_path}",
     ]
     assert sum(line.startswith("likeliest cause (") for line in lines) == 2
+
+
+def test_the_next_command_has_the_plugins_that_were_typed_if_it_takes_them(capsys, monkeypatch):
+    monkeypatch.setattr("identify.progress.TYPED_PLUGINS", ["mine", "other"])
+    print_advice("Frames are lost.", "cmmsim replay runs/mine")
+    print_advice("The noise is large.", "cmmsim budget runs/mine")
+    lines = capsys.readouterr().out.splitlines()[1::2]
+    assert lines == [
+        "next: cmmsim replay runs/mine --plugin mine --plugin other",
+        "next: cmmsim budget runs/mine",
+    ]
+    commands = typer.main.get_command(app).commands
+    assert not [
+        name
+        for name in WITHOUT_PLUGINS
+        if any(option.name == "plugin" for option in commands[name].params)
+    ]
 
 
 def test_the_declared_effect_of_cameras_that_are_known_only_so_well_is_no_missed_goal(result):

@@ -4,6 +4,7 @@ they are.
 
 import io
 import json
+import re
 from dataclasses import astuple
 
 import cv2
@@ -212,6 +213,24 @@ def test_what_a_run_lacks_is_left_out_and_said(run_folder):
     text = run_folder.scenario.read_text().replace('"ctrack780"', '"gone.toml"')
     run_folder.scenario.write_text(text)
     assert "Cameras, stickers and images are left out" in read_motion(run_folder.path).notes[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("of_run", "asked", "drawn_by"),
+    [
+        ("scene", None, "scene"),
+        ("statistical", None, "analytic"),
+        ("pyrender", "analytic", "analytic"),
+    ],
+)
+def test_a_replay_is_drawn_as_the_run_unless_asked_otherwise(run_folder, of_run, asked, drawn_by):
+    text = run_folder.scenario.read_text()
+    run_folder.scenario.write_text(
+        re.sub('^renderer = ".*"', f'renderer = "{of_run}"', text, flags=re.MULTILINE)
+    )
+    assert f'renderer = "{of_run}"' in run_folder.scenario.read_text()
+    assert read_motion(run_folder.path, renderer=asked).renderer == drawn_by
 
 
 @pytest.mark.slow
