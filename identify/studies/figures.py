@@ -44,6 +44,7 @@ FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
 # Largest factor by which bands extend a logarithmic axis beyond the curves. Wider bands are cut.
 WIDEST_BAND = 3.0
+LINE_IN = 0.16  # height of a line of the title or legend, by which a figure grows, inches
 LETTERS_PER_INCH = 14.0  # letters of a title per inch, a little fewer than fit
 BESIDE = 1.02  # ratio between the abscissae of two neighbouring curves with the same levels
 # Largest number of separate curves. If the other factors have more settings, all rows form one
@@ -234,20 +235,20 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 
 
 def _title(figure: Figure, text: str) -> None:
-    """Write a title above all panels, in as many lines as the width of the figure needs.
+    """Write a title above all panels, for which the figure grows, in as many lines as it needs.
 
     The title says if data lie beyond the frame of a panel, see WIDEST_BAND.
     """
     drawn = [(axes.get_ylim(), line.get_ydata()) for axes in figure.axes for line in axes.lines]
     if any(np.min(values) < low or np.max(values) > high for (low, high), values in drawn):
         text += "; what lies beyond the frame is cut"
-    figure.suptitle(
-        "\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9
-    )
+    lines = wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))
+    figure.suptitle("\n".join(lines), fontsize=9)
+    figure.set_figheight(figure.get_figheight() + LINE_IN * len(lines))
 
 
 def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
-    """Draw one legend below all panels, where it covers no data, if any curve has a label."""
+    """Draw one legend below all panels, for which the figure grows, if any curve has a label."""
     entries: dict[str, Any] = {}
     for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
@@ -257,6 +258,7 @@ def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
         columns = max(1, min(fits, len(entries)))
         style: Any = {"loc": "outside lower center", "fontsize": "small", "ncols": columns}
         figure.legend(entries.values(), entries, **style)
+        figure.set_figheight(figure.get_figheight() + LINE_IN * -(-len(entries) // columns))
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:

@@ -254,6 +254,27 @@ def test_long_title_stays_within_the_figure_of_a_single_law():
     assert title.y0 > figure.axes[0].title.get_window_extent().y1
 
 
+@pytest.mark.parametrize("title", ["Short", "Long enough for a second line of the figure " * 2])
+@pytest.mark.parametrize("count", [1, 2])
+def test_labels_of_axes_touch_neither_title_nor_legend_of_studies_side_by_side(title, count):
+    """With six curves, each with a long name, and the longest labels that kinds of rows have."""
+    shown = ["group_std_percent", "unseen_orientation_rms_urad"][:count]
+    factors = {DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]}
+    study = made_study(kind="identification", title=title, factors=factors, repeats=2, theory=[])
+    frame = made_table(study, figures=lambda *_: dict.fromkeys(shown, 1.0))
+    names = [f"{place} study of a slower servo" for place in ("first", "second", "third")]
+    together = pd.concat([frame.assign(study=name) for name in names])
+    named = study.model_copy(update={"factors": factors | {"study": names}})
+    figure = factor_figure(named, together, DARK, shown)
+    figure.draw_without_rendering()
+    title_box, legend = (one.get_window_extent() for one in (figure.texts[0], figure.legends[0]))
+    assert len(figure.legends[0].get_texts()) == 6
+    for axes in figure.axes:
+        label = axes.yaxis.label.get_window_extent()
+        assert label.y1 < title_box.y0
+        assert label.y0 > legend.y1
+
+
 def test_laws_over_two_factors_give_each_value_its_own_look_in_their_one_legend():
     laws = [
         Law(figure=POSITION, factor=DARK, exponent=1.0),
