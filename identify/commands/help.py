@@ -1,5 +1,6 @@
 """Help of the command line, with commands first and by group, and the exit statuses."""
 
+from pathlib import Path
 from typing import Any, ClassVar
 
 import typer
@@ -62,6 +63,9 @@ class Command(TyperCommand):
         if name != "out" or any(one.param_type_name == "argument" for one in self.params):
             return ""
         folder = typed[0] if typed and not typed[0].startswith("-") else "FOLDER"
+        # What a run has written lies in the folder that is meant.
+        if Path(folder).is_file():
+            folder = str(Path(folder).parent)
         return f"A folder stands after --out: cmmsim {self.name} --out {folder}"
 
     def _remedy(self, option: str, message: str) -> str:

@@ -87,6 +87,10 @@ class RunFolder:
         study. The message names the first missing file and the stage that writes it. Raises
         RecordError if a netCDF file cannot be read, or its digest is wrong.
         """
+        if self.path.is_file():
+            raise OutputFolderError(
+                f"{self.path} is a file; the folder of a run is needed: --out {self.path.parent}"
+            )
         if not self.path.is_dir():
             later = any(WRITTEN_BY[name] != "excite" for name in names)
             command = "run quick" if later else "excite"

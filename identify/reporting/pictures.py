@@ -89,8 +89,9 @@ THICK = " Thick: the truth minus the identified model"
 
 GROUPS = (
     "Parameters in each sum on which the motion depends: one row per sum, one column per "
-    "parameter. The area of a dot is the share of the sum that coefficient times initial guess "
-    "has; an open dot is subtracted. A star marks a sum that is identified."
+    "parameter. The area of a dot is the size of coefficient times initial guess, as a share of "
+    "the sum of all these sizes in the row; an open dot is subtracted. A star marks a sum that is "
+    "identified."
 )
 
 CORRELATION = (
@@ -122,7 +123,7 @@ def _errors(data: RunData) -> Picture:
         return Picture(lambda: fit.error_figure(data.excitation_fit), text)
     text = (
         "Distance of both models, and of the single measured poses, from the true robot on the "
-        "first validation trajectory."
+        "first validation trajectory, with all three axes in one number."
     )
     if estimated := unseen(data.result).estimated:
         text += f" The identified model is drawn without {estimated}."
@@ -148,8 +149,10 @@ def _of_the_scene(data: RunData) -> dict[str, Picture]:
         "that time, with the stickers that were found."
     )
     residuals = (
-        "The same images, rendered again from scenario, seed and true pose: detected ellipses, and "
-        "arrows that show the error of each detected centre, enlarged as stated."
+        "The images of both cameras in the first picture of this page, half way along the exciting "
+        "trajectory: detected ellipses, and arrows that show the error of each detected centre, "
+        "enlarged as stated. A run keeps no images, so that these are rendered again from "
+        "scenario, seed and true pose."
     )
     return {
         "scene": Picture(
@@ -227,9 +230,12 @@ def _of_the_validation(data: RunData) -> dict[str, Picture]:
     alone = ""
     if data.result["identification"].get("nuisance_prior_std"):
         errors = " and the estimated errors that all frames share"
-        # The headline judges the model alone, unless the sensor states errors of its cameras.
+        # The goals judge the model alone, unless the sensor states errors of its cameras.
         if not unseen(data.result).estimated:
-            alone = " Without these errors, the model is off by what the headline says."
+            alone = (
+                " The goals judge the model without these errors, whose distance is in the rows "
+                "“identified, true” of the table below."
+            )
     bars = (
         "Distance of the true robot from the predicted poses on each validation trajectory, RMS: "
         "bars as it is, diamonds as expected from the stated uncertainty. Poses are predicted by "

@@ -271,18 +271,34 @@ def common_scale_sentence(identification: Mapping[str, Any]) -> str:
     shared = scale["shared"]
     known = sum(bool(one["identifiable"]) for one in identification["parameters"].values())
     said = (
-        f"The common scale, as the proportional gain {scale['gain']} shows it, is known to "
-        f"{100 * scale['std']:.2g} %: {len(shared) + 1} of the {known} identified parameters share "
-        "its error"
+        f"The common scale, as the proportional gain {scale['gain']} shows it, has a standard "
+        f"deviation of {100 * scale['std']:.2g} %. {len(shared) + 1} of the {known} identified "
+        "parameters share its error"
     )
     errors = found_errors(identification)
     if errors is None:
         widest = 100 * max(shared.values())
-        return f"{said}, and without it have standard deviations of at most {widest:.2g} %."
+        return f"{said}. Their ratios to this gain have standard deviations up to {widest:.2g} %."
     return (
-        f"{said}, here {100 * errors[0]:+.2g} %, and without it are off by at most "
-        f"{100 * errors[1]:.2g} %."
+        f"{said}, which is {100 * errors[0]:+.2g} % here. Their ratios to this gain are off by at "
+        f"most {100 * errors[1]:.2g} %."
     )
+
+
+def measures_sentence(result: dict[str, Any]) -> str:
+    """Return the sentences on what the goals of a run measure, which the report has as a column."""
+    validated = bool(result.get("validation"))
+    compared = [f"of the {unseen(result).what} against the true robot"] if validated else []
+    compared += ["of measured against true poses"] if result.get("sensor") else []
+    said = []
+    if compared:
+        said.append(f"Errors are the RMS of the worst axis and run: {' and '.join(compared)}.")
+    if explanation_goals(result):
+        said.append(
+            "Residuals are measured minus identified poses; their p value is the probability that "
+            "noise alone makes them as correlated from frame to frame."
+        )
+    return " ".join(said)
 
 
 def print_identification(result: dict[str, Any], path: Path) -> None:
@@ -324,7 +340,11 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
         table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note
     )
     identification = result.get("identification") or {}
-    for said in (common_scale_sentence(identification), intervals_sentence(identification)):
+    for said in (
+        measures_sentence(result),
+        common_scale_sentence(identification),
+        intervals_sentence(identification),
+    ):
         if said:
             typer.echo(said)
     for goal in goals:

@@ -182,11 +182,12 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
         predicted = KeyNumber(
             number(float(found.rows[:, :3].max()), 2),
             "µm",
-            f"error of the {found.what} on validation trajectories, against the true robot.",
+            f"RMS of the worst axis: {found.what} against the true robot, on validation "
+            "trajectories.",
         )
         measured = max(rms_row(result["sensor"])[:3])
         measurement = KeyNumber(
-            number(measured, 2), "µm", "error of one measured pose, against the true pose."
+            number(measured, 2), "µm", "RMS of the worst axis: measured against true poses."
         )
         return [predicted, measurement, identified]
     before = max(rms_row(result.get("before"))[:3])
@@ -235,25 +236,27 @@ def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
-    parts = []
+    said = []
     if goals.RESIDUALS in found:
         size = number(found[goals.RESIDUALS].value, 3)
         limit = number(found[goals.RESIDUALS].limit, 3)
         # In the loop of the servo, noise also moves the robot, and gives more than its variance.
         expected = result["identification"]["expected_noise_ratio"] or 0.0
-        moving = ", which also moves the robot," if expected > 1.0 else ""
-        parts.append(
-            f"their mean square is {size} times the stated noise, and noise alone{moving} gives up "
-            f"to {limit}"
+        moving = ", more than 1 because noise also moves the robot" if expected > 1.0 else ""
+        said.append(
+            f"Their mean square is {size} times that which the cameras state. Noise alone gives up "
+            f"to {limit}{moving}."
         )
     if goals.CHANCE in found:
         chance = share(found[goals.CHANCE].value / 100)
-        parts.append(f"noise alone would be as correlated in {chance} of cases")
-    said = "; ".join(parts)
+        said.append(
+            f"In {chance} of experiments with noise alone, the residuals are as correlated from "
+            "frame to frame as here."
+        )
     if explained:
-        return f"The residuals are the noise of the cameras: {said}."
+        return " ".join(["The residuals are the noise of the cameras.", *said])
     cause = _cause(consistent, result)
-    return f"The residuals are more than the noise of the cameras: {said}. {cause}"
+    return " ".join(["The residuals are more than the noise of the cameras.", *said, cause])
 
 
 def _drift_warning(result: dict[str, Any]) -> str | None:

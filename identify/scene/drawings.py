@@ -102,7 +102,7 @@ def overview_figure(
     draw_scene(panels["scene"], cell, view.pose, viewpoint or Viewpoint(), rays=True, labels=True)
     for side, name in enumerate(SIDES):
         draw_image(panels[name], view, side, arrows)
-        panels[name].set(xlabel="", xticks=[], yticks=[])
+        panels[name].set(xlabel="", ylabel="", xticks=[], yticks=[])
     _explain(figure, view, arrows)
     return figure
 
@@ -180,6 +180,7 @@ def show_image(axes: Axes, view: StereoView, side: int) -> None:
     )
     axes.tick_params(labelsize=7)
     axes.set_xlabel("px", fontsize=8)
+    axes.set_ylabel("px", fontsize=8)
 
 
 def brightened(image: Array) -> Array:
@@ -254,11 +255,17 @@ def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
 
 
 def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -> None:
-    positions = [(camera.base_from_camera @ [0, -0.09, -0.06, 1])[:3] for camera in cell.cameras]
-    words = [f"{camera.name} camera" for camera in cell.cameras]
-    for text, position in zip(words, positions, strict=True):
+    for camera in cell.cameras:
+        x, y = painter.pixels(camera_box(camera)[0]).T
         axes.annotate(
-            text, tuple(painter.pixels(position)), fontsize=8, ha="center", va="bottom", zorder=5
+            f"{camera.name} camera",
+            (x.mean(), y.max()),
+            (0, 3),
+            textcoords="offset points",
+            fontsize=8,
+            ha="center",
+            va="bottom",
+            zorder=5,
         )
     for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
         flat = painter.pixels(vertices)

@@ -16,7 +16,7 @@ from rich.console import Console
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
 from identify.commands import run_stages as command_line
-from identify.commands.help import BEYOND_LIMIT
+from identify.commands.help import BEYOND_LIMIT, MISUSED
 from identify.commands.options import parse_settings
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, save_result
@@ -142,6 +142,14 @@ def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_set
     assert "cmmsim record --out" in one_line(capfd.readouterr().err)
 
 
+def test_a_file_of_a_run_in_place_of_its_folder_is_answered_with_the_folder(run_folder, capfd):
+    assert command("report", run_folder.result) == MISUSED
+    said = " ".join(capfd.readouterr().err.split())
+    assert said.endswith(f"cmmsim report --out {run_folder.path}")
+    assert command("report", "--out", run_folder.result) == 1
+    assert one_line(capfd.readouterr().err).endswith(f"--out {run_folder.path}\n")
+
+
 def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_report_is(
     calls, run_folder, capsys
 ):
@@ -155,6 +163,8 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         "and more than 3 standard"
     )
     assert f"{missed} deviations, joint1.viscous\n" in shown
+    measured = "identified model against the true robot and of measured against true poses.\n"
+    assert f"Errors are the RMS of the worst axis and run: of the {measured}"[:-1] in shown
     assert all(
         text in shown
         for text in ("validation motion, position", "µrad", "stereo frames", str(run_folder.report))

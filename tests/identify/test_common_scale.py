@@ -34,12 +34,12 @@ def test_one_sentence_tells_the_error_that_all_share_from_what_is_left():
     found = {"parameters": ENTRIES, "common_scale": SCALE}
     assert found_errors(found) == pytest.approx((-0.075, 1 - 0.915 / 0.925))
     said = common_scale_sentence(found)
-    assert "is known to 3.8 %: 2 of the 3 identified parameters share its error" in said
-    assert "here -7.5 %" in said
-    assert "without it are off by at most 1.1 %" in said
+    assert "a standard deviation of 3.8 %. 2 of the 3 identified parameters share its error" in said
+    assert "which is -7.5 % here" in said
+    assert "ratios to this gain are off by at most 1.1 %" in said
     unknown = {name: entry | {"true": None} for name, entry in ENTRIES.items()}
     said = common_scale_sentence({"parameters": unknown, "common_scale": SCALE})
-    assert "without it have standard deviations of at most 0.4 %" in said
+    assert "ratios to this gain have standard deviations up to 0.4 %" in said
     assert common_scale_sentence({"parameters": ENTRIES, "common_scale": None}) == ""
 
 

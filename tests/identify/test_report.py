@@ -347,6 +347,14 @@ def test_times_along_a_path_do_not_touch_even_where_it_crosses_itself():
             boxes = [text.get_window_extent() for text in axes.texts]
             assert len(boxes) >= 4
             assert [pair for pair in combinations(boxes, 2) if pair[0].overlaps(pair[1])] == []
+    figure = paths.path_figure(
+        np.linspace(0, 10, 200), np.sin(turns)[:, None] * np.eye(6)[0] * 1e-2
+    )
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    shown = axes.transData.transform(axes.lines[0].get_xydata())
+    assert len(axes.texts) == 10
+    assert not any(text.get_window_extent().contains(*one) for text in axes.texts for one in shown)
 
 
 def test_ellipses_hold_95_percent_of_drawn_errors():
@@ -541,6 +549,7 @@ def test_cameras_are_acquitted_when_they_err_by_white_noise_of_the_size_that_the
 
 def test_the_first_look_has_three_numbers_with_and_without_truth(result):
     assert [one.value for one in key_numbers(result)] == ["1.8", "7", "4"]
+    assert all("RMS of the worst axis" in one.meaning for one in key_numbers(result)[:2])
     for name in ("sensor", "validation"):
         del result[name]
     assert [one.value for one in key_numbers(result)] == ["22", "–", "4"]
@@ -809,6 +818,8 @@ def test_bars_and_diamonds_of_a_validation_run_are_of_the_same_poses(result):
     assert heights == [[size, size] for size in (0.5, 0.6, 0.7, 3.0, 4.0, 5.0)]
     diamonds = [list(line.get_ydata()) for line in panels[0].lines if line.get_marker() == "D"]
     assert diamonds == [[size, size] for size in (1.5, 2.5, 3.5)]
+    # The limits of the goals are about other poses, and no line is drawn at them.
+    assert {line.get_marker() for line in panels[0].lines} == {"D", "_"}
     assert [row[1] for row in tables.prediction_table(result).rows[:2]] == ["1.50", "0.500"]
 
 
@@ -823,7 +834,9 @@ def test_the_page_says_how_many_quantities_a_motion_shows_and_why_noise_gives_mo
     details = [goal.detail for goal in check_goals(result)]
     assert any("1.100 ± 0.040, more than 1 as it also moves the robot" in text for text in details)
     sentences = " ".join(verdict(result, True).sentences)
-    assert "noise alone, which also moves the robot, gives up to 1.22" in sentences
+    assert (
+        "Noise alone gives up to 1.22, more than 1 because noise also moves the robot." in sentences
+    )
     found["expected_noise_ratio"] = 1.0
     assert not any("more than 1" in goal.detail for goal in check_goals(result))
 

@@ -165,6 +165,12 @@ def test_the_base_hides_no_leg_of_the_robot_in_a_picture(cell):
 def test_figures_are_drawn_with_words_of_what_they_show(cell, view):
     scene = drawn_words(scene_figure(cell, MOVED))
     assert {"left camera", "right camera", "platform", "x", "y", "z"} <= scene
+    named = scene_figure(cell, MOVED)
+    plain = drawn(scene_figure(cell, MOVED, labels=False))
+    drawn(named)
+    for text in (one for one in named.findobj(Text) if one.get_text().endswith(" camera")):
+        left, low, right, high = (int(end) for end in text.get_window_extent().extents)
+        assert plain[len(plain) - high : len(plain) - low, left:right].min() == 255
     assert "stickers\nof the base" in scene
     both = drawn_words(stereo_figure(view, arrows=2000.0))
     assert any("2000 times enlarged" in words for words in both)

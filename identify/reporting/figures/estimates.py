@@ -138,7 +138,7 @@ def group_figure(
         axes.set_title("The motion shows every parameter separately: there are no sums")
         return figure
     dot_matrix(axes, shares[:, used], labels, [columns[k] for k in used])
-    _key(axes, (1.0, 0.25, 0.05), "share of the sum", "subtracted")
+    _key(axes, (1.0, 0.25, 0.05), "share of the sum of sizes", "subtracted")
     return figure
 
 

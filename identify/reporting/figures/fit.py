@@ -29,11 +29,6 @@ from identify.reporting.figures.style import (
     legend_above,
     moving,
 )
-from identify.reporting.goals import (
-    UNSEEN_ORIENTATION,
-    UNSEEN_POSITION,
-    check_goals,
-)
 from identify.reporting.number_format import significant
 
 # Half width of the band in which the true errors are expected, in standard deviations. It contains
@@ -266,14 +261,14 @@ def validation_figure(result: dict[str, Any]) -> Figure:
     """Draw the actual and the expected distance of the true robot from the predicted poses.
 
     The RMS distances of each validation trajectory have bars and diamonds. The distance of the
-    measured poses from the identified model, and the limits of the goals, are drawn as well.
+    measured poses from the identified model is drawn as well. The limits of the goals are not, as
+    they can be about other poses.
     """
     validation = result["validation"]
-    limits = {goal.name: goal.limit for goal in check_goals(result)}
     figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
-    for axes, first, goal in ((panels[0], 0, UNSEEN_POSITION), (panels[1], 3, UNSEEN_ORIENTATION)):
+    for axes, first in zip(panels, (0, 3), strict=True):
         for i in range(first, first + 3):
             actual = [actual_row(run)[i] for run in validation]
             measured = [rms_row(run["measured"])[i] for run in validation]
@@ -310,13 +305,6 @@ def validation_figure(result: dict[str, Any]) -> Figure:
                 fillstyle="none",
                 label="expected" if labelled else None,
             )
-        axes.axhline(
-            limits[goal],
-            color=GREY,
-            linestyle="--",
-            linewidth=0.9,
-            label=f"limit of the goal, {limits[goal]:.3g} {UNITS[first]}",
-        )
         axes.set_ylabel(f"RMS of {'position' if first == 0 else 'orientation'} [{UNITS[first]}]")
         # On a narrow screen, a legend at the right would be out of sight.
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)

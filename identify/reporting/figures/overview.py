@@ -27,7 +27,8 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
     width, height = OVERVIEW
     beneath = 0.0 if view is None else BENEATH
     figure = Figure(figsize=(width, height * (1 - BENEATH + beneath)))
-    axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
+    # The name of the upper camera is above the scene.
+    axes = figure.add_axes((0.08, beneath, 0.87, 0.97 - beneath))
     draw_scene(axes, cell, pose, Viewpoint(), rays=True, labels=True)
     if view is not None:
         # The images are square, but the figure, whose fractions are the coordinates, is not.
@@ -40,7 +41,7 @@ def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None)
             for body, found in view.found.items():
                 x, y = found.centres[number].T
                 axes.scatter(x, y, s=9, facecolors="none", edgecolors=FOUND[body], linewidths=0.5)
-            axes.set(xticks=[], yticks=[], xlabel="")
+            axes.set(xticks=[], yticks=[], xlabel="", ylabel="")
             axes.set_title(f"seen by the {name} camera", fontsize=8, pad=2)
     return figure
 

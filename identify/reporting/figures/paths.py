@@ -121,17 +121,22 @@ AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], 
 
 
 def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Write its time beside each mark of a path, unless other labels and marks leave no room."""
+    """Write its time beside each mark of a path, unless other labels and marks leave no room.
+
+    A label is on the path only where there is no place beside it.
+    """
     axes.figure.draw_without_rendering()
-    flat = path[marks]
+    flat = path
     if path.shape[1] == 3:
-        flat = np.column_stack(proj3d.proj_transform(*flat.T, axes.get_proj())[:2])
+        flat = np.column_stack(proj3d.proj_transform(*path.T, axes.get_proj())[:2])
     points = axes.transData.transform(flat) * 72 / axes.figure.dpi
-    taken = [(point - 2.0, point + 2.0) for point in points]
-    for k, point, anchor in zip(marks, points, flat, strict=True):
+    taken = [(point - 2.0, point + 2.0) for point in points[marks]]
+    for k, point, anchor in zip(marks, points[marks], flat[marks], strict=True):
         label = "start" if k == marks[0] else f"{time[k]:.3g} s"
         half = np.array([0.31 * LABEL * len(label), 0.6 * LABEL])
-        for step in (step for far in (3.0, 9.0, 15.0) for step in AROUND * (far + half)):
+        steps = [step for far in (3.0, 9.0, 15.0) for step in AROUND * (far + half)]
+        # The sort is stable: of places that are equally good, the nearest comes first.
+        for step in sorted(steps, key=lambda step: _faults(point + step, half, points, marks, k)):
             low, high = point + step - half, point + step + half
             if all((low > other).any() or (high < one).any() for one, other in taken):
                 taken.append((low, high))
@@ -146,6 +151,20 @@ def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -
                     color=RED if k == marks[0] else INK,
                 )
                 break
+
+
+def _faults(
+    middle: Array, half: Array, points: Array, marks: NDArray[np.int_], mark: int
+) -> tuple[bool, bool]:
+    """Tell whether a label is nearer to another mark than to its own, and whether it hides a path.
+
+    middle, half (2,)  Middle and half size of the label.
+    points (N, 2)      Points of the path, of which `marks` and `mark` are indices.
+    """
+    away = np.linalg.norm(points[marks] - middle, axis=1)
+    own = np.linalg.norm(points[mark] - middle)
+    covered = (np.abs(points - middle) < half).all(axis=1)
+    return bool(away.min() < own), bool(covered.any())
 
 
 def _plain_box(axes: Axes3D) -> None:
