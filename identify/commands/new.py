@@ -138,8 +138,8 @@ def sensor(
     of your own.
 
     With --robot, the file has the robot's home, a platform on which its legs end, and cameras that
-    see all stickers of the built-in sensor at home. It states these alone. The built-in sensor
-    supplies the rest.
+    see all stickers of the built-in sensor at home. For legs that come from above, platform and
+    cameras are upside down. It states these alone. The built-in sensor supplies the rest.
 
     Reads a robot file, if one is named. Writes one TOML file.
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.files import SensorFile
 from cmmsim.files.rig_and_bodies import marked_body
-from cmmsim.files.schema import Body, HalfSpace, unit
+from cmmsim.files.schema import Body, HalfSpace, StickerPlane, unit
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import ScenarioError
@@ -19,7 +19,10 @@ B = TypeVar("B", bound=Body)
 
 FARTHER = 1.05  # ratio of successive distances of the cameras from their target that are tried
 DISTANCES = 25  # number of these distances
-NEGLIGIBLE_M = 0.03  # largest distance, m, of a leg's end outside a plane that is not moved for it
+# Largest distance, m, of a leg's end outside a plane, or outside a cut, that is not moved for it. A
+# plane carries stickers, and is moved only if it must be.
+NEGLIGIBLE_M = 0.03
+NEGLIGIBLE_OF_CUTS_M = 0.01
 CLEAR_M = 0.05  # least distance, m, of the stickers of the base in front of the base joints
 DIGITS = 4  # number of decimals of positions, m
 
@@ -27,19 +30,28 @@ DIGITS = 4  # number of decimals of positions, m
 def fitted(file: SensorFile, robot: Robot) -> SensorFile:
     """Return a sensor file that fits a robot.
 
-    Platform, base and rig are moved from the home of the file to that of the robot. Planes and cuts
-    of the platform are moved outwards to legs that end more than 0.03 m outside, and base and rig
-    with them. The cameras are moved away from their target until they see all stickers that they
-    saw before. Raises ScenarioError if they never do.
+    Platform, base and rig are moved from the home of the file to that of the robot. If the legs
+    come from above, all are turned upside down first. Planes and cuts of the platform are moved
+    outwards to legs that end more than 0.03 m and 0.01 m outside, and base and rig with the planes.
+    The cameras are moved away from their target until they see all stickers that they saw before.
+    Raises ScenarioError if they never do.
     """
+    geometry = robot.geometry
+    feet = (geometry.base_joints - geometry.platform_joints)[:, 2].mean()
+    # Legs from above would pass through a platform above its joints.
+    if feet - robot.home_pose[2] > NEGLIGIBLE_M:
+        file = _upside_down(file)
     move = robot.home_pose[:3] - np.array(file.platform.home[:3])
     joints = robot.geometry.platform_joints
 
-    def around_joints(normal: Array, point: Array) -> Array:
+    def around_joints(one: HalfSpace) -> HalfSpace:
+        normal, point = unit(one.normal), np.array(one.point)
         outside = float(((joints - point) @ normal).max())
-        return point + normal * (outside if outside > NEGLIGIBLE_M else 0.0)
+        least = NEGLIGIBLE_M if isinstance(one, StickerPlane) else NEGLIGIBLE_OF_CUTS_M
+        moved = point + normal * (outside if outside > least else 0.0)
+        return one.model_copy(update={"point": _rounded(moved)})
 
-    platform = _moved(file.platform, around_joints)
+    platform = _with_sides(file.platform, around_joints)
     platform = platform.model_copy(update={"home": tuple(robot.home_pose.tolist())})
     away = np.subtract(file.rig.position, file.rig.target)
     ahead = unit(away * [1, 1, 0])
@@ -50,7 +62,10 @@ def fitted(file: SensorFile, robot: Robot) -> SensorFile:
     front = (marked_body("base", file.base).nominal + move) @ ahead
     behind = robot.geometry.base_joints @ ahead + CLEAR_M - front.min()
     move = move + max(0.0, *grown, *behind) * ahead
-    base = _moved(file.base, lambda _, p: p + move)
+    base = _with_sides(
+        file.base,
+        lambda one: one.model_copy(update={"point": _rounded(np.array(one.point) + move)}),
+    )
     target = np.array(file.rig.target) + move
     wanted = _seen(file)
     for factor in FARTHER ** np.arange(DISTANCES):
@@ -94,16 +109,35 @@ def fitted_text(file: SensorFile, name: str, basis: str) -> str:
     return "\n".join([*lines, ""])
 
 
-def _moved(body: B, point: Callable[[Array, Array], Array]) -> B:
-    """Return a body whose planes and cuts go through other points.
+def _upside_down(file: SensorFile) -> SensorFile:
+    """Return a sensor file with a half turn about the horizontal direction of the cameras."""
+    away = np.subtract(file.rig.position, file.rig.target)
+    axis = unit(away * [1, 1, 0])
+    turn = 2 * np.outer(axis, axis) - np.eye(3)
 
-    `point` returns the new point (3,) for an outward unit normal and the old point.
-    """
+    def turned(vector: ArrayLike) -> tuple[float, ...]:
+        return tuple((turn @ np.array(vector) + 0.0).tolist())
 
     def other(one: HalfSpace) -> HalfSpace:
-        moved = point(unit(one.normal), np.array(one.point))
-        return one.model_copy(update={"point": _rounded(moved)})
+        names = {"normal", "point", "across"} & type(one).model_fields.keys()
+        return one.model_copy(update={name: turned(getattr(one, name)) for name in names})
 
+    platform, base = (_with_sides(body, other) for body in (file.platform, file.base))
+    home = (*turned(file.platform.home[:3]), *file.platform.home[3:])
+    position, target = turned(file.rig.position), turned(file.rig.target)
+    return file.model_copy(
+        update={
+            "platform": platform.model_copy(update={"home": home}),
+            "base": base,
+            "rig": file.rig.model_copy(
+                update={"position": position, "target": target, "distance": None}
+            ),
+        }
+    )
+
+
+def _with_sides(body: B, other: Callable[[HalfSpace], HalfSpace]) -> B:
+    """Return a body with other planes and cuts."""
     planes = body.planes.model_copy(update={name: other(plane) for name, plane in body.planes})
     return body.model_copy(update={"planes": planes, "cuts": [other(cut) for cut in body.cuts]})
 

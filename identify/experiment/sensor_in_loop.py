@@ -12,9 +12,11 @@ import cmmsim
 from cmmsim.files import SensorFile
 from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.schema import unit
+from cmmsim.geometry.pose import pose_to_transform
 from cmmsim.uncertainty.known_rig import KnownRig
 from cmmsim.visibility import SightLines, stated_covariance
 from dynamics import Robot
+from dynamics.bodies import parts_of
 from dynamics.closed_loop import IdealSensor, RateSensor
 from identify.arrays import Array
 from identify.errors import ScenarioError
@@ -125,12 +127,39 @@ def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
     Ends inside have negative values. The second value is the distance [m] between the home of this
     platform and the robot's home.
     """
+    normals, reach = _half_spaces(file)
+    outside = (robot.geometry.platform_joints @ normals.T - reach).max(axis=1)
+    return outside, float(np.linalg.norm(robot.home_pose[:3] - np.array(file.platform.home[:3])))
+
+
+def lengths_inside(robot: Robot, file: SensorFile) -> tuple[Array, tuple[int, ...]]:
+    """Return the lengths (n,) [m] of the legs' rods inside the platform of a sensor file, at home.
+
+    The second value has the index of the leg of each rod.
+    """
+    normals, reach = _half_spaces(file)
+    parts = parts_of(robot.geometry)
+    base_from_platform = pose_to_transform(robot.home_pose)
+    ends = parts.rods(robot, robot.home_pose) - base_from_platform[:3, 3]
+    # Depths (rods, 2, planes) of both ends below the planes, m.
+    depths = reach - ends @ base_from_platform[:3, :3] @ normals.T
+    slopes = depths[:, 1] - depths[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = -depths[:, 0] / slopes
+    # Each plane leaves the part of the rod, from 0 to 1, that is on its inner side.
+    enters = np.where(slopes > 0, crossings, np.where((slopes == 0) & (depths[:, 0] < 0), 1.0, 0.0))
+    leaves = np.where(slopes < 0, crossings, 1.0)
+    shares = leaves.min(axis=1, initial=1.0) - enters.max(axis=1, initial=0.0)
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    return np.maximum(shares, 0.0) * lengths, tuple(part.leg for part in parts.all)
+
+
+def _half_spaces(file: SensorFile) -> tuple[Array, Array]:
+    """Return normals (n, 3) and offsets (n,) [m] of all sides of the platform of a sensor file."""
     body = marked_body("platform", file.platform)
     cuts = file.platform.cuts
     normals = np.vstack([body.normals, *[unit(cut.normal) for cut in cuts]])
-    reach = np.append(body.offsets, [unit(cut.normal) @ cut.point for cut in cuts])
-    outside = (robot.geometry.platform_joints @ normals.T - reach).max(axis=1)
-    return outside, float(np.linalg.norm(robot.home_pose[:3] - np.array(file.platform.home[:3])))
+    return normals, np.append(body.offsets, [unit(cut.normal) @ cut.point for cut in cuts])
 
 
 def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:

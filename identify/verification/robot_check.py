@@ -25,7 +25,7 @@ from identify.scenario import Excitation
 from identify.setup import Setup
 from identify.verification.finding import Finding
 from identify.verification.loop_check import CheckSettings, check_gains, check_loop, check_steps
-from identify.verification.sensor_check import REFUSED, about_sensor
+from identify.verification.sensor_check import REFUSED, about_sensor, check_legs_outside
 
 SAMPLES = 2000  # number of random vectors of joint coordinates over the travel
 # Largest ratio between the length of a mesh and the reach of its body, in either direction.
@@ -57,6 +57,7 @@ def check_robot(
         lambda: check_steps(robot, parameters, around),
         lambda: check_gains(robot, parameters, around),
         lambda: about_sensor(robot, around.sensor, around.sensor_file),
+        lambda: check_legs_outside(robot, around.sensor, around.sensor_file),
     ]
     findings = []
     with (progress or SilentProgress()).stage("check", len(questions)) as advance:

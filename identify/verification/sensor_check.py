@@ -10,6 +10,7 @@ from identify.excitation.constraints import MOVE_RIG, seen_by_plane
 from identify.experiment.sensor_in_loop import (
     OFF_PLATFORM_M,
     OWN_SENSOR,
+    lengths_inside,
     platform_distances,
     sight_lines,
 )
@@ -17,6 +18,7 @@ from identify.verification.finding import Finding
 
 # Checks that a run repeats before it begins, and that end it.
 REFUSED = ("sensor's platform", "sensor's home", "visible stickers")
+MOST_INSIDE_M = 0.02  # largest length, m, of a leg inside the platform of the sensor
 
 
 def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
@@ -51,3 +53,20 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
     yield Finding(
         "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
     )
+
+
+def check_legs_outside(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Finding]:
+    """Check that no leg runs through the platform in a sensor file, with the platform at home."""
+    lengths, legs = lengths_inside(robot, file)
+    rod = int(np.argmax(lengths))
+    most = float(lengths[rod])
+    leg = legs[rod] + 1
+    text = f"no leg runs through the platform in the file of sensor {sensor}"
+    if most > MOST_INSIDE_M:
+        text = (
+            f"{most:.3g} m of leg {leg} are inside the platform in the file of sensor {sensor}, "
+            "which lies on the side of its joints from which the legs come; "
+            f"{OWN_SENSOR}"
+        )
+    inside = most <= MOST_INSIDE_M
+    yield Finding("legs outside", inside, most, text, limit=MOST_INSIDE_M, unit="m", leg=leg)

@@ -3,6 +3,7 @@ limit and leg.
 """
 
 import json
+from dataclasses import replace
 from importlib import resources
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 from cmmsim.files import read_sensor_file
 from cmmsim.files.rig_and_bodies import marked_body
 from dynamics import Robot, load_robot
+from dynamics.kinematics.platform import Chart
 from dynamics.robot_file import parsed_robot
 from identify.commands import run_stages
 from identify.commands.help import BEYOND_LIMIT
@@ -22,7 +24,7 @@ from identify.experiment.sensor_in_loop import check_platform
 from identify.scenario import load_scenario
 from identify.setup import Setup
 from identify.verification.robot_check import check_sets, check_travel, run_warning
-from identify.verification.sensor_check import about_sensor
+from identify.verification.sensor_check import about_sensor, check_legs_outside
 from tests.identify.commands import command, one_line
 
 
@@ -179,7 +181,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
     )
     said = one_line(capfd.readouterr().err)
     assert (
-        "2 of 24 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+        "2 of 25 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
         "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "
@@ -259,8 +261,50 @@ def test_a_sensor_made_for_a_robot_sees_its_platform_and_holds_its_legs():
     assert marked_body("base", made.base).nominal[:, 0].min() > large["base_joints"][:, 0].max()
 
 
-def test_a_sensor_made_for_a_built_in_robot_is_the_built_in_sensor(tmp_path):
+def test_a_sensor_made_for_a_built_in_robot_is_the_built_in_sensor_but_for_a_cut(tmp_path):
+    """The built-in platform ends 0.024 m before the joints of legs 4 and 5."""
     mine = tmp_path / "mine.toml"
     assert command("new", "sensor", mine, "--robot", "rss6", "--quiet") == 0
+    built_in, made = read_sensor_file("ctrack780"), read_sensor_file(mine)
+    cuts = list(built_in.platform.cuts)
+    farthest = load_robot("rss6").geometry.platform_joints[:, 0].min()
+    cuts[1] = cuts[1].model_copy(update={"point": (round(farthest, 4), 0.0, 0.0)})
+    platform = built_in.platform.model_copy(update={"cuts": cuts})
     own = {"name": "ctrack780", "based_on": None}
-    assert read_sensor_file(mine).model_copy(update=own) == read_sensor_file("ctrack780")
+    assert made.model_copy(update=own) == built_in.model_copy(update={"platform": platform})
+
+
+def test_a_sensor_for_legs_from_above_has_its_platform_below_them():
+    """The robot is a Delta robot whose base axes point up, as delta3 turned about its x axis."""
+    delta3 = load_robot("delta3")
+    turn = np.array([1.0, -1.0, -1.0])
+    legs = tuple(
+        leg.model_copy(
+            update={
+                name: turn * getattr(leg, name)
+                for name, value in leg
+                if isinstance(value, np.ndarray)
+            }
+        )
+        for leg in delta3.geometry.legs
+    )
+    home = np.concatenate([turn * delta3.home_pose[:3], np.zeros(3)])
+    geometry = replace(
+        delta3.geometry,
+        legs=legs,
+        chart=Chart("translation", tuple(home)),
+        gravity=turn * delta3.geometry.gravity,
+    )
+    robot = delta3.with_geometry(geometry)
+    file = read_sensor_file("ctrack780")
+    at_home = file.platform.model_copy(update={"home": tuple(home)})
+    (found,) = check_legs_outside(robot, "mine", file.model_copy(update={"platform": at_home}))
+    assert not found.ok
+    assert "of leg" in found.text
+    made = fitted(file, robot)
+    findings = [*about_sensor(robot, "mine", made), *check_legs_outside(robot, "mine", made)]
+    assert all(one.ok for one in findings)
+    # the same scene, seen from the other side of its horizontal plane
+    plain = fitted(file, delta3)
+    assert made.rig.position == pytest.approx(turn * plain.rig.position)
+    assert made.platform.planes.B.point == pytest.approx(turn * plain.platform.planes.B.point)
