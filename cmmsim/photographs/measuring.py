@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import PhotographError
 from cmmsim.geometry.pose import Array
+from cmmsim.measuring.frame_solver import OF_OUTLINE
 from cmmsim.measuring.layout_search import bright_ellipses
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, measure_frame
@@ -129,19 +130,29 @@ def measure_pairs(
         if not measurement.ok:
             if number == 0:
                 _require_order(photograph, estimator)
-            measurement = lost_measurement(measurement.reason + _hint(photograph, estimator))
+            reason = measurement.reason
+            measurement = lost_measurement(reason + _hint(reason, photograph, estimator))
         yield MeasuredPair(photograph.name, photograph.time, measurement, photograph.images)
 
 
-def _hint(lost: Photograph, estimator: PoseEstimator) -> str:
-    """Return a hint if each image of a lost pair shows enough bright spots; otherwise no text."""
+def _hint(reason: str, lost: Photograph, estimator: PoseEstimator) -> str:
+    """Return a hint if each image of a lost pair shows enough bright spots; otherwise no text.
+
+    reason: why the pair is lost.
+    """
     sides = bright_ellipses(readable(lost.images), estimator)
     counts = [int(fits.good.sum()) for fits in sides]
     if min(counts) < SHOWN_SHARE * len(estimator.platform.sticker_ids):
         return ""
+    outlines = (
+        "; stickers of another radius, or images of another blur, than those of teaching have "
+        "other outlines: teach anew with such images"
+        if OF_OUTLINE in reason
+        else ""
+    )
     return (
         f" ({counts[0]} bright spots in the left image and {counts[1]} in the right: do the images "
-        "belong together, and have the cameras stood still since teaching?)"
+        f"belong together, and have the cameras stood still since teaching?{outlines})"
     )
 
 

@@ -164,6 +164,9 @@ def budget(
 GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
 
 
+NEGLIGIBLE = 1e-3  # fraction of the combined uncertainty below which a table has no digits
+
+
 def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
     """Print what each source adds to poses and identified parameters.
 
@@ -183,8 +186,8 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
     rows = []
     for source in order:
         most = identified[int(np.argmax(shares[:, source]))] if means[source] else ""
-        numbers = [f"{column[source]:.3g}" for column in columns]
-        rows.append((found.words[source], *numbers, f"{means[source]:.3g}", most))
+        numbers = [_short(column[source], np.linalg.norm(column)) for column in columns]
+        rows.append((found.words[source], *numbers, _short(means[source], means.sum()), most))
     combined = [f"{np.sqrt(np.sum(column**2)):.3g}" for column in columns]
     rows.append(("combined", *combined, f"{means.sum():.3g}", ""))
     titles = ("pose\num", "pose\nurad", "predicted\num", "predicted\nurad")[: len(columns)]
@@ -197,7 +200,19 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
         "the squares sum up to that of the combined one; poses: root mean square of three axes; "
         "share: mean share of the variances of identified parameters",
     )
+    largest: dict[str, list[str]] = {}
+    for title, column in zip((*titles, "share"), (*columns, means), strict=True):
+        source = found.words[int(np.argmax(column))]
+        largest.setdefault(source, []).append(" ".join(title.split()))
+    said = "; ".join(f"of {', '.join(named)}: {source}" for source, named in largest.items())
+    typer.echo(f"largest source {said}")
     typer.echo(f"table and picture: {folder}")
+
+
+def _short(part: float, whole: float) -> str:
+    """Return a number with fewer digits if it is a negligible part of a whole."""
+    least = NEGLIGIBLE * whole
+    return f"<{least:.1g}" if 0 < abs(part) < least else f"{part:.3g}"
 
 
 GAUNTLET_HEADER = ("what", "right", "of", "share\n%", "95 % interval\n%", "goal")

@@ -341,6 +341,10 @@ def test_pairs_that_do_not_belong_together_are_lost_with_a_hint():
     found = [one.measurement for one in cmmsim.measure(*images, "ctrack780", sensor.truth)]
     assert [one.ok for one in found] == [True, False, True]
     assert "36 bright spots in the left image and 36 in the right: do" in found[1].reason
+    smaller = replace(sensor.truth, radius=0.98 * 0.003)
+    found = [one.measurement for one in cmmsim.measure(*images, "ctrack780", smaller)]
+    assert not found[0].ok
+    assert "stickers of another radius, or images of another blur" in found[0].reason
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -90,6 +91,12 @@ def test_the_command_writes_table_picture_and_numbers_that_agree(identified, cap
     assert "the largest predicted um first" in " ".join(said.split())
     assert "drives: zeros of the joints" in said
     assert "combined" in said
+    budget = error_budget(identified.path)
+    table = budget.to_dataframe()
+    for name, title in (("pose.", "pose um"), ("prediction.", "predicted um")):
+        axes = table[table["quantity"].isin([name + axis for axis in "xyz"])]
+        most = axes.assign(square=axes["added"] ** 2).groupby("source")["square"].sum().idxmax()
+        assert re.search(f"{title}[^:]*: {re.escape(most)}", said.partition("largest source ")[2])
     folder = RunFolder(identified.path).budget
     whole = json.loads((folder / "budget.json").read_text())
     with (folder / "budget.csv").open(encoding="utf-8") as file:
