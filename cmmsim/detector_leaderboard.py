@@ -32,15 +32,15 @@ from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
-# Number of discs that are drawn together.
-TOGETHER = 100
+TOGETHER = 100  # largest number of discs that are drawn together
+# Limits of a condition.
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
 # Pixels between a sharp disc's rim and the edge of the fitted part of the window.
 FREE_PX = 3
-RESAMPLES = 1000
-CONFIDENCE = 0.95
+RESAMPLES = 1000  # number of bootstrap samples for the interval of a ratio
+CONFIDENCE = 0.95  # probability that this interval contains the ratio
 # If the noise is below half a grey value, the rounding errors of neighbouring pixels are
 # correlated. A limit on the misfit assumes independent errors, so it would reject good windows.
 LIMITS = FitLimits(largest_misfit=np.inf)
@@ -270,12 +270,12 @@ def compete(
     scores: list[Score] = []
     chosen = detectors or contestants()
     for k, (own_scene, condition) in enumerate(zip(scenes, conditions, strict=True)):
-        scores += _round(own_scene, condition, draws, rng, chosen)
+        scores += _scores(own_scene, condition, draws, rng, chosen)
         report(k + 1, len(conditions))
     return scores
 
 
-def _round(
+def _scores(
     scene: Scene,
     condition: Condition,
     draws: int,

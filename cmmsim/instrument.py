@@ -151,7 +151,7 @@ class Instrument:
 
     @property
     def home(self) -> Array:
-        """Pose (6,) of the platform at teaching, m and rad."""
+        """Pose (6,) about which the platform moves at teaching, m and rad."""
         return np.array(self._file.platform.home)
 
     @property

@@ -56,7 +56,7 @@ LARGEST_GAP = 1e-4
 # A warning is given if the rms distance between the two rays of a sticker of the base exceeds this,
 # in standard deviations. It is 1.2 to 1.4 if cameras and stickers are as stated.
 LARGEST_PARTING = 3.0
-# Additional distance that is allowed for errors of the print, in their standard deviations.
+# Distance that is added to LARGEST_GAP for errors of the print, in their standard deviations.
 PRINT_REACH = 20.0
 # Phase of each pose coordinate at the start of the path, rad.
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])

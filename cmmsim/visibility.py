@@ -29,7 +29,7 @@ from cmmsim.measuring.observation import DetectionSettings, faces_camera
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.sensor import Sensor
 
-# Stickers nearer to an edge of an image do not count as visible. This is the default window's side.
+# Smallest distance of a visible sticker from an edge of an image, px: the side of a default window.
 EDGE_PX = DetectionSettings().window_size
 
 

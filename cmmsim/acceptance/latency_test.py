@@ -31,7 +31,7 @@ STREAM = 201  # number that selects the random noise
 # Radius of the circle in m, and time of one revolution in s. The speed is 0.31 m/s.
 RADIUS = 0.05
 PERIOD = 1.0
-FRAMES = 180
+FRAMES = 180  # number of frames
 # Step of the central differences of a motion, s.
 STEP = 1e-5
 # Number of least-squares steps. The first half estimates a common delay, the rest single delays.

@@ -21,7 +21,7 @@ from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.many_frames import on_all_cores
 from cmmsim.sensor import Sensor
 
-STREAM = 1  # number that selects the random noise of the first line; the next lines follow
+STREAM = 1  # number that selects the random noise of the first line. The next lines have the next.
 # Number of exposures of the artefact at rest over which lengths are averaged.
 EXPOSURES = 5
 # Irregular coordinates of the stickers that serve to recognise the artefact. Along the artefact,

@@ -48,10 +48,10 @@ from cmmsim.tracker import Tracker
 # Duration of the motion in a run, s, and number of movements to and fro in this time.
 SECONDS = 3.0
 CYCLES = 1.5
-# Amplitude of the rotation about each axis, and number of its cycles in a run.
+# Amplitude of the rotation about each axis, rad, and number of its cycles in a run.
 TURN = np.deg2rad(8.0)
 TURN_CYCLES = np.array([1.0, 1.5, 0.5])
-# Angle of the bar to the image plane in the third orientation.
+# Angle of the bar to the image plane in the third orientation, rad.
 TOWARDS_DEPTH = np.deg2rad(35.0)
 # Time step of the difference quotient of a path, s.
 STEP = 1e-4

@@ -27,7 +27,7 @@ LARGEST_DEPTH_RATIO = 0.8
 SMALLEST_SIZE = 0.1
 # Corners (8, 3) of the volume, in units of its sides.
 CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
-# Rules of the standard: numbers of lines and of different test lengths on each line.
+# Rules of the standard: smallest numbers of lines, and of different test lengths on each line.
 FEWEST_LINES = 7
 FEWEST_LENGTHS = 5
 # Smallest ratio of the longest test length to the space diagonal of the volume.
@@ -36,7 +36,7 @@ SMALLEST_LENGTH_RATIO = 2.0 / 3.0
 LINE_RATIO = 0.9
 # Test lengths of a line, as fractions of its longest test length.
 TEST_LENGTHS = frozen([0.19, 0.41, 0.6, 0.82, 1.0])
-# Ends of the lines, in half sides of the volume.
+# Ends of the diagonals on which the lines lie, in half sides of the volume.
 LINES = {
     "space 1": ((-1, -1, -1), (1, 1, 1)),
     "space 2": ((1, -1, -1), (-1, 1, 1)),

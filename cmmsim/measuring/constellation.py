@@ -59,11 +59,11 @@ def plane_normals(body: MarkedBody, camera_from_body: Array) -> Array:
 
 
 def mean_constellation(points: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the weighted mean (..., n, 3) of v views of the same stickers, moved onto each other.
+    """Move v views of the same stickers onto each other, and return their mean (..., n, 3).
 
-    The mean has about the place and orientation of the first view. The second result is its
-    covariances (..., n, 3, 3). ``points`` of the views is (..., v, n, 3), and ``covariances`` is
-    (..., v, n, 3, 3).
+    The mean is weighted, and has about the place and orientation of the first view. The second
+    result is its covariances (..., n, 3, 3). ``points`` of the views is (..., v, n, 3), and
+    ``covariances`` is (..., v, n, 3, 3).
     """
     weights = np.linalg.inv(covariances)
     mean = points[..., 0, :, :]

@@ -1,8 +1,9 @@
 """Movement of a body from a single frame of a camera with a rolling shutter.
 
 The rows of pixels are exposed one after another, so a sticker in a later row is seen later. Its
-place in the image depends on the body's pose when the middle row is exposed, and on the body's
-movement until its own row is exposed. Both are fitted to all stickers together, to first order.
+place in the image depends on the body's pose when the middle row is exposed, and on the movement
+between the exposures of the middle row and of the sticker's row. Pose and movement are fitted to
+all stickers together, to first order.
 """
 
 from __future__ import annotations
@@ -12,8 +13,7 @@ import numpy as np
 from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp, skew
 from cmmsim.measuring.sticker_windows import StickerWindows
 
-# Fewest stickers from which a movement is estimated.
-FEWEST = 6
+FEWEST = 6  # fewest stickers from which a movement is estimated
 
 
 def frame_ends_of(read: StickerWindows) -> tuple[tuple[Array, Array] | None, float]:

@@ -1,4 +1,4 @@
-"""Poses of a body, with covariances, from observed stickers without those that contradict the rest.
+"""Poses of a body and their covariances, from those observed stickers that agree with each other.
 
 The taught places are fitted to the observed stickers. Stickers are rejected one by one, the worst
 one first, in two cases:
@@ -14,10 +14,10 @@ one first, in two cases:
 A sticker is kept if the slip of a whole plane explains more of the residuals than an error of this
 sticker, as ``slip_kernels`` tells. Both have three degrees of freedom.
 
-Undetected errors of both kinds are then of the size of the noise. At least five stickers must
-remain, and more than were rejected. If three or more of the rejected stickers agree with each other
-on another pose, a group of stickers has moved. The images do not show which group it was, so the
-frame is lost.
+Undetected errors of places and of ellipses are of the size of the noise. At least five stickers
+must remain, and more than were rejected. If three or more of the rejected stickers agree with each
+other on another pose, a group of stickers has moved. The images do not show which group it was, so
+the frame is lost.
 
 All residuals can be larger than noise, for example if a camera has drifted since its calibration,
 or several stickers are slightly misplaced. The squared residual of each sticker is then divided by
@@ -60,9 +60,9 @@ CHANCE = 1e-4
 EXCESS_CHANCE = 1e-4
 # Largest mean square of the residuals in units of their noise.
 LARGEST_EXCESS = 6.0
+# Largest squared misfit of a good sticker, of its place or of an ellipse.
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
-# Smallest number of stickers that must remain.
-FEWEST = 5
+FEWEST = 5  # smallest number of stickers that must remain
 # Smallest ratio of the variance of a residual to that of the sticker's noise. Directions with a
 # smaller ratio are not tested, because the sticker alone determines the pose along them.
 SMALLEST_SHARE = 0.01
@@ -71,7 +71,7 @@ SMALLEST_SHARE = 0.01
 WARP_CHANCE = 1e-3
 # Largest squared size of a warp that noise explains, in units of the noise.
 LARGEST_WARP = float(chdtri(10, WARP_CHANCE))
-# Probability that a plane of a good frame counts as slipped. It is as large, for the same reason.
+# Probability that a plane of a good frame counts as slipped. It is larger for the same reason.
 SLIP_CHANCE = 1e-3
 # Largest squared slip of one of three planes that noise explains, in units of the noise.
 LARGEST_SLIP = float(chdtri(3, SLIP_CHANCE / 3))
@@ -85,7 +85,7 @@ TAIL = 0.999
 WARP_SHARE = 8.0
 # Fewest rejected stickers that make a frame lost if they agree with each other on another pose.
 FEWEST_RIVALS = 3
-# rad: a fit ends after a step with a smaller rotation.
+# A fit ends after a step with a rotation smaller than this, rad.
 STEP_TOLERANCE = 1e-8
 
 
@@ -317,7 +317,7 @@ def _largest_totals(freedom: int) -> Array:
 
 @lru_cache(maxsize=16)
 def _tails(freedom: int) -> Array:
-    """Return factors on a pose's covariance whose scale is estimated from residuals.
+    """Return the factors on a pose's covariance if its scale is estimated from residuals.
 
     They are for residuals with 0 to ``freedom`` degrees of freedom. The pose then has Student's
     distribution. With the factor, a normal distribution has the same quantile TAIL of the squared

@@ -38,14 +38,14 @@ BRIGHT_SHARE = 1e-4
 DARK_SHARE = 1e-3
 # Smallest step from the ground to the brightest pixels, as a fraction of the largest grey value.
 SMALLEST_STEP = 40.0 / 255.0
-SMALLEST_WINDOW_PX = 24
+SMALLEST_WINDOW_PX = 24  # smallest side of the window around a bright spot
 # Margin of windows for the error of a bright spot's rough centre.
 ROOM_PX = 8
 # Fewest recognised stickers of a platform with taught places.
 FEWEST_TAUGHT = 4
 # Allowed distance from epipolar lines if the rig is exact.
 LINE_TOLERANCE_PX = 0.5
-# Further distance that errors of the rig may cause, in its standard deviations.
+# Additional distance that is allowed for errors of the rig, in their standard deviations.
 LINE_STDS = 4.0
 # Smallest depth, and largest distance of a point from the left camera, m.
 NEAREST = 0.3

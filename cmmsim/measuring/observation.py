@@ -26,7 +26,7 @@ from cmmsim.measuring.sticker_windows import StickerObservation, StickerWindows
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.stereo_images import ManyExposures, StereoImages, Windows
 
-# Smallest cosine between a sticker's normal and the line of sight at which it is searched.
+# Smallest cosine between a sticker's normal and the line of sight at which the sticker is searched.
 GRAZING = 0.15
 
 

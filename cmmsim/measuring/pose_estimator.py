@@ -1,8 +1,7 @@
 """Measurement of one stereo frame (paper eq. 27 and 28). The true pose is not used.
 
-The pose in camera axes and its covariance come from ``frame_solver``, or from ``by_planes``. They
-are then transformed to the base frame. ``geometry.pose_fit_kernels`` computes the covariance due to
-noise, and ``solver_kernels`` enlarges it if the residuals are larger than noise.
+The pose in camera axes and its covariance come from ``frame_solver``, or from ``by_planes``. Both
+are then transformed to the base frame. ``frame_solver`` explains all parts of the covariance.
 """
 
 from __future__ import annotations

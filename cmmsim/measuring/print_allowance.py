@@ -21,7 +21,7 @@ from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.radiometry.noise import CameraNoise
 
 # Probability that light that rises across the stickers is fitted in a frame with even light. It is
-# fitted if it would move the pose by more than noise does with this probability.
+# fitted if it moves the pose further than noise does in all but this fraction of frames.
 LIGHT_CHANCE = 1e-4
 # Largest squared movement of the pose in units of its noise.
 LARGEST_LIGHT = float(chdtri(6, LIGHT_CHANCE))

@@ -23,9 +23,9 @@ from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.camera_kernels import Cameras, pose_slopes, project, transformed, weigh
 from cmmsim.geometry.transform_kernels import transform_point
 
-# A delay of the right camera, and one from row to row.
+# Number of delays: one of the right camera, and one from row to row.
 DELAYS = 2
-# Common shifts of both images, along x and y.
+# Number of common shifts: one along x and one along y in each image.
 SHIFTS = 4
 # Inverse variance of a delay before the fit, in frame periods^-2. It keeps the variance finite if
 # the stickers do not determine a delay. The row delay is that over the whole height of the image.

@@ -16,9 +16,8 @@ import numpy as np
 from cmmsim.compilation import Array, compiled
 from cmmsim.geometry.matrix_kernels import factorise, invert_factored
 
-# Planes of stickers of a body.
-PLANES = 3
-# Inverse square of the largest slip, m. It keeps the matrices regular if the stickers do not
+PLANES = 3  # number of planes of a body's stickers
+# Inverse square of the largest slip, m^-2. It keeps the matrices regular if the stickers do not
 # determine the slip of a plane. A larger slip is seen in single stickers.
 KNOWN_SLIP = 1e6
 

@@ -27,7 +27,7 @@ from cmmsim.measuring.shared_error_kernels import Images, shared_errors
 from cmmsim.measuring.slip_kernels import largest_slip
 from cmmsim.measuring.warp_kernels import SHAPES, warp
 
-MOST_STEPS = 8
+MOST_STEPS = 8  # largest number of steps of a fit
 
 # States of a frame. All but MEASURED mean that the frame is lost.
 MEASURED = 0
@@ -277,9 +277,9 @@ def few_excess(
 ) -> float:
     """Return the factor on the covariance of a pose from few stickers.
 
-    It is the mean square of the residuals of all stickers that were seen, and at least 1. The
-    squared residuals of ``rejected`` (n,) stickers count up to the limit for one sticker. The
-    factor contains ``limits.tails``, because the pose has a wider distribution than a normal one.
+    It is the mean square of the residuals of all stickers that were seen, at least 1, times the
+    entry of ``limits.tails``, because the pose has a wider distribution than a normal one. The
+    squared residuals of ``rejected`` (n,) stickers count up to the limit for one sticker.
     """
     half = np.empty((3, 6))
     entries = np.empty(6)

@@ -33,8 +33,8 @@ LONGEST_SMEAR_PX = 8.0
 # Point spreads of stickers out of focus are rounded to multiples of this. Stickers with the same
 # point spread are fitted together.
 SPREAD_STEP_PX = 0.01
-# Half the variance of a point spread, px², is known to within KNOWN_BLUR. Noise explains a further
-# difference of LARGEST_BLUR of its standard deviations.
+# Half the variance of a point spread, px², is known to within KNOWN_BLUR. Noise explains an excess
+# over this of LARGEST_BLUR standard deviations of the estimate.
 KNOWN_BLUR = 0.002
 LARGEST_BLUR = 3.0
 # Standard deviation, px, of a shift along one axis that all centres in an image share, if half the
@@ -371,7 +371,7 @@ class StickerWindows:
         return np.asarray(last - first)
 
     def _swept(self, frame_ends: tuple[Array, Array]) -> Array:
-        """Return the movements (2, k, 2) px from the middle row's exposure to each sticker's."""
+        """Return the movements (2, k, 2) px of the stickers during the delays of their rows."""
         return np.asarray(self.row_delays()[..., None] * self._moved(frame_ends))
 
     def row_delays(self) -> Array:

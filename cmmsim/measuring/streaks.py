@@ -38,7 +38,7 @@ FEWEST = 8
 LARGEST_MISFIT = float(chdtri(3, CHANCE))
 # Largest number of repetitions of the fit.
 ROUNDS = 8
-# Repetition ends at a smaller change of d, which has no visible effect on centres and ellipses.
+# The repetition ends if d changes by less than this, which moves no centre or ellipse visibly.
 TOLERANCE_PX = 0.05
 # Number of least-squares fits, with updated weights, for a start value.
 REWEIGHTED = 5

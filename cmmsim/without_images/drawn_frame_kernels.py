@@ -337,7 +337,7 @@ def measure_frame(
         pose_transform(poses[3 * end], platform)
         multiply(scene.camera_from_base, platform, ends[0, end])
     images = Images(frame.pixels, frame.spreads, np.zeros((1, 2)), ends, scene.assumed_cameras)
-    # not a literal, for which Numba would compile what takes it once more
+    # For a literal, Numba would compile `solve` once more.
     row = int(np.int64(0))
     solve(
         frame.stickers, stickers.taught, outlines, scene.solver_limits, camera_from_platform,

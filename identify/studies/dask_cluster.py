@@ -63,7 +63,7 @@ class DaskExecutor:
         self._seen = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches in the order in which they finish, and an empty list after a vain wait.
+        """Yield the rows of each batch when it finishes, and empty lists while none has finished.
 
         Raises StudyError if the scheduler is gone, if there has been no worker for
         WORKERLESS_SECONDS, or if a worker cannot run this program.
@@ -186,9 +186,9 @@ def running_cluster(address: str, insecure: bool = False) -> Iterator[DaskExecut
     address   Address of the scheduler.
     insecure  Also accept a scheduler to which everyone on the network can connect.
 
-    Raises StudyError if no scheduler answers at the address, the scheduler has no workers, or a
-    worker has another version of cmmsim. Unless ``insecure``, StudyError is also raised for a
-    scheduler on another machine that asks for no certificate.
+    Raises StudyError if no scheduler answers at the address, certificates that it asks for are
+    missing, it has no workers, or a worker has another version of cmmsim. Unless ``insecure``,
+    StudyError is also raised for a scheduler on another machine that asks for no certificate.
     """
     _silence_dask()
     try:

@@ -47,8 +47,8 @@ WIDEST_BAND = 3.0
 LINE_IN = 0.16  # height of a line of the title or legend, by which a figure grows, inches
 LETTERS_PER_INCH = 14.0  # letters of a title per inch, a little fewer than fit
 BESIDE = 1.02  # ratio between the abscissae of two neighbouring curves with the same levels
-# Largest number of separate curves. If the other factors have more settings, all rows form one
-# curve.
+# Largest number of separate curves. If the factors beside the abscissa have more settings, all rows
+# form one curve.
 MOST_CURVES = 6
 NEAREST_TICKS = 0.09  # smallest distance of two ticks of a vertical axis, as a fraction of the axis
 LETTER = 0.034  # width of a letter of a tick label, as a fraction of the axis

@@ -17,7 +17,8 @@ from identify.studies.rows.gauntlet.verdict import GROUPS
 from identify.studies.study_file import Study
 
 STEM = "gauntlet"  # name of the files, before their suffix
-# Smallest misfit, over that of noise, with which a case of one or two causes counts in fractions.
+# Smallest ratio of a misfit to that of noise. Fractions of right answers for one and for two causes
+# are over cases with at least this ratio. Of two causes, each alone must reach it for one fraction.
 DOUBLED = 2.0
 LEVEL = 0.95  # confidence of the intervals of fractions
 
@@ -41,33 +42,33 @@ class Share:
 def cases_of(frame: pd.DataFrame) -> pd.DataFrame:
     """Return one row for each case in the table of a study of kind `gauntlet`.
 
-    Names of troubles and groups of causes replace their numbers. No number, or -1, has no name.
+    Names of troubles and groups of causes replace their numbers. -1 and NaN become empty texts.
     The verdict is "failed" if the diagnosis is wrong or the row could not be computed.
     """
-    own = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
+    rows = frame.reindex(columns=sorted({*frame.columns, *_NEEDED}))
     # A row that could not be computed lacks its figures, which are NaN here.
-    kinds = [_name(TROUBLES, own[f"trouble_{place}"]) for place in (1, 2)]
-    numbers = {name: own[name] for name in _NEEDED if not name.startswith(("trouble_", "first_"))}
+    names = [_name(TROUBLES, rows[f"trouble_{place}"]) for place in (1, 2)]
+    numbers = {name: rows[name] for name in _NEEDED if not name.startswith(("trouble_", "first_"))}
     sort = np.select(
-        [own["outside"] == 1, own["troubles"] == 0, own["troubles"] == 1, own["troubles"] == 2],
+        [rows["outside"] == 1, *(rows["troubles"] == count for count in range(3))],
         ["outside", "none", "one", "two"],
         "not computed",
     )
     verdict = np.select(
-        [own["right_intervals"] == 1, own["right_cause"] == 1],
+        [rows["right_intervals"] == 1, rows["right_cause"] == 1],
         ["right intervals", "right cause"],
         "failed",
     )
     columns = {
-        "case": own["row"],
+        "case": rows["row"],
         "wrong": sort,
-        "trouble_1": kinds[0],
-        "trouble_2": kinds[1],
-        "first_finding": _name(GROUPS, own["first_group"]),
+        "trouble_1": names[0],
+        "trouble_2": names[1],
+        "first_finding": _name(GROUPS, rows["first_group"]),
         "verdict": verdict,
         **numbers,
-        "time_ratio": 1.0 + own["diagnosis_seconds"] / own["identification_seconds"],
-        "error": own["error"],
+        "time_ratio": 1.0 + rows["diagnosis_seconds"] / rows["identification_seconds"],
+        "error": rows["error"],
     }
     return pd.DataFrame(columns)
 
@@ -167,14 +168,14 @@ def kinds(cases: pd.DataFrame) -> Iterator[tuple[str, int, int, float, float]]:
     """
     single = cases[cases["wrong"].isin(["one", "outside"])]
     for name in TROUBLES:
-        own = single[single["trouble_1"] == name]
-        if len(own):
+        of_kind = single[single["trouble_1"] == name]
+        if len(of_kind):
             yield (
                 name,
-                len(own),
-                int(own["right_cause"].sum()),
-                float(own["misfit"].median()),
-                float(own["covered_percent"].mean()),
+                len(of_kind),
+                int(of_kind["right_cause"].sum()),
+                float(of_kind["misfit"].median()),
+                float(of_kind["covered_percent"].mean()),
             )
 
 

@@ -90,8 +90,8 @@ class Study:
         Raises
         ------
         StudyError
-            The study is not valid, its folder or the memory does not suffice, the script has no
-            guard, or a row failed. Finished rows are kept if a ``folder`` is given.
+            The study is not valid, its folder cannot be used, the memory does not suffice, the
+            script has no guard, or a row failed. Finished rows are kept if a ``folder`` is given.
         ScenarioError
             The scenario is not valid, or the factors of the first row contradict each other.
         StudyInterrupted

@@ -76,7 +76,7 @@ def setting(path: str, value: object) -> str:
 
 
 def short_number(value: object) -> str:
-    """Format a float with four digits, or from 1e4 to 1e7 as an integer; anything else by `str`."""
+    """Format a float with four digits, or as an integer from 1e4 to 1e7. Other values use `str`."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:.4g}" if not 1e4 <= abs(value) < 1e7 else f"{value:.0f}"

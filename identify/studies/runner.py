@@ -165,8 +165,8 @@ def _compute_pending(
                 shown()
 
 
-# Intended duration of a batch, s. It is long enough that sending costs little. A process that is
-# killed loses its batch. A row that takes longer is a batch by itself.
+# Intended duration of a batch, s. Batches of this duration cost little to send, and little is lost
+# if a process is killed. A row that takes longer is a batch by itself.
 BATCH_SECONDS = 0.25
 
 LARGEST_BATCH = 500  # largest number of rows in a batch

@@ -38,7 +38,7 @@ VIEW = "study.nc"
 VERSIONS = "versions"
 
 # Entries that are allowed to change in a continued study, because finished rows do not depend on
-# them. Rows of further repeats come after all other rows. With fewer repeats, the further rows stay
+# them. Rows of added repeats come after all other rows. With fewer repeats, the surplus rows stay
 # in the journal and are ignored.
 MAY_CHANGE = (
     "study.title",

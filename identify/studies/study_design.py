@@ -2,9 +2,9 @@
 
 Rows are numbered from 0 repeat by repeat, and within a repeat point by point, with the last factor
 varying fastest. The seed of row n is ``numpy.random.SeedSequence(seed).spawn(n + 1)[n]``.
-The figures of a row therefore do not depend on the machines, on the order of work, or on further
-repeats. With a single repeat they do not depend on further points of a sample either. Rows are
-generated on demand, so a large grid takes no memory.
+The figures of a row therefore do not depend on the machines, on the order of work, or on the number
+of repeats. With a single repeat they do not depend on the number of points of a sample either. Rows
+are generated on demand, so a large grid takes no memory.
 """
 
 import difflib
@@ -156,7 +156,7 @@ class Design:
 
 
 def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the overrides of a scenario for settings with ``scenario.`` and ``sensor.`` only."""
+    """Return the overrides of a scenario for settings by path. Options are left out."""
     replaced = {}
     for path, value in settings.items():
         root, _, key = path.partition(".")

@@ -20,12 +20,13 @@ from identify.scenario.settings_file import SettingsFiles, one_line
 
 
 class Law(Section):
-    """Statement about the rms of a figure over rows, with all other factors fixed.
+    """Expected rms of a figure over rows. A figure is a number that each row computes.
 
-    A law has one of three forms. ``exponent``: the rms is proportional to ``factor ** exponent`` of
-    a numeric factor, or of another figure in a study of one factor. ``equals``: the rms equals the
-    rms of another figure. ``order``: the rms grows along these values of a factor. ``tolerance`` is
-    the allowed error of the exponent, or of the logarithm of a ratio.
+    A law has one of three forms. ``exponent``: the rms is proportional to this power of ``factor``,
+    a numeric factor, or another figure in a study of one factor. ``equals``: the rms equals that of
+    another figure. ``order``: the rms grows along these values of ``factor``. The factors that
+    ``factor`` does not name are fixed in the first and third form. ``tolerance`` is the allowed
+    error of the exponent, or of the logarithm of a ratio.
     """
 
     figure: str = Field(description="figure of the rows; the law is about its rms over rows")
@@ -86,7 +87,7 @@ class Law(Section):
 
 
 class Range(Section):
-    """Factor of a random sample, uniform between two bounds or between their logarithms."""
+    """Interval from which a sample draws a factor, uniformly in its value or in its logarithm."""
 
     low: float
     high: float
@@ -110,7 +111,7 @@ class Study(Section):
     """Content of a study file. `load_study` reads a file."""
 
     name: Name = Field(description="short name, used for folders")
-    title: str = Field("", description="question of the study, the title of its figures")
+    title: str = Field("", description="question of the study, the title of its plots")
     kind: str = Field(description="kind of row: a built-in one, or module:function")
     scenario: str = Field(
         "paper",
@@ -176,7 +177,7 @@ class Study(Section):
         return self.points * self.repeats
 
     def with_settings(self, settings: Mapping[str, Any]) -> "Study":
-        """Copy the study with entries replaced by dotted path.
+        """Return a copy of the study in which ``settings``, values by dotted path, replace entries.
 
         An example is ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``. A key of the scenario,
         of the sensor or of the options becomes a factor if its value is a list, or a table of low
@@ -218,6 +219,7 @@ class Study(Section):
         return STUDIES.from_dict(data, f"study {self.name!r}")
 
 
+# Keys of scenarios that name files, in the tables of changes and factors, with the built-in names.
 _VARIED = {
     f"{table}.scenario.{key}": names
     for table in ("changes", "factors")
@@ -230,7 +232,6 @@ STUDIES = SettingsFiles(
     StudyError,
     {"scenario": SCENARIOS.names, **_VARIED},
 )
-
 
 STARTING = Path(__file__).parent / "starting.toml"  # template of a study file, with all keys
 
@@ -292,16 +293,16 @@ def _with_root(path: str) -> str:
 
 
 def _without(values: dict[str, Any], path: str) -> dict[str, Any]:
-    """Copy values by dotted path, without the value of a path and the values in its table."""
+    """Return a copy of values by dotted path, without the one at a path and those of its table."""
     return {key: value for key, value in values.items() if not f"{key}.".startswith(f"{path}.")}
 
 
-def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
+def _by_path(tables: Any, keep: Collection[str] = (), prefix: str = "") -> Any:
     """Flatten nested tables by dotted path, except empty ones and those with a key in ``keep``."""
     if not isinstance(tables, Mapping):
         return tables
     flat: dict[str, Any] = {}
     for key, value in tables.items():
         nested = isinstance(value, Mapping) and value and not set(value) & set(keep)
-        flat |= _by_path(value, keep, f"{section}{key}.") if nested else {f"{section}{key}": value}
+        flat |= _by_path(value, keep, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
     return flat

@@ -1,11 +1,11 @@
 """Comparison of a study's rows with the study's laws, by a measured exponent or ratio.
 
-A log-linear regression estimates how the mean square of a positive figure y depends on other
-quantities. The mean square is modelled as exp(X beta). The estimate solves X^T (y^2 / mean - 1) =
-0, the score equation of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989,
-section 8.3). The result is the scaling of the mean square itself, for any distribution of the
-figure. A straight line through logarithms would not give this scaling. The covariance is a sandwich
-estimate, which holds even if the figure's distribution differs from row to row.
+A log-linear regression estimates how the mean square of a figure y depends on other quantities. The
+mean square is modelled as exp(X beta). The estimate solves X^T (y^2 / mean - 1) = 0, the score
+equation of a gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989, section 8.3).
+The result is the scaling of the mean square itself, for any distribution of the figure. A straight
+line through logarithms would not give this scaling. The covariance is a sandwich estimate, which
+holds even if the figure's distribution differs from row to row.
 
 The figures of one point of a study have 95 % bands. The band of the mean is Student's interval. The
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
@@ -297,10 +297,10 @@ def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, floa
 
 
 def _other_columns(law: Law, study: Study, frame: pd.DataFrame) -> Array:
-    """Return the columns of the design for all other factors.
+    """Return the columns of the design for all factors but the law's.
 
-    For a grid they are an indicator for each setting of the other factors. For a sample they are a
-    constant, and the covariates of each other factor.
+    For a grid they are an indicator for each setting of these factors. For a sample they are a
+    constant, and the covariates of each of these factors.
     """
     others = [path for path in study.factors if path != law.factor and law.factor in study.factors]
     if not others:
