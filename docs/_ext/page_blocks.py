@@ -233,8 +233,13 @@ def answer_pictures() -> dict[Path, tuple[list[Point], list[str], dict[str, str]
         name: (kept_figures.answer_points(KEPT, name, *heads), list(heads[0].values()), heads[1])
         for name, heads in ANSWERS.items()
     }
+    # A given gain has no error, and would stretch its axis beyond all that is estimated.
+    points = [
+        (names, {end: one for end, one in found.items() if not 0 < one[0] < kept_figures.SMALLEST})
+        for names, found in kept_figures.leaderboard_points(KEPT)
+    ]
     drawn["estimators"] = (
-        kept_figures.leaderboard_points(KEPT),
+        points,
         ["estimator"],
         kept_figures.ESTIMATED,
     )

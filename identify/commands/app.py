@@ -47,7 +47,7 @@ is then validated on trajectories that were not used for the estimate.
 
 EXAMPLES = """
 Examples:
-  cmmsim run quick                     a whole experiment in a minute
+  cmmsim run quick                     a whole experiment, a short one
   cmmsim run quick --robot ups6        with another robot, or your own file
   cmmsim new robot mine.toml           a commented file to start from
   cmmsim check mine.toml               check the design of a robot

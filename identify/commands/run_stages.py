@@ -69,7 +69,7 @@ def run(
 
     \b
     Examples:
-      cmmsim run quick                        a one-minute run into runs/quick-0
+      cmmsim run quick                        a short run into runs/quick-0
       cmmsim run                              the paper's experiment
       cmmsim run paper --seed 7 --out mine    other noise and trajectories
       cmmsim run quick --robot ups6           another robot, or your own file
