@@ -263,10 +263,6 @@ def solver_limits(
     )
 
 
-# Words of a reason for which a frame is lost, if the first rejected sticker has another outline.
-OF_OUTLINE = "of its outline"
-
-
 def lost_reason(verdict: Array, first: str, left: Array) -> str:
     """Return the reason why a frame is lost.
 
@@ -292,7 +288,7 @@ def lost_reason(verdict: Array, first: str, left: Array) -> str:
         return f"{seen} visible stickers, at least {FEWEST} are needed to detect a wrong one"
     place = verdict[kernels.PLACE]
     outline = verdict[kernels.OUTLINE]
-    misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} {OF_OUTLINE}"
+    misfit = f"{place:.0f} of its place" if place >= outline else f"{outline:.0f} of its outline"
     cause = f"with squared misfit {misfit}, at most {LARGEST_MISFIT:.1f}"
     if max(place, outline) <= LARGEST_MISFIT:
         cause = (

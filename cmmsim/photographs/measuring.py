@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import PhotographError
 from cmmsim.geometry.pose import Array
-from cmmsim.measuring.frame_solver import OF_OUTLINE
 from cmmsim.measuring.layout_search import bright_ellipses
 from cmmsim.measuring.measurement import Measurement, lost_measurement
 from cmmsim.measuring.pose_estimator import PoseEstimator, measure_frame
@@ -138,7 +137,7 @@ def measure_pairs(
 def _hint(reason: str, lost: Photograph, estimator: PoseEstimator) -> str:
     """Return a hint if each image of a lost pair shows enough bright spots; otherwise no text.
 
-    reason: why the pair is lost.
+    reason: why the pair is lost, as `frame_solver.lost_reason` says it.
     """
     sides = bright_ellipses(readable(lost.images), estimator)
     counts = [int(fits.good.sum()) for fits in sides]
@@ -147,7 +146,7 @@ def _hint(reason: str, lost: Photograph, estimator: PoseEstimator) -> str:
     outlines = (
         "; stickers of another radius, or images of another blur, than those of teaching have "
         "other outlines: teach anew with such images"
-        if OF_OUTLINE in reason
+        if "of its outline" in reason
         else ""
     )
     return (

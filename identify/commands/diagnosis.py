@@ -186,7 +186,7 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
     rows = []
     for source in order:
         most = identified[int(np.argmax(shares[:, source]))] if means[source] else ""
-        numbers = [_short(column[source], np.linalg.norm(column)) for column in columns]
+        numbers = [_short(column[source], float(np.linalg.norm(column))) for column in columns]
         rows.append((found.words[source], *numbers, _short(means[source], means.sum()), most))
     combined = [f"{np.sqrt(np.sum(column**2)):.3g}" for column in columns]
     rows.append(("combined", *combined, f"{means.sum():.3g}", ""))
