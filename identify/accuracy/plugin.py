@@ -178,7 +178,7 @@ def cmmsim_sensor(
     """
     from identify.setup import Setup
 
-    # all that `SensorPlan.make` depends on: the robot's legs can hide stickers
+    # Teaching depends on these entries, also on the robot, whose legs can hide stickers.
     key = cmmsim_scenario.model_dump_json(
         include={"robot", "sensor", "sensor_changes", "timing", "renderer", "pose_method", "rig"}
     )

@@ -112,7 +112,7 @@ def _show_warning(
 
 
 def is_known(error: Exception) -> bool:
-    """Return whether the three packages raise an error on purpose, or it names a file."""
+    """Tell whether an error is one that the three packages raise on purpose, or names a file."""
     if isinstance(error, IdentifyError) or (
         isinstance(error, OSError) and error.filename is not None
     ):

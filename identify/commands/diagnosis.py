@@ -47,10 +47,10 @@ def diagnose(
     """Name the causes for which the identified model misses its record, with size and remedy.
 
     Each cause of a catalogue, such as the zero of a joint or the clock of the commands, is judged
-    by the share of the misfit that it explains. The best one is fitted beside the parameters, then
-    the others are judged again. cmmsim identify does the same if noise does not explain the record,
-    unless the drift watch of the cameras has warned. If no cause is needed, the command says so,
-    and prints the causes only with --add.
+    by the share of the misfit that it explains. The one that explains most is fitted beside the
+    parameters, then the others are judged again. cmmsim identify does the same if noise does not
+    explain the record, unless the drift watch of the cameras has warned. If no cause is needed, the
+    command says so, and prints the causes only with --add.
     A cause of your own is a function (run, size) that returns the model of the run with this cause,
     see identify.diagnosis.diagnose.
 

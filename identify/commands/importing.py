@@ -76,7 +76,8 @@ def urdf(
 
     \b
     Examples:
-      cmmsim import urdf ups6.urdf --out mine.toml     with ups6.yaml, as cmmsim export urdf writes
+      cmmsim import urdf ups6.urdf --out mine.toml
+                                with ups6.yaml, as cmmsim export writes it
       cmmsim import urdf robot.urdf --closures loops.yaml --out mine.toml
     """
     from dynamics.engines.urdf_import import robot_of_urdf

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from identify.errors import IdentifyError, ScenarioError
 
-# Keys at the top level that only files of a kind have. Each file of a kind has one of them, except
-# that a scenario can have its name alone. A description has keys of a scenario, too.
+# Keys at the top level that tell the kind of a file. Each file has one of those of its kind, but a
+# scenario can have its name alone. A description also has keys of a scenario, and is thus first.
 KEYS = {
     "description of a log": {"record", "columns"},
     "robot": {"home_pose", "travel_limit", "legs", "family"},
@@ -25,7 +25,7 @@ USES = {
 
 
 def check_kind(kind: str, name: str) -> None:
-    """Raise ScenarioError, with commands that use it, if a TOML file is not of a kind.
+    """Raise ScenarioError if a TOML file is of another kind, and name the commands that use it.
 
     Nothing is raised for a file that cannot be read or that has keys of no kind. Its reader says
     more about it.

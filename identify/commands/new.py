@@ -78,12 +78,12 @@ def robot(
     """Write a robot file: geometry, parameter sets and gains of a built-in robot, under a name of
     your own and with lengths of your own.
 
-    Without lengths, the file is a copy, comments included. With lengths, joints, home, directions
-    and travel follow from them, masses and inertias are scaled, and the gains of the drives are
-    designed. Lengths that are not given stay as they are. A family has its own lengths: robots
-    with cranks have base-radius, platform-radius, crank and link, delta3 also bar-distance; those
-    with sliders have base-radius, platform-radius and link; ups6 has base-radius, platform-radius,
-    leg, cylinder and rod.
+    Without lengths, the file is a copy, comments included, but in [unstated] it has the standard
+    deviations of a workshop. With lengths, joints, home, directions and travel follow from them,
+    masses and inertias are scaled, and the gains of the drives are designed. Lengths that are not
+    given stay as they are. A family has its own lengths: robots with cranks have base-radius,
+    platform-radius, crank and link, delta3 also bar-distance; those with sliders have base-radius,
+    platform-radius and link; ups6 has base-radius, platform-radius, leg, cylinder and rod.
 
     Reads nothing of yours. Writes one TOML file.
 

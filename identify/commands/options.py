@@ -215,10 +215,8 @@ def tell(
         say()
 
 
-BRACKETS = {
-    "[": ("list", "]"),
-    "{": ("table", "}"),
-}  # first letter: kind and last letter of a value
+# Kind of a value and its last letter, by the first letter.
+BRACKETS = {"[": ("list", "]"), "{": ("table", "}")}
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def paper(
     path = out or Path("runs") / f"figures-of-the-paper-{seed}"
     folder = context.with_resource(new_run_folder(path, (OURS, SETTINGS))).path
     progress = terminal_progress(quiet)
-    # Settings of either run that cannot work are refused before the first one begins.
+    # Settings of either run that cannot work are refused before the first run begins.
     planned = {name: set_up(one, seed) for name, one in ((OURS, ours), (SETTINGS, theirs))}
     for name, setup in planned.items():
         _run(setup, folder / name, progress, workers)

@@ -252,7 +252,7 @@ def measure(
 
 
 def _new_picture(folder: Path, name: str, number: int) -> Path:
-    """Return the new file of a pair with a name, which is that of its left image if it has one."""
+    """Return the file for a pair's picture: named as its left image, or by number in a video."""
     from cmmsim.files.image_files import SUFFIXES
 
     left = Path(name.partition(" | ")[0])

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from identify.estimation.base_parameters import BaseParameters
 
 THRESHOLD = 1e-3  # magnitude of an entry of R below which the paper counts it as zero (section 4.2)
-PAPERS = "rss6"  # robot of the paper. The paper's numbers are printed only with this robot.
+PAPERS = "rss6"  # robot of the paper, for which the number in the paper's table is also printed
 # Decimal exponents of the force units in which the paper's threshold is tried: N, kN, MN.
 DECADES = (0, 3, 6)
 

@@ -347,7 +347,7 @@ def report(
 
 
 def _tell_missed(result: dict[str, Any], unseen: bool, strict: bool) -> None:
-    """Print each missed goal on standard error if its table is not seen, and raise if strict."""
+    """Print missed goals on standard error if their table is unseen, and raise if strict."""
     from identify.reporting.goals import check_goals
     from identify.reporting.verdict import sentence
 

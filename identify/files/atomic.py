@@ -164,8 +164,8 @@ def atomic_contents(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder, whose contents are moved into ``folder`` after the block.
 
     The temporary folder is within ``folder``, which is never replaced and can thus be the current
-    directory. It must not contain entries with the names of the new contents, because they would be
-    replaced. After an exception, the new contents are removed.
+    directory. ``folder`` must not contain entries with the names of the new contents, because they
+    would be replaced. After an exception, the new contents are removed.
 
     Raises WriteError for an OSError or ValueError, also for one in the block.
     """

@@ -221,7 +221,7 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
 
 
 def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
-    """Return the six figures [um, urad] of one entry, ``rms`` or ``std`` according to ``of``.
+    """Return the six figures [um, urad] of an entry with ``of``, such as ``std``, in their names.
 
     A null figure is NaN. Without an entry, all figures are NaN.
     """

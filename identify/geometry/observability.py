@@ -93,7 +93,7 @@ def posterior(information: Array, scale: Array, count: int) -> Array:
 def check_enough(
     robot: Robot, poses: int, information: Array, scale: Array, prior_std: Array
 ) -> None:
-    """Raise EstimationError if poses give fewer equations than combinations can be determined.
+    """Raise EstimationError if poses give fewer equations than there are determinable combinations.
 
     ``information`` (u, u) is the information of many candidates about all unknowns, in units of
     their prior. The message states the needed poses, and the numbers hardest to determine.
@@ -105,12 +105,11 @@ def check_enough(
     if poses * coordinates >= determinable:
         return
     worst = np.argsort(-np.sqrt(np.diagonal(covariance)) / prior_std, kind="stable")
-    unseen = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2][
-        : determinable - poses * coordinates
-    ]
-    shown = ", ".join(unseen[:6]) + (f" and {len(unseen) - 6} more" if len(unseen) > 6 else "")
-    needed = -(-determinable // coordinates)
     missing = determinable - poses * coordinates
+    hardest = [names[k] for k in worst if covariance[k, k] <= (OBSERVABLE * prior_std[k]) ** 2]
+    hardest = hardest[:missing]
+    shown = ", ".join(hardest[:6]) + (f" and {len(hardest) - 6} more" if len(hardest) > 6 else "")
+    needed = -(-determinable // coordinates)
     raise EstimationError(
         f"{poses} poses that differ give {poses * coordinates} equations for {determinable} "
         f"combinations of the {len(names)} geometric numbers of {robot.name} that poses can "
@@ -223,7 +222,7 @@ def _eigenvalues(information: Array, columns: Array) -> Array:
 
 
 def _spread(columns: Array, information: Array) -> tuple[Array, Array]:
-    """Return columns times the unknowns' covariance, and covariances of measured coordinates."""
+    """Return columns times the unknowns' covariance, and covariances of coordinates with noise."""
     weighted = columns @ np.linalg.inv(information)
     return weighted, np.eye(columns.shape[1]) + weighted @ columns.swapaxes(1, 2)
 

@@ -148,7 +148,7 @@ class Designer:
     def greedy(
         self, among: Candidates, count: int, advance: Advance = lambda n=1: None
     ) -> Candidates:
-        """Choose the best candidates one by one, then exchange each for the best in its k.
+        """Choose the best candidates one by one, then exchange each for the best in its place.
 
         The passes over all poses end when none is exchanged, or after `EXCHANGES`. The same
         candidate can be chosen twice.

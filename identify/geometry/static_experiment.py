@@ -178,12 +178,11 @@ def drawn(
     """Draw measured poses without images.
 
     The stated covariance of one frame at each pose, divided by `frames`, is the covariance of the
-    drawn mean. Errors of the frames, with the covariance of teaching, and errors of inexact cameras
-    are drawn once for all poses.
+    drawn mean. Errors of the base and platform frames, with the covariance of teaching, and errors
+    of inexact cameras are drawn once for all poses.
     """
     taught = sensor.taught
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
-    # Errors of teaching are the same at all poses, so they are drawn once.
     offset = known.root @ rng.standard_normal(12)
     covariances = np.full((len(poses), 6, 6), np.nan)
     seen = np.zeros(len(poses), dtype=bool)

@@ -19,7 +19,7 @@ from identify.files.run_folder import load_result
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
 # Two poses differ if a joint differs by more than this number of standard deviations.
 APART = 10.0
-ROUNDING = 1e-9  # lower bound of the difference by which two poses differ, rad or m
+ROUNDING = 1e-9  # difference of a joint, rad or m, up to which two poses never count as different
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
 
 
 def _columns(rows: Any) -> int:
-    """Return the length of the first list in nested lists (N, 6, k), or 1 if it is not a list."""
+    """Return k of nested lists (N, 6, k), or 1 if the lists are not nested so."""
     try:
         return len(rows[0][0])
     except (TypeError, LookupError):

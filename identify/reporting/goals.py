@@ -77,7 +77,7 @@ class Goal:
 def check_goals(result: dict[str, Any]) -> list[Goal]:
     """Judge every goal for which the result has the necessary entries.
 
-    The accuracy of the worst axis in the worst run counts.
+    An accuracy is that of the worst axis, and on validation motions that of the worst run.
     """
     parts = (_validation, _sensor, explanation_goals, _parameters)
     return [goal for part in parts for goal in part(result)]
@@ -116,8 +116,8 @@ class Unseen:
 
     rows (n, 6): RMS of each run, µm and µrad. predicted (n, 6): their stated standard deviations.
     estimated: words for the declared errors beyond teaching, such as those of cameras or of centres
-    of mass. If they are not empty, `rows` are the errors of the poses that the model predicts
-    together with the estimates of these declared errors.
+    of mass. If there are such errors and estimates of them, `rows` are the errors of the poses that
+    the model predicts together with these estimates.
     """
 
     rows: Array
@@ -136,8 +136,8 @@ def unseen(result: dict[str, Any]) -> Unseen:
     names = result["identification"].get("nuisance_prior_std", {})
     declared = [kind for kind in dict.fromkeys(map(kind_of, names)) if kind != TEACHING]
     predicts = all("position_rms_um" in run.get("predicted", {}) for run in runs)
-    # The model alone lacks the other declared errors, which move the robot: the servo follows an
-    # error of the cameras, and an error of a centre of mass changes the torques.
+    # The model alone lacks the declared errors, which move the robot: the servo follows an error
+    # of the cameras, and an error of a centre of mass changes the torques.
     estimated = ""
     if predicts and declared:
         words = [KINDS.get(kind, kind) for kind in declared]

@@ -131,7 +131,7 @@ def group_table(result: dict[str, Any]) -> Table:
     """Return the table of the base parameters that combine several parameters.
 
     The columns are the initial guess, the truth, the estimate with its standard deviation, the
-    interval, the error, and a remark. A column without any entry is left out.
+    interval, the error in standard deviations, and a remark. Empty columns are left out.
     """
     identification = result["identification"]
     rows = []
@@ -180,7 +180,7 @@ def correlation_table(result: dict[str, Any]) -> Table:
 
 
 def common_error_table(result: dict[str, Any]) -> Table:
-    """Return the errors that all poses of the record have in common.
+    """Return the table of the errors that all poses of the record have in common.
 
     Each row has the unit, the prior standard deviation, and the estimate with its standard
     deviation. There are no rows if the record declares no such errors.
@@ -188,9 +188,9 @@ def common_error_table(result: dict[str, Any]) -> Table:
     found = result["identification"]
     rows = []
     for name, before in found.get("nuisance_prior_std", {}).items():
-        unit, size = FINE.get(name.rpartition("_")[2], ("", 1.0))
-        estimate = size * found["nuisance_estimates"][name], size * found["nuisances"][name]
-        rows.append((name, unit, number(size * before, 2), with_deviation(*estimate)))
+        unit, factor = FINE.get(name.rpartition("_")[2], ("", 1.0))
+        estimate = factor * found["nuisance_estimates"][name], factor * found["nuisances"][name]
+        rows.append((name, unit, number(factor * before, 2), with_deviation(*estimate)))
     note = (
         "True minus known value. Names are those of result.json. Where no unit is stated, the "
         f"value is in that at the end of its name.{_kinds_noted(found)} A visual "
@@ -202,11 +202,11 @@ def common_error_table(result: dict[str, Any]) -> Table:
     return table.without_empty()
 
 
-# Units in which the errors are shown whose names end with a unit, with the size of this unit.
+# Unit in which an error is shown, and the factor to it, by the SI unit at the end of its name.
 FINE = {"m": ("µm", 1e6), "rad": ("µrad", 1e6)}
 
 
-# What names of common errors of a kind do not say.
+# Notes on what the names of common errors do not say, by the kind of the errors.
 NOTES = {
     "geometry": " Geometric errors are in m and rad.",
     "centres": " Centres of mass are first moments of all bodies of a kind.",
@@ -220,7 +220,7 @@ def _kinds_noted(found: dict[str, Any]) -> str:
 
 
 def _shares(found: dict[str, Any]) -> str:
-    """State which fraction of a parameter's variance each kind of common error causes at most."""
+    """State which fraction of an identified parameter's variance each kind causes at most."""
     identified = [
         one.get("common_share") for one in found["parameters"].values() if one["identifiable"]
     ]
@@ -338,7 +338,7 @@ def _shown(entry: Entry, size: float) -> tuple[str, ...]:
 
 
 def _deviations(group: Entry) -> str:
-    """Format the error in standard deviations, as a dash if one of both is unknown."""
+    """Format a group's error in standard deviations, or as a dash if it is not identified."""
     true = group["true"]
     estimate = group["estimate"]
     std = group["std"]
@@ -355,7 +355,7 @@ def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
     )
 
 
-MOST_PLACES = 4  # decimal places of an error in per cent
+MOST_PLACES = 4  # largest number of decimal places of an error in per cent
 
 
 def _percent(entry: Entry, size: float) -> str:

@@ -92,7 +92,7 @@ def sensor_section(data: RunData) -> Section:
 
 
 def row_counts(record: xr.Dataset, ok: NDArray[np.bool_], rate_hz: float) -> str:
-    """Return the numbers of rows and poses of a record of one's own. ok (N,): measured rows."""
+    """Say how many rows and poses a record of a real robot has. ok (N,): rows with a used pose."""
     rows = int(record.attrs.get(LOGGED_ROWS, len(ok)))
     missing = int(record.attrs.get(MISSING_ROWS, missing_rows(record["time"].values, rate_hz)))
     source = "log" if LOGGED_ROWS in record.attrs else "record"
@@ -173,7 +173,7 @@ def validation_section(data: RunData) -> Section:
 
 
 def provenance_section(data: RunData) -> Section:
-    """List the scenario, versions and times that are needed to repeat the run."""
+    """List the settings and versions that repeat the run, and the times of its stages."""
     designed = "reference_position" in data.experiment
     # A built-in scenario is no standard for a record of one's own.
     own = data.truth is None

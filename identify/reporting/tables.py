@@ -111,8 +111,8 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
             what = "all stages, teaching and compiling included"
             rows.append(("whole run", f"{number(total)} s", "", "", what))
         else:
-            total = f"{number(sum(stages.values()))} s"
-            rows.append((f"time of {', '.join(stages)}", total, "", "", "compiling included"))
+            said = f"{number(sum(stages.values()))} s"
+            rows.append((f"time of {', '.join(stages)}", said, "", "", "compiling included"))
     return rows
 
 
@@ -329,10 +329,10 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
 
 
 def print_goals(result: dict[str, Any], report: Path) -> None:
-    """Print the goals of a run with their values, and the path of the report.
+    """Print the goals of a run with their values and, at the end, the path of the report.
 
-    The common scale, and how many intervals contain the truth, are between them.
-    Missed goals follow with their likeliest causes and the command to type next.
+    Between them are the common scale, how many intervals contain the truth, the widened limits, and
+    the missed goals with their likeliest causes and the commands to type next.
     """
     table = goals_table(result)
     goals = check_goals(result)

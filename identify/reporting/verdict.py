@@ -91,7 +91,7 @@ def verdict(result: dict[str, Any], consistent: bool | None) -> Verdict:
     sentences = [_residual_sentence(result, explained, consistent)]
     if unseen:
         # If the model does not explain its record, it is wrong, and this is stated first.
-        sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
+        sentences.insert(0 if explained else 1, _unseen_sentence(result))
     sentences += [
         f"Not met: {sentence(goal)}"
         for goal in missed
@@ -162,7 +162,7 @@ def intervals_sentence(identification: Mapping[str, Any]) -> str:
 
 
 def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
-    """Return two RMS errors of the worst axis, and the number of identified parameters.
+    """Return two RMS position errors of the worst axis, and the number of identified parameters.
 
     With validation runs, the errors are those of model and measured poses against the truth,
     otherwise those of both models against the measured poses.
@@ -203,7 +203,7 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
     return [fitted, initial, identified]
 
 
-def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
+def _unseen_sentence(result: dict[str, Any]) -> str:
     """State the errors of both models against the true robot on validation trajectories."""
     runs = result["validation"]
     found = goals.unseen(result)

@@ -112,7 +112,7 @@ class Timing(Section):
     def check(self) -> None:
         """Check that the values agree, and that the closed loop can delay commands by the latency.
 
-        Otherwise, raises ValueError with the longest possible latency.
+        Raises ValueError if the values disagree, or if the latency can be too long.
         """
         from dynamics.closed_loop.loop_settings import MAX_DELAY_FRAMES
 

@@ -49,7 +49,7 @@ ABOVE_M = 0.0004
 
 
 def gltf(cell: Workcell, pose: Array | None = None) -> bytes:
-    """Return a workcell as glTF, with its platform drawn_pose a pose (6,), by default home.
+    """Return a workcell as glTF, with its platform at a pose (6,), by default home.
 
     The nodes are "platform" and "base" with their stickers, each body of a leg, and "left camera"
     and "right camera". A body of a leg is a rod along its z axis from its origin. Raises

@@ -163,8 +163,8 @@ def _models(
 ) -> dict[str, Array]:
     """Return the poses (N, 6) of the identified model and of the initial guess.
 
-    A model that diverges in the first frame is left out. If the run is not validated, there are
-    none, and a note states this. Raises RecordError if the poses do not belong to the record.
+    A model that diverges in the first frame is left out. If the run is not validated, there are no
+    poses, and a note says so. Raises RecordError if the poses do not belong to the record.
     """
     missing = "so no model is shown; this command adds it: cmmsim validate --out"
     if not run.model.is_file() or not run.result.is_file():

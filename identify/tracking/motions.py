@@ -91,7 +91,7 @@ def circle(robot: Robot, radius: float, turn_s: float) -> CoordinateMotion:
 
     def angle(t: Array) -> tuple[Array, Array, Array]:
         s = np.clip(t / turn_s, 0.0, 1.0)
-        # The integral of the smooth step of fifth degree.
+        # This is the integral of the smooth step of fifth degree.
         travelled = s**4 * (2.5 - 3 * s + s**2)
         step = s**3 * (10 - 15 * s + 6 * s**2)
         rising = 30 * s**2 * (1 - s) ** 2 / turn_s
@@ -210,7 +210,7 @@ def read_motion(path: Path, robot: Robot, fastest: float) -> NamedMotion:
             f"{path}, row {row + 1}: {','.join(lines[row + 1])!r} are not all finite numbers"
         )
     if times[0] != 0 or not (np.diff(times) > 0).all():
-        # First row with a time that does not increase.
+        # This is the first row whose time does not increase.
         row = int(np.argmin(np.diff(times, prepend=-1.0) > 0)) if times[0] == 0 else 0
         raise TrajectoryError(
             f"{path}, row {row + 1}: t is {times[row]:g}; times must begin at 0 and increase"

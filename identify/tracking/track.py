@@ -70,7 +70,7 @@ def track(
     """Return the content of track.json.
 
     run_folder  Folder of a finished run. Its estimates are the identified model. With None, the
-                robot is identified first, according to the scenario.
+                robot is identified first, if that model is requested.
     own         CSV file with poses to follow in place of the standard motions.
 
     Raises ScenarioError, TrajectoryError or RecordError if the scenario, a motion or the run folder

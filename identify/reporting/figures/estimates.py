@@ -44,11 +44,11 @@ def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
         (_size(p), p["estimate"], *(p.get("interval") or 2 * [p["estimate"]]))
         for p in shown.values()
     ]
-    true, estimate, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
-    percent = 100 / np.abs(true)
+    reference, estimate, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    percent = 100 / np.abs(reference)
     return RelativeErrors(
         list(shown),
-        percent * (estimate - true),
+        percent * (estimate - reference),
         percent * (estimate - low),
         percent * (high - estimate),
     )
@@ -205,15 +205,16 @@ def _key(axes: Axes, sizes: Sequence[float], meaning: str, negative: str) -> Non
     )
 
 
-# Hatches of the sources of a budget. The next one begins when all colours have been used.
+# Hatches of the sources of a budget. Source after source has the next colour and the next hatch,
+# and one hatch is skipped after each round of colours, so that other pairs follow.
 HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
 
 
 def budget_figure(budget: Budget, identified: Mapping[str, bool]) -> Figure:
     """Draw the fraction of each source in the variance of poses, predictions and parameters.
 
-    The rows are poses and predictions, and the ``identified`` parameters, sorted by the fraction of
-    the source with the largest mean fraction. The number beside a row is the combined standard
+    The rows are poses and predictions, and then the ``identified`` parameters, sorted by the share
+    of the source with the largest mean share. The number beside a row is the combined standard
     uncertainty. Fractions that are negative, because of correlations, are left out.
     """
     names = budget.quantities

@@ -260,9 +260,9 @@ HATCHES = ("", "////", "xxxx")  # patterns of the three bars of a run, distinct 
 def validation_figure(result: dict[str, Any]) -> Figure:
     """Draw the actual and the expected distance of the true robot from the predicted poses.
 
-    The RMS distances of each validation trajectory have bars and diamonds. The distance of the
-    measured poses from the identified model is drawn as well. The limits of the goals are not, as
-    they can be about other poses.
+    Bars are the actual RMS distances on each validation trajectory, and diamonds the expected ones.
+    The measured poses minus the identified model are drawn as well. The limits of the goals are
+    not, as they can be about other poses.
     """
     validation = result["validation"]
     figure = Figure(figsize=(WIDTH, 5.0), layout="constrained")

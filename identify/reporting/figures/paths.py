@@ -121,7 +121,7 @@ AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], 
 
 
 def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
-    """Write its time beside each mark of a path, unless other labels and marks leave no room.
+    """Write the time beside each mark of a path, unless other labels and marks leave no room.
 
     A label is on the path only where there is no place beside it.
     """
@@ -180,7 +180,7 @@ def _plain_box(axes: Axes3D) -> None:
 
 
 COVERED = 0.95  # probability that an ellipse covers the true pose
-ELLIPSES = 12  # number of poses whose ellipses are drawn
+ELLIPSES = 12  # largest number of poses whose ellipses are drawn
 SHARE = 0.15  # largest half axis of a drawn ellipse, as a fraction of the size of the path
 
 

@@ -76,7 +76,7 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": INDIGO, "linestyle": "-."},
 )
 
-STANDS = 1e-9  # share of a figure by which panels move in a layout that is repeated for nothing
+STANDS = 1e-9  # movement of panels, as a fraction of a figure, below which its layout has settled
 STILL = 1e-9  # range, m or rad, below which a component counts as not moving
 
 
@@ -142,6 +142,6 @@ def panel_grid(
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
-    """Draw the legend of one panel above all of them."""
+    """Draw the legend of one panel above all panels."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=3.0)
