@@ -292,11 +292,12 @@ def measures_sentence(result: dict[str, Any]) -> str:
     compared += ["of measured against true poses"] if result.get("sensor") else []
     said = []
     if compared:
-        said.append(f"Errors are the RMS of the worst axis and run: {' and '.join(compared)}.")
+        said.append(f"Errors are the RMS of the worst axis and run: {', and '.join(compared)}.")
     if explanation_goals(result):
         said.append(
-            "Residuals are measured minus identified poses; their p value is the probability that "
-            "noise alone makes them as correlated from frame to frame."
+            "Residuals are measured minus identified poses. Noise variance is that which the "
+            "cameras state. The p value is the probability that noise alone makes residuals as "
+            "correlated from frame to frame."
         )
     return " ".join(said)
 

@@ -250,8 +250,8 @@ def _residual_sentence(result: dict[str, Any], explained: bool, consistent: bool
     if goals.CHANCE in found:
         chance = share(found[goals.CHANCE].value / 100)
         said.append(
-            f"In {chance} of experiments with noise alone, the residuals are as correlated from "
-            "frame to frame as here."
+            "With noise alone, residuals would be at least as correlated from frame to frame in "
+            f"{chance} of experiments."
         )
     if explained:
         return " ".join(["The residuals are the noise of the cameras.", *said])

@@ -163,8 +163,8 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         "and more than 3 standard"
     )
     assert f"{missed} deviations, joint1.viscous\n" in shown
-    measured = "identified model against the true robot and of measured against true poses.\n"
-    assert f"Errors are the RMS of the worst axis and run: of the {measured}"[:-1] in shown
+    measured = "identified model against the true robot, and of measured against true poses."
+    assert f"Errors are the RMS of the worst axis and run: of the {measured}" in shown
     assert all(
         text in shown
         for text in ("validation motion, position", "µrad", "stereo frames", str(run_folder.report))
