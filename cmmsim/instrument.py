@@ -239,7 +239,7 @@ class Instrument:
             for body in (self.platform, self.base):
                 require_corner(body)
             teacher = Teacher(
-                self.camera, self.observer, self.platform, self.base, self._view.sizes.plan()
+                self.camera, self.observer, self.platform, self.base, self._view.teaching_plan()
             )
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             taught = teacher.teach(self.name, self.home, rng, progress or self._progress)

@@ -27,6 +27,7 @@ from cmmsim.errors import LostError, TeachingError, TeachingWarning
 from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.disc_image import sticker_outlines
+from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import StereoRig
@@ -226,7 +227,9 @@ class Teacher:
             missing = np.setdiff1d(np.arange(len(places)), seen.index)
             raise LostError(
                 f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both "
-                "cameras" + self._outside(body, missing, apply(expected, places))
+                "cameras"
+                + self._outside(body, missing, apply(expected, places))
+                + f"; teaching needs every sticker: {_removal(body, missing)}, or move the cameras"
             )
         return seen
 
@@ -281,12 +284,22 @@ class Teacher:
         errors = settings.line_error_px + PRINT_REACH * settings.allowed.changing_px
         limit = LARGEST_GAP + errors * depth / focal
         if distances.max() > limit:
-            worst = self.platform.sticker_ids[distances.argmax()]
+            worst = distances.argmax()
+            spread = settings.optics.psf_px
             raise LostError(
-                f"{self.platform.name}: sticker {worst} is {distances.max() * 1e6:.0f} um off its "
-                f"expected position, but at most {limit * 1e6:.0f} um is allowed; is it partly "
-                "hidden?"
+                f"{self.platform.name}: sticker {self.platform.sticker_ids[worst]} is "
+                f"{distances.max() * 1e6:.0f} um off its expected position, but at most "
+                f"{limit * 1e6:.0f} um is allowed; if it is partly hidden, "
+                f"{_removal(self.platform, np.array([worst]))}"
+                + (f"; or lens.psf_px = {spread:g} blurs the edge of its ring" if spread else "")
             )
+
+
+def _removal(body: MarkedBody, stickers: NDArray[np.int_]) -> str:
+    """Return the advice to remove stickers, given by their indices, from their lists."""
+    planes = sorted({PLANE_NAMES[k] for k in body.plane_index[stickers]})
+    lists = " and ".join(f"{body.name}.planes.{plane}.stickers" for plane in planes)
+    return f"remove {'it' if len(stickers) == 1 else 'them'} from {lists}"
 
 
 def teaching_path(home: Array, count: int) -> Array:
@@ -333,20 +346,15 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
     return WindowSizes(2 * int(0.5 * WINDOW_SHARE * fit), fit, fit / smallest)
 
 
-def largest_radius(
-    rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float
-) -> float:
-    """Return the longest semi-axis, px, in the images of the stickers that both cameras see.
-
-    The result is 0 if no sticker of the body is seen by both cameras.
-    """
+def image_radii(rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float) -> Array:
+    """Return the semi-axes (2, k, 2), px, in the images of the k stickers that both cameras see."""
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
     for move in rig.from_camera:
         placed = move @ camera_from_body
         seen &= faces_camera(apply(placed, body.nominal), normals @ placed[:3, :3].T)
     _, shapes = sticker_outlines(rig, camera_from_body, body.nominal[seen], normals[seen], radius)
-    return float(np.linalg.eigvalsh(shapes).max(initial=0.0))
+    return np.asarray(np.linalg.eigvalsh(shapes), dtype=float)
 
 
 def exactly_taught(file: SensorFile) -> Taught:

@@ -1,7 +1,8 @@
 """Stickers of the platform that both cameras see at a pose, and the stated accuracy at that pose.
 
 A sticker counts as visible if it lies in both images, at least `EDGE_PX` away from their edges, and
-neither camera sees it at grazing incidence. Obstacles are not considered.
+neither camera sees it at grazing incidence. Obstacles are not considered. For teaching, platform
+and base can hide stickers.
 """
 
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.errors import LostError
 from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
+from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import (
     Array,
@@ -24,13 +26,19 @@ from cmmsim.geometry.pose import (
     pose_to_transform,
 )
 from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.scene_bodies import TOUCHING, scene_body
 from cmmsim.loading import load_sensor
 from cmmsim.measuring.observation import DetectionSettings, faces_camera
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.sensor import Sensor
+from cmmsim.teaching import teaching_path
 
 # Smallest distance of a visible sticker from an edge of an image, px: the side of a default window.
 EDGE_PX = DetectionSettings().window_size
+# Number of poses on the path of teaching at which stickers are looked for, besides home.
+TRIED_POSES = 8
+# Points of a sticker that no body may hide: on its rim, as fractions of the radius.
+RIM = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(8) * np.pi / 4])
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,71 @@ def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
     file = read_sensor_file(name, changes)
     rig, camera_from_base = rig_from_file(file.rig)
     return SightLines(marked_body("platform", file.platform), rig, camera_from_base)
+
+
+def unseen_at_teaching(file: SensorFile) -> dict[tuple[str, str], str]:
+    """Return the stickers that teaching does not see, each with the reason.
+
+    Teaching needs every sticker of the file, whole and in both images, along a path about home. The
+    keys are body and sticker, such as ("platform", "A3"). Legs of a robot are not considered,
+    because they are absent at teaching. Raises SensorFileError for an impossible rig or body.
+    """
+    rig, camera_from_base = rig_from_file(file.rig)
+    sections = {"platform": file.platform, "base": file.base}
+    bodies = [marked_body(name, section) for name, section in sections.items()]
+    scenes = [
+        scene_body(body, section, file.stickers, stream)
+        for stream, (body, section) in enumerate(zip(bodies, sections.values(), strict=True))
+    ]
+    home = np.array(file.platform.home)
+    unseen: dict[tuple[str, str], str] = {}
+    for pose in (home, *teaching_path(home, TRIED_POSES)):
+        placed = [camera_from_base @ pose_to_transform(pose), camera_from_base]
+        for side, move in enumerate(rig.from_camera):
+            moves = [move @ transform for transform in placed]
+            triangles = np.concatenate(
+                [
+                    apply(into, scene.solid.vertices)[scene.solid.faces]
+                    for into, scene in zip(moves, scenes, strict=True)
+                ]
+            )
+            for body, scene, transform, into in zip(bodies, scenes, placed, moves, strict=True):
+                shown = rig.project(apply(transform, scene.sticker_places))[1][side]
+                facing = faces_camera(
+                    apply(into, scene.sticker_places), body.sticker_normals @ into[:3, :3].T
+                )
+                for k, place in enumerate(scene.sticker_places):
+                    rim = place + file.stickers.radius * RIM @ body.in_plane[k].T
+                    reason = (
+                        "lies outside of the image of"
+                        if not shown[k]
+                        else "is turned away from"
+                        if not facing[k]
+                        else "is hidden from"
+                        if _is_hidden(apply(into, rim), triangles)
+                        else ""
+                    )
+                    if reason:
+                        camera = ("left", "right")[side]
+                        key = body.name, str(body.sticker_ids[k])
+                        unseen.setdefault(key, f"{reason} the {camera} camera")
+    return unseen
+
+
+def _is_hidden(points: Array, triangles: Array) -> bool:
+    """Tell whether triangles (m, 3, 3) hide one of points (k, 3), both in the axes of a camera."""
+    first, second, third = triangles.swapaxes(0, 1)
+    sides = [
+        points @ np.cross(one, other).T
+        for one, other in ((first, second), (second, third), (third, first))
+    ]
+    inside = np.all([side >= 0.0 for side in sides], axis=0)
+    inside |= np.all([side <= 0.0 for side in sides], axis=0)
+    normals = np.cross(second - first, third - first)
+    # Depth of each triangle's plane along each line of sight, as a fraction of the point's depth.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.einsum("mi,mi->m", first, normals) / (points @ normals.T)
+    return bool(np.any(inside & (depth > 0.0) & (depth < 1.0 - TOUCHING)))
 
 
 def expected_covariance(

@@ -20,6 +20,8 @@ from cmmsim.files.body_meshes import with_meshes
 from cmmsim.files.schema import SensorFile
 from cmmsim.geometry.pose import Array
 
+BODIES = ("platform", "base")  # tables of the bodies that carry stickers
+
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     """Return changes with dotted keys, from changes with dotted keys or nested tables.
@@ -197,10 +199,16 @@ def sensor_schema() -> dict[str, Any]:
     needed = {name: schema["$defs"][table].pop("required", []) for name, table in tables.items()}
     # In place of `dark_noise`, a file can state `grey_noise_percent`.
     needed["camera"].remove("dark_noise")
-    complete = {
+    complete: dict[str, Any] = {
         "required": schema["required"],
         "properties": {name: {"required": entries} for name, entries in needed.items() if entries},
     }
+    names, of_plane = (
+        schema["$defs"][table].pop("required") for table in ("Planes", "StickerPlane")
+    )
+    planes = {"required": names, "properties": {name: {"required": of_plane} for name in names}}
+    for body in BODIES:
+        complete["properties"][body]["properties"] = {"planes": planes}
     return schema | {
         "required": ["name"],
         "if": {"not": {"required": ["based_on"]}},
@@ -232,7 +240,8 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
 def _content(name: str | Path) -> dict[str, Any]:
     """Return the content of a file, completed from the sensor that ``based_on`` names.
 
-    Missing tables, and missing entries of a table, are added; tables within tables are not merged.
+    Missing tables, and missing entries of a table, are added. Of the tables within tables, only the
+    planes of stickers are completed too.
     Raises SensorFileError if only the cameras are described, or for a wrong ``based_on``.
     """
     own = _table(name)
@@ -262,15 +271,29 @@ def _content(name: str | Path) -> dict[str, Any]:
         else value
         for key, value in own.items()
     }
+    for body in BODIES:
+        _complete_planes(merged.get(body), base.get(body))
     _refuse_idle_noise(base, base, f"sensor file {basis_file}")
     _refuse_idle_noise(own, base | merged, f"sensor file {name}")
     return base | merged
 
 
+def _complete_planes(body: Any, basis: Any) -> None:
+    """Add missing planes of stickers, and missing entries of a plane, from another body."""
+    own, others = (one.get("planes") if isinstance(one, dict) else None for one in (body, basis))
+    if isinstance(own, dict) and isinstance(others, dict):
+        body["planes"] = others | {
+            name: {**others[name], **plane}
+            if isinstance(plane, dict) and isinstance(others.get(name), dict)
+            else plane
+            for name, plane in own.items()
+        }
+
+
 def _table(name: str | Path) -> dict[str, Any]:
     """Return the content of a file, in which the paths of meshes are absolute."""
     content = parsed(sensor_text(name), f"sensor file {name}", SensorFileError)
-    for body in ("platform", "base"):
+    for body in BODIES:
         section = content.get(body)
         if isinstance(section, dict) and isinstance(section.get("mesh"), str):
             section["mesh"] = str(Path(name).resolve().parent / section["mesh"])

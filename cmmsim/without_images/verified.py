@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 NAME = "statistical"
 # Largest verified standard deviation of the point spread, and largest length of motion blur.
-WIDEST_PSF_PX = 1.0
+WIDEST_PSF_PX = 0.8
 LONGEST_STREAK_PX = 4.0
 # Grey values must be at least this many standard deviations of noise away from black and white.
 CLIPPED = 3.0

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmmsim.files import SensorFile
+from cmmsim.files.rig_and_bodies import marked_body
+from cmmsim.visibility import unseen_at_teaching
 from dynamics import Robot
 from identify.excitation.constraints import MOVE_RIG, seen_by_plane
 from identify.experiment.sensor_in_loop import (
@@ -17,7 +19,7 @@ from identify.experiment.sensor_in_loop import (
 from identify.verification.finding import Finding
 
 # Checks that a run repeats before it begins, and that end it.
-REFUSED = ("sensor's platform", "sensor's home", "visible stickers")
+REFUSED = ("sensor's platform", "sensor's home", "visible stickers", "stickers at teaching")
 MOST_INSIDE_M = 0.02  # largest length, m, of a leg inside the platform of the sensor
 
 
@@ -52,6 +54,33 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
         text += f": {MOVE_RIG}"
     yield Finding(
         "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
+    )
+    yield _taught_stickers(file)
+
+
+def _taught_stickers(file: SensorFile) -> Finding:
+    """Check that teaching sees every sticker of the file."""
+    sections = {"platform": file.platform, "base": file.base}
+    total = sum(len(marked_body(name, one).sticker_ids) for name, one in sections.items())
+    unseen = unseen_at_teaching(file)
+    text = f"teaching sees all {total} stickers of platform and base"
+    if unseen:
+        (body, sticker), reason = next(iter(unseen.items()))
+        text = (
+            f"teaching needs all {total} stickers, and near home {sticker} of the {body} {reason}: "
+            f"remove it from {body}.planes.{sticker[0]}.stickers, or move the cameras"
+        )
+        others = [f"{name} of the {which}" for which, name in list(unseen)[1:4]]
+        if others:
+            more = f" and {len(unseen) - 4} more" if len(unseen) > 4 else ""
+            text += f"; not seen either: {', '.join(others)}{more}"
+    return Finding(
+        "stickers at teaching",
+        not unseen,
+        total - len(unseen),
+        text,
+        limit=total,
+        relation=">=",
     )
 
 

@@ -12,6 +12,9 @@ from cmmsim.files.body_meshes import read_mesh, surface_heights
 from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.schema import unit
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.visibility import unseen_at_teaching
+from dynamics import load_robot
+from identify.verification.sensor_check import about_sensor
 from tests.cmmsim.sensors import NOISE_FREE
 
 # Sticker B6 of both built-in bodies juts out over an edge by more than its radius. The sides of
@@ -98,6 +101,31 @@ def test_a_wall_on_the_mesh_hides_the_stickers_behind_it_and_no_other(tmp_path, 
         match=r"^platform.mesh .*platform\.stl: stickers A1, .*, A6 lie in a hollow of",
     ):
         cmmsim.load_sensor(file, renderer="analytic").capture(mine.home)
+
+
+@pytest.mark.rendering
+def test_a_sticker_behind_a_fin_ends_the_teaching_until_it_is_removed(tmp_path, platform):
+    fin = trimesh.creation.box((0.01, 0.07, 0.05))
+    fin.apply_translation([-0.12, 0.12, 0.154])
+    file = sensor_file(tmp_path, trimesh.util.concatenate([platform, fin]))
+    hidden = unseen_at_teaching(read_sensor_file(file, WIDE))
+    assert hidden == {("platform", "A3"): "is hidden from the left camera"}
+    sensor = cmmsim.load_sensor(file, renderer="pyrender", changes=WIDE)
+    said = "sticker.? A3 .* remove it from platform.planes.A.stickers"
+    with pytest.raises(cmmsim.TeachingError, match=said):
+        sensor.teach()
+    (finding,) = (
+        one
+        for one in about_sensor(load_robot("rss6"), "mine", read_sensor_file(file, WIDE))
+        if one.check == "stickers at teaching"
+    )
+    assert (finding.ok, finding.value, finding.limit) == (False, 35, 36)
+    assert "A3 of the platform is hidden from the left camera: remove it from" in finding.text
+    stickers = read_sensor_file("ctrack780").platform.planes.A.stickers
+    without = WIDE | {"platform.planes.A.stickers": [*stickers[:2], *stickers[3:]]}
+    assert unseen_at_teaching(read_sensor_file(file, without)) == {}
+    sensor = cmmsim.load_sensor(file, renderer="pyrender", changes=without)
+    assert len(sensor.teach().platform_places) == 17
 
 
 def test_planes_are_dropped_onto_the_surface_where_the_stickers_lie(tmp_path, platform):

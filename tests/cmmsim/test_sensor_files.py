@@ -147,6 +147,17 @@ def test_a_file_is_read_from_a_path_and_may_change_single_entries_of_the_one_bes
     assert cmmsim.load_sensor(mine).noise.gain == 0.26
 
 
+def test_a_short_file_completes_planes_and_no_other_tables_within_tables(tmp_path):
+    mine, usual = tmp_path / "mine.toml", read_sensor_file("ctrack780").platform.planes
+    head = 'name = "mine"\nbased_on = "ctrack780"\n'
+    mine.write_text(f"{head}[platform.planes.A]\nstickers = {[*map(list, usual.A.stickers[:5])]}\n")
+    planes = read_sensor_file(mine).platform.planes
+    five = usual.A.model_copy(update={"stickers": usual.A.stickers[:5]})
+    assert planes == usual.model_copy(update={"A": five})
+    mine.write_text(f"{head}[rig.left]\ncentre_px = [1000.0, 700.0]\n")
+    refused(lambda: read_sensor_file(mine), "rig.left.focal_px: Field required")
+
+
 def test_the_camera_tables_of_a_calibration_are_told_from_the_whole_file(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text("[rig.left]\nfocal_px = [1400.0, 1400.0]\n")

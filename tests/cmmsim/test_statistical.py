@@ -295,7 +295,7 @@ def test_it_is_taught_and_measures_with_a_rig_that_drifts():
             {"camera.electrons_at_white": 2500.0, "camera.full_well": 4000.0},
             "not verified for rings and stickers of",
         ),
-        ({"lens.psf_px": 2.0}, "not verified for lens.psf_px 2, only for at most 1"),
+        ({"lens.psf_px": 2.0}, "not verified for lens.psf_px 2, only for at most 0.8;"),
         (
             {"stickers.ring_radius": 0.005},
             "not verified for stickers.ring_radius 0.005 m, only for at least 2.4",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.errors import TeachingWarning
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, invert, rotation_log
 from cmmsim.geometry.stereo_rig import radius_at
@@ -151,6 +152,25 @@ def teaching_itself(changes):
 def test_the_built_in_stickers_and_smaller_ones_get_the_smallest_windows(changes, sizes):
     settings = teaching_itself(changes).settings
     assert (settings.window_size, settings.fit_size) == sizes
+
+
+def test_a_point_spread_that_blurs_the_edge_of_rings_is_named_before_and_after_teaching_fails():
+    """The largest one is proportional to the width of the ring beyond 2.4 radii of a sticker, and
+    there is no limit if the bodies are as dark as the rings.
+    """
+    widest = teaching_itself({})._view.widest_psf_px
+    wider = teaching_itself({"stickers.ring_radius": 0.0084})._view.widest_psf_px
+    assert wider == pytest.approx(widest * (2.8 - 2.4) / (3.0 - 2.4))
+    assert teaching_itself({"stickers.body_level": 8})._view.widest_psf_px == np.inf
+    blurred = teaching_itself({"lens.psf_px": 2.0})
+    said = "lens.psf_px = 2 blurs the light of the bodies over .* at most 0.82 px is free of this"
+    with (
+        pytest.warns(TeachingWarning, match=said),
+        pytest.raises(
+            cmmsim.TeachingError, match=r"or lens.psf_px = 2 blurs the edge of its ring$"
+        ),
+    ):
+        blurred.teach()
 
 
 def test_windows_of_teaching_grow_as_those_of_measuring():

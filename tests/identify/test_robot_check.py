@@ -181,7 +181,7 @@ def test_actuators_too_weak_to_hold_the_platform_fail_in_a_line_that_can_be_read
     )
     said = one_line(capfd.readouterr().err)
     assert (
-        "2 of 25 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
+        "2 of 26 findings about rss6 fail: holding torque: joint 6 holds the most at home, " in said
     )
     assert (
         "and the actuators have 3 N m; inertias: no rigid body has these; corrected, accelerations "

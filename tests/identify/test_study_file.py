@@ -228,7 +228,7 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
                 "kind": "static_pose",
                 "changes": {"scenario.renderer": "statistical", "sensor.lens.psf_px": 2.0},
             },
-            ["first row", "not verified for lens.psf_px 2", "at most 1", "analytic or pyrender"],
+            ["first row", "not verified for lens.psf_px 2", "at most 0.8", "analytic or pyrender"],
         ),
         (
             {"kind": f"{__name__}:wrong_row"},
