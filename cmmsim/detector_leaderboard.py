@@ -37,8 +37,7 @@ TOGETHER = 100  # largest number of discs that are drawn together
 SMALLEST_RADIUS_PX = 1.0
 LARGEST_RADIUS_PX = 50.0
 LARGEST_TILT_DEG = 80.0
-# Pixels between a sharp disc's rim and the edge of the fitted part of the window.
-FREE_PX = 3
+FREE_PX = 3  # pixels between a sharp disc's rim and the edge of the fitted part of the window
 RESAMPLES = 1000  # number of bootstrap samples for the interval of a ratio
 CONFIDENCE = 0.95  # probability that this interval contains the ratio
 # If the noise is below half a grey value, the rounding errors of neighbouring pixels are
@@ -394,6 +393,7 @@ def detect_by_contour(spots: SpotWindows) -> DetectedCentres:
     return _by_window(find, spots)
 
 
+# Methods of OpenCV with their biases, px.
 PEERS = (
     Detector("opencv_blob", detect_by_blobs, 0.01),
     Detector("opencv_fit_ellipse", detect_by_contour, 0.05),

@@ -95,9 +95,8 @@ def report(
     run_began: time at which a whole run began, from `time.perf_counter`. seconds: durations of
     earlier stages that are added to result.json.
     """
-    from identify.reporting.report import (
-        write_report,
-    )  # imports Matplotlib, which the other stages do not need
+    # Imported late, because it loads Matplotlib, which the other stages do not need.
+    from identify.reporting.report import write_report
 
     began = time.perf_counter()
     path = RunFolder(folder).result

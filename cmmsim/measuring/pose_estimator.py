@@ -185,9 +185,9 @@ class PoseEstimator(Observer):
         ``expected`` is a first guess of camera_from_platform. ``exposure_ends`` are the expected
         transforms at the beginning and at the end of the exposure. ``frame_ends`` are those half a
         frame period before and after its middle, for rows or cameras that are not exposed at the
-        same time. Without ``exposure_ends`` and without point spread, the error of the pose exceeds
-        its covariance if images of stickers move by more than half a pixel during the exposure; use
-        ``measure_anew`` in this case. Raises LostError.
+        same time. Without ``exposure_ends`` and without point spread, the covariance is too small
+        if images of stickers move by more than half a pixel during the exposure. ``measure_anew``
+        avoids this. Raises LostError.
         """
         return self.measured(
             self.observe(images, expected, *self._stickers, exposure_ends, frame_ends), expected

@@ -288,7 +288,7 @@ class StickerWindows:
         return LEAN * np.maximum(blur - LARGEST_BLUR * deviation - KNOWN_BLUR, 0.0)
 
     def _lit(self, even: EllipseFits, smears: Array) -> DetectedCentres:
-        """Fit light that rises across each sticker, in the exposures in which it moves the pose.
+        """Fit rising light to stickers in the exposures in which this moves the pose beyond noise.
 
         In other exposures, this would only widen the covariance. ``even`` are the fits with even
         light, for stickers that move by ``smears`` (2, k, 2) px during the exposure.

@@ -1,4 +1,4 @@
-"""Causes as they are asked at an optimum: their columns, and the trial sizes of some of them."""
+"""Asking of causes: at an optimum, the columns that show what each of them would explain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 class Asked:
     """Causes as they are asked at an optimum, and their columns (m, k) there.
 
-    Of the trial sizes of a cause, the one with the largest gain is kept alone. Its column is the
-    change of the residuals at that size, divided by the size. All sizes are kept if none gains.
+    Of its trial sizes, a cause keeps only the one that explains most. Its column is the change of
+    the residuals at that size, divided by the size. All are kept if none explains anything.
     """
 
     causes: tuple[Cause, ...]
@@ -46,7 +46,7 @@ def ask_first(
     at_bound: NDArray[np.bool_],
     causes: Sequence[Cause],
 ) -> tuple[Point, Asked]:
-    """Return the optimum (p,) of a problem without any cause, and the causes as asked there.
+    """Return the optimum at `parameters` (p,) without any cause, and the causes as asked there.
 
     at_bound (p,): coordinates of the parameters that are held at their bounds. Both results share
     one linearisation.

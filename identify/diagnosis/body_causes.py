@@ -69,7 +69,6 @@ def body_causes(
         *_passive_friction(problem.runs[0].robot, motions),
         *_uneven_friction(problem.runs[0], motions),
     ]
-
     return tuple(_cause(one) for one in needed)
 
 

@@ -1,8 +1,8 @@
-"""Fits of candidates beside the causes that were selected before, and which of them is the best.
+"""Fits of candidates beside the causes that were selected before, and the choice of the best fit.
 
 Columns tell what a candidate explains to first order. Where the best candidate, once fitted, leaves
-some of the misfit, those that columns cannot tell from it are fitted, too. A cause with trial sizes
-is fitted whenever its statistic is close to the best, because its column is the least exact.
+some of the misfit, those that columns cannot tell from it are fitted, too. So is the first cause of
+another group with trial sizes and a statistic close to the best, as its column is the least exact.
 """
 
 from collections.abc import Sequence
@@ -94,7 +94,7 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
     """Fit the best candidate of a state's ranking beside the causes that the state has.
 
     Others are fitted, too, see `CLOSE`, `LOOSE`, `RIVALS` and `MOST_LEFT`. Returns the fits that
-    help by increasing cost, but that of the best candidate first if it is as good but for chance.
+    help, by increasing cost. The best candidate leads if only by chance its fit costs more.
     """
     point, asked, places = now.point, now.asked, now.places
     alike = indistinguishable(now.ranking, rows, point.beside_all.part(point.residual))
@@ -134,8 +134,8 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
 def _of_use(now: State, first: FittedCandidate | None, rows: Rows) -> float:
     """Return the cost above which the fit of another candidate than the first is of no use.
 
-    A useful fit is as good as the first. If nothing is selected yet, one that explains nearly all
-    is useful, too, as a selection can begin anew with it.
+    A useful fit is as good as the first. If nothing is selected yet, a fit that explains nearly all
+    of the misfit is useful, too, as a selection can begin anew with it.
     """
     if first is None:
         return np.inf
@@ -161,8 +161,8 @@ def _from_afar(
 
     The parameters can have taken up so much of such a cause that it shows only once they are fitted
     with it. least: cost of the best fit before. done: candidates that were fitted already, from the
-    size at which they explain most. The largest size of a cause comes first. Returns the fits of
-    lower cost than `least`, and ends after one that leaves less than `MOST_LEFT` of its misfit.
+    size at which they explain most. The largest size of a cause comes first. Returns the fits that
+    cost less than `least`, and ends after one that leaves little of the misfit, see `MOST_LEFT`.
     """
     found = []
     for one in now.ranking:
@@ -187,39 +187,40 @@ def _from_afar(
 
 def _trial(
     problem: OutputErrorProblem,
-    now: Point,
+    before: Point,
     asked: Asked,
     places: tuple[int, ...],
-    best: Ranked,
+    one: Ranked,
     reach: float = np.inf,
 ) -> FittedCandidate | None:
     """Fit a candidate beside the causes at `places`, or return None if the fit does not help.
 
-    A fit helps if the cost falls by more than ln n and one of the new causes is kept. now: optimum
-    with the causes at `places`. asked: causes there. reach: cost above which a fit is of no use.
+    A fit helps if the cost falls by more than ln n and one of the new causes is kept. before:
+    optimum with the causes at `places`. asked: causes as asked there. reach: cost above which a fit
+    is of no use.
     """
     causes = asked.causes
     # some members of a group may have been fitted before
-    new = [k for k, place in enumerate(best.candidate.places) if place not in places]
-    own = tuple(best.candidate.places[k] for k in new)
+    new = [k for k, place in enumerate(one.candidate.places) if place not in places]
+    own = tuple(one.candidate.places[k] for k in new)
     accompanying = companions(causes, own)
     added = (*own, *accompanying)
     zeros = np.zeros(len(accompanying))
     tried = [causes[place].tried[0] if causes[place].tried else 0.0 for place in own]
-    sizes = np.concatenate([now.sizes, tried, zeros])
-    expected = np.concatenate([now.sizes, best.score.sizes[new], zeros])
+    sizes = np.concatenate([before.sizes, tried, zeros])
+    expected = np.concatenate([before.sizes, one.score.sizes[new], zeros])
     linear = None
     if not any(tried):
-        linear = replace(now.linear, by_causes=np.hstack([now.columns, asked.columns[:, added]]))
+        columns = np.hstack([before.columns, asked.columns[:, added]])
+        linear = replace(before.linear, by_causes=columns)
     try:
-        held = np.isin(np.arange(len(sizes)), len(now.sizes) + np.flatnonzero(tried))
-        kept, point = fitted(
-            problem, now.parameters, causes, (*places, *added), sizes, expected, held, linear, reach
-        )
+        held = np.isin(np.arange(len(sizes)), len(before.sizes) + np.flatnonzero(tried))
+        start, both = before.parameters, (*places, *added)
+        kept, point = fitted(problem, start, causes, both, sizes, expected, held, linear, reach)
     except (DynamicsError, OutOfReachError):
         # the model with the cause does not run, or does not come near the record
         return None
-    enough = now.cost - point.cost > np.log(len(now.residual))
+    enough = before.cost - point.cost > np.log(len(before.residual))
     return FittedCandidate(added, kept, point) if enough and set(added) & set(kept) else None
 
 
@@ -228,7 +229,7 @@ def _rival(
 ) -> Ranked | None:
     """Return a cause that may do better than the best candidate once it is fitted, or None.
 
-    It has trial sizes and another group than the best, and more than `share` of its statistic.
+    Its group is not the best one's. It has trial sizes, and over `share` of the best statistic.
     """
     for one in ranking:
         cause = causes[one.candidate.places[0]]
@@ -263,11 +264,11 @@ def fitted(
     linear: Linearisation | None,
     reach: float = np.inf,
 ) -> tuple[tuple[int, ...], Point]:
-    """Fit causes, and again without those that chance explains.
+    """Fit causes, then leave out those whose sizes chance explains, and fit the rest again.
 
     places (k,): indices of the causes in the catalogue. The other arguments are as for `fit`, with
-    `reach` for the first fit only. Returns the indices of the causes that are kept, and their
-    optimum. If none is kept, that is the optimum with all. Raises the errors of `fit`.
+    `reach` for the first fit only. Returns the indices of the causes that are kept, and the optimum
+    with them. If none is kept, it is the optimum with all. Raises the errors of `fit`.
     """
     own = [causes[place] for place in places]
     point = fit(problem, parameters, own, sizes, expected, held, linear, reach)

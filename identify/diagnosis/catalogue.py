@@ -42,7 +42,7 @@ def catalogue(problem: OutputErrorProblem, parameters: Array) -> tuple[Cause, ..
 
 
 def own_cause(name: str) -> Cause:
-    """Return a user's own cause. Raises EstimationError if it, or its step, is unusable."""
+    """Return a user's own cause. Raises EstimationError if the function or its step is unusable."""
     function = own_function(name, "cause", EstimationError)
     step = getattr(function, "step", STEP)
     if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < math.inf:

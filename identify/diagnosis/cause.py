@@ -2,9 +2,9 @@
 
 A cause has a size, zero where the model is right. At another size, it turns the output-error
 problem that was solved into one with other commands, another clock or another robot. The derivative
-of the residuals with respect to the size is the column of the cause. A column is a difference of
-runs, or follows, for a cause that names its effect, from one run of the model that is
-differentiated along many directions at once.
+of the residuals with respect to the size is the column of the cause. The columns of causes that
+name their effects follow from one run of the model, which is differentiated along many directions
+at once. The other columns are differences of runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from identify.arrays import Array
 from identify.estimation.output_error_problem import OutputErrorProblem
 from identify.model.loop_model import LoopModel
 
-# Function that returns the problem with a cause of a given size. It changes nothing else.
+# Function that returns the problem with a cause of a given size, and changes nothing else.
 Change = Callable[[OutputErrorProblem, float], OutputErrorProblem]
 # Function (run, its index) that returns what a cause of size one changes at each frame.
 RunColumn = Callable[[LoopModel, int], Array]
@@ -67,7 +67,7 @@ Effect = OnCommands | OnTorques | OnGain | OnGeometry | OnPoses
 class InList:
     """Remedy that adds an entry to a list in the settings.
 
-    key: that of the list. known: entries that the model has. entry: the one to add.
+    key: key of the list. known: entries that the model has. entry: entry to add.
     """
 
     key: str
@@ -86,7 +86,7 @@ class Cause:
     unit : str
         Unit of the size.
     group : str
-        Name of its group of similar causes. A group is also judged as a whole, if not exclusive.
+        Name of a group of similar causes. A group is also judged as a whole, unless exclusive.
     change : callable
         Function (problem, size) that returns the problem with this cause.
     step : float
@@ -110,12 +110,12 @@ class Cause:
         the motion of that problem. None: a fit keeps the first effect.
     anew : callable, optional
         Function (problem with other causes, parameters) that returns this cause as it is asked at
-        the optimum with those. None: its sizes are not relative to the motion.
+        the optimum of that problem. None: its sizes are not relative to the motion.
     exact : bool
-        True if the fit of a true cause leaves only noise. False: its effect is of first order, or
-        joints that stick keep a fit from the optimum.
+        True if the fit of a true cause leaves only noise. False: its effect is only known to first
+        order, or joints that stick keep a fit from the optimum.
     tried : tuple of float
-        Trial sizes, for a cause of which a small size shows nothing. Empty: it is asked at zero.
+        Trial sizes, for a cause that shows nothing at a small size. Empty: it is asked at size 0.
     """
 
     name: str
@@ -136,7 +136,7 @@ class Cause:
 
     @property
     def differentiable(self) -> bool:
-        """True if the column is a difference of runs, and the cause is not just there or not."""
+        """True if the column is a difference of runs, and the cause has a size."""
         return self.effect is None and self.step > 0
 
 
@@ -150,9 +150,9 @@ def in_each_run(change: Callable[[LoopModel, float], LoopModel]) -> Change:
 
 
 def prior_std(size: float, least: float) -> float:
-    """Return the smallest power of ten not below |size|, as a prior standard deviation.
+    """Return the smallest power of ten not below |size| and `least`, as a prior standard deviation.
 
-    Nor is it below `least`, which is usual in workshops. Most causes of a kind thus have the same.
+    `least` is usual in workshops, so that most causes of a kind have the same standard deviation.
     """
     return float(10.0 ** np.ceil(np.log10(max(abs(size), least))))
 
@@ -167,7 +167,7 @@ def with_causes(
         size * one.effect.deviations for one, size in present if isinstance(one.effect, OnGeometry)
     ]
     if geometric:
-        # to move a robot takes longer than to run it, so it is moved once for all numbers
+        # to move a robot takes longer than to run it, so it is moved once by all deviations
         problem = with_geometry(problem, np.sum(geometric, axis=0))
     others = [pair for pair in present if not isinstance(pair[0].effect, OnGeometry)]
     return reduce(lambda changed, pair: pair[0].change(changed, pair[1]), others, problem)
@@ -181,5 +181,5 @@ def with_geometry(problem: OutputErrorProblem, deviations: Array) -> OutputError
 
 @lru_cache(maxsize=8)
 def _moved(robot: Robot, deviations: bytes) -> Robot:
-    """Return a moved robot, as a fit asks for it repeatedly. The cache needs bytes, not arrays."""
+    """Return the robot moved by deviations (g,), which are bytes because the cache needs a hash."""
     return robot.moved(np.frombuffer(deviations))

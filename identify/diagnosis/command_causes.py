@@ -1,4 +1,4 @@
-"""Causes between the log of the commands and the drives: their scale, and clocks.
+"""Causes between the log of the commands and the drives: errors of scale and of clocks.
 
 A record with commands at its frames states a latency for each of them. A record with commands at
 any times states when each of them acts.
@@ -102,14 +102,14 @@ def clocks(problem: OutputErrorProblem) -> tuple[Cause, ...]:
 
 
 def seconds_of(run: LoopModel) -> Array:
-    """Return the times (N,), s, of a run's commands after its first frame."""
+    """Return the times (N,), s, of a run's commands, counted from its first frame."""
     if isinstance(run, TimedModel):
         return np.asarray(run.acting - run.times[0])
     return np.arange(len(run.logged)) / run.settings.timing.frame_rate_hz
 
 
 def acting_later(run: LoopModel, seconds: Array | float) -> LoopModel:
-    """Return a model whose commands act later by some seconds (N,), with `possible` latencies."""
+    """Return a model whose commands act later by some seconds (N,). `possible` limits latencies."""
     if isinstance(run, TimedModel):
         return replace(run, acting=run.acting + seconds)
     return replace(run, acted=possible(run, run.stated_latencies + seconds))

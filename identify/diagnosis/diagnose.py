@@ -50,7 +50,7 @@ def diagnose(
     record : xarray.Dataset or path, or sequence of them
         One or several records of the same robot, or the paths of their netCDF files.
     result : IdentificationResult, optional
-        What was identified from them. The default is to identify it.
+        Result of the identification from these records, which is done here if none is given.
     robot : Robot, optional
         Robot as it is known. The default is the robot of the scenario.
     scenario : Scenario, optional

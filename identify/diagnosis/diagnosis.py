@@ -1,4 +1,4 @@
-"""Diagnosis of a record: the causes that explain what its model leaves, with their sizes."""
+"""Diagnosis of a record: the causes that explain the misfit of its model, with their sizes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Finding:
-    """Cause, or group of causes, that explains what a model leaves of its record.
+    """Cause, or group of causes, that explains a part of the misfit of a model.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Finding:
     sizes : tuple of Size
         Sizes of the causes that have one, fitted beside the parameters and all other findings.
     share : float
-        Fraction of the misfit that it explains after the findings before it.
+        Fraction of the misfit that this finding explains beside the findings before it.
     statistic, freedoms : float, int
         Score statistic and its degrees of freedom.
     chance : float

@@ -168,7 +168,7 @@ class WithCauses:
         return self.known[key]
 
     def _settled(self, coordinates: Array) -> Linearisation | None:
-        """Return `with_last_columns` of the latest linearisation, None if residuals change much."""
+        """Return the latest linearisation `with_last_columns`, or None if residuals change much."""
         if not self.known:
             return None
         key, latest = next(reversed(self.known.items()))
@@ -186,7 +186,7 @@ class WithCauses:
         return found if change @ change <= SETTLED * len(change) else None
 
     def best_known(self, coordinates: Array, cost: float) -> Array:
-        """Return the best linearised coordinates, or these (p + k,) if clearly of less cost."""
+        """Return the linearised coordinates of least cost, or these if `cost` is clearly less."""
         costs = {key: float(one.residual @ one.residual) for key, one in self.known.items()}
         key = min(costs, key=lambda one: costs[one], default=b"")
         good_enough = key and costs[key] <= cost * (1 + STOP.cost_tolerance)

@@ -6,15 +6,16 @@ the model is a direction, too (`identify.model.joint_torques`). So are the zeros
 
 The column of a geometric number follows without a run of a robot with that number. Let J_g and X be
 the derivatives of the pose with respect to the number and to the joint coordinates, both with
-closed loops. A run begins at the same pose of rest, so that its joint coordinates differ by d. The
-drives then move the joints by -d, to where the commands want them. The columns Z of the zeros of
-the joints contain the same response: a joint whose zero is off by s begins at its command less s.
+closed loops. A run of such a robot begins at the same pose of rest, so that its joint coordinates
+differ by d. The drives then move the joints by -d, to where the commands want them. The columns Z
+of the zeros of the joints contain the same response: a joint whose zero is off by s begins at its
+command less s.
 
     column = J_g + (X - Z) d,    d = -X^-1 J_g at the first pose
 
 The effect of changed lever arms on the torques is left out.
 
-All other columns are differences of runs.
+A change of measured poses is a column by itself. All other columns are differences of runs.
 """
 
 from collections.abc import Sequence
@@ -184,9 +185,9 @@ def _differences(
     It is one-sided at the least size, and where the model is unstable on one side. It is NaN where
     the model is unstable on both. residual (m,): residuals at the sizes.
     """
-    by = [step * causes[k].step for k in places]
+    steps = [step * causes[k].step for k in places]
     spans = [
-        (max(-own, causes[k].least - sizes[k]), own) for k, own in zip(places, by, strict=True)
+        (max(-own, causes[k].least - sizes[k]), own) for k, own in zip(places, steps, strict=True)
     ]
     moves = np.eye(len(causes))[list(places)]
     # a cause at its least size is not moved down, and the residuals there are known
@@ -208,7 +209,7 @@ def _differences(
 def _slope(
     residual: Array, less: Array | None, more: Array | None, low: float, high: float
 ) -> Array | float:
-    """Return the slope between residuals (m,) at two changes of size. None: no change instead."""
+    """Return the slope between residuals (m,) at two changes of size. None stands for no change."""
     if less is None:
         less, low = residual, 0.0
     if more is None:

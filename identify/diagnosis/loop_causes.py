@@ -188,9 +188,9 @@ def _carried(run: LoopModel, parameters: Array, found: ClosedLoopRun, rates: Arr
 
 
 def torque_limit(run: LoopModel, peak: float) -> Cause:
-    """Return a limit of the torques below that of the model. peak: its largest torque.
+    """Return a limit of the torques below the largest torque `peak` of the model.
 
-    A size is the fraction of this torque that the limit cuts off. With other causes, the largest
+    The size is the fraction of `peak` that the limit cuts off. With other causes, the largest
     torque differs. Trial sizes are small, since motion can add only a few per cent to the weight.
     """
     layout = run.robot.layout

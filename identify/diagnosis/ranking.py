@@ -217,7 +217,7 @@ def in_few_rows(columns: Array, residual: Array) -> tuple[Array, Array]:
 
 
 def _exactly(one: Ranked, count: int, left: Array, rows: Rows) -> Ranked:
-    """Return one of `count` candidates with its chance by what it leaves of residuals (m,)."""
+    """Return one of `count` candidates. Its chance allows for what it leaves of residuals (m,)."""
     return replace(one, chance=min(1.0, count * p_value_of(one.score, left, rows)))
 
 
@@ -298,9 +298,9 @@ def indistinguishable(ranking: Sequence[Ranked], rows: Rows, residual: Array) ->
     """Return the first of a ranking and all that cannot be told apart from it, the lead first.
 
     They have no cause in common with the first, and explain as much up to chance, or up to a cosine
-    of `ALIKE`. Single causes are compared with single causes, groups with groups. Of those that
-    explain as much up to the exactness of columns, the lead has the fewest degrees of freedom, and
-    then stands first in the catalogue, where causes that are easier to check come first.
+    of `ALIKE`. Single causes are compared with single causes, groups with groups. The lead has the
+    fewest degrees of freedom of those that explain as much up to the exactness of columns. Of
+    several, it is the first of the catalogue, where causes that are easier to check come first.
     """
     first = ranking[0]
     most = first.score.statistic

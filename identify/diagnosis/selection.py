@@ -89,7 +89,7 @@ def select(
 
 
 def _followed(problem: OutputErrorProblem, now: State, cost: float, rows: Rows) -> State:
-    """Select up to `MOST` candidates while one counts. cost: that without any cause."""
+    """Select candidates as long as one counts, at most `MOST`. cost: cost without any cause."""
     while len(now.chosen) < MOST:
         ways = _next_fits(problem, now, rows)
         if not ways:
@@ -187,7 +187,7 @@ def _exchanged(problem: OutputErrorProblem, now: State, cost: float, rows: Rows)
     """Return a state with another cause in place of one that is there or not, if that is better.
 
     Such a cause has no size that could become insignificant. It can take up what several causes
-    make together, and is asked again once one of these is fitted. cost: that without any cause.
+    make together, and is asked again once one of these is fitted. cost: cost without any cause.
     """
     for one in now.chosen[:-1]:
         if all(now.causes[place].step for place in one.places):
@@ -230,7 +230,7 @@ def _simplified(problem: OutputErrorProblem, now: State, rows: Rows) -> State:
 
 
 def _in_place_of(problem: OutputErrorProblem, now: State, one: Selected, rows: Rows) -> State:
-    """Return a state of smaller criterion with a simpler candidate in place of one, or the same."""
+    """Return a state with a simpler candidate in place of `one` if that lowers the criterion."""
     point = now.point
     own = np.isin(now.places, one.places)
     residual = point.residual - point.columns[:, own] @ point.sizes[own]

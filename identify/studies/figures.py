@@ -85,7 +85,7 @@ def draw_side_by_side(
 ) -> None:
     """Write plots that show the finished rows of a study and of other studies side by side.
 
-    The abscissa is each factor, or the name of the study if there are no factors.
+    A plot is drawn against each factor, or against the name of the study if there are no factors.
     """
     names, tables = zip((study.name, done), *others, strict=True)
     together = pd.concat(

@@ -11,8 +11,8 @@ The figures of one point of a study have 95 % bands. The band of the mean is Stu
 band of the rms is Student's interval of the logarithm of the mean square. A chi-square band would
 need the number of independent errors in a row's figure, while this band uses the scatter of the
 figure over the rows. In simulations with two or more rows, the band contained the true rms in 95 to
-97 % of cases if the figures were the rms of three or more normal numbers, and in at least 92 % if
-they were single normal numbers, the worst case. A single row has no band.
+97 % of cases if the figures were the rms of three or more normal numbers. In the worst case, single
+normal numbers, it did so in at least 92 %. A single row has no band.
 
 A law states an exponent or a ratio, with a tolerance. The law fails if no value within the
 tolerance lies in the 99 % interval of the measured value. Otherwise the law passes if the interval

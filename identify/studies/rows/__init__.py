@@ -60,7 +60,7 @@ def find_kind(name: str) -> Kind:
 def _own(name: str, function: Callable[..., Any]) -> Kind:
     """Make a kind from a function of (scenario, seed, options), or of (scenario, seed).
 
-    Its errors name the function, and the file and line that raised an exception.
+    Errors of its rows name the function, and the file and line that raised an exception.
     """
     known = (CmmError, DynamicsError, IdentifyError)
     told = PluginFunction(f"kind {name!r}", function, StudyError, known, _check_figures)

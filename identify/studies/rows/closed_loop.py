@@ -32,8 +32,7 @@ from identify.studies.rows.kind import (
 )
 from identify.studies.rows.row_sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
-EXPERIMENT = 0
-TRAJECTORY = 1
+EXPERIMENT, TRAJECTORY = range(2)  # random streams of a row
 
 COLUMNS = {
     "frames": Column("1", "frames of the run"),

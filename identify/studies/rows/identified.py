@@ -50,7 +50,7 @@ from identify.trajectory import TrajectorySet
 from identify.validation.pose_prediction import PosePrediction, predicted_runs
 from identify.validation.unseen import model_on_record
 
-EXPERIMENT = 0
+EXPERIMENT = 0  # random stream of a row
 CHOSEN = {
     "coulomb": ("Coulomb friction", "coulomb"),
     "viscous": ("viscous friction", "viscous"),

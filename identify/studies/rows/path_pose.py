@@ -38,9 +38,7 @@ from identify.studies.rows.row_sensor import (
 )
 from identify.trajectory import FourierTrajectory
 
-DRAWN_PATH = 0
-SENSOR = 1
-LATENCY = 2
+DRAWN_PATH, SENSOR, LATENCY = range(3)  # random streams of a row
 # Number of instants per frame period at which the pose in use is compared with the true pose.
 INSTANTS_PER_FRAME = 16
 

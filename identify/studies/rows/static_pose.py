@@ -42,9 +42,7 @@ from identify.studies.rows.row_sensor import (
     row_sensor,
 )
 
-POSES = 0
-SENSOR = 1
-DROPOUT = 2
+POSES, SENSOR, DROPOUT = range(3)  # random streams of a row
 TOGETHER = 256  # pictures that are drawn and measured at once
 # Standard deviation of the error of the predicted pose, m and rad. Stickers are searched near this
 # pose, as by a tracker.

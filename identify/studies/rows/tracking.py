@@ -37,8 +37,7 @@ from identify.tracking.following import TrackingRun
 from identify.tracking.motions import motions
 from identify.tracking.track import follow_by_images, known_model, model_of_result
 
-EXPERIMENT = 0
-SIGNS = 1
+EXPERIMENT, SIGNS = range(2)  # random streams of a row
 AXES = (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad"))
 
 COLUMNS = {

@@ -72,5 +72,5 @@ def drawn_troubles(
 
 
 def _clash(one: Trouble, other: Trouble) -> bool:
-    """Return whether two troubles set the same key of the plant."""
+    """Return whether two troubles set the same key of the scenario."""
     return bool(set(one.settings) & set(other.settings))

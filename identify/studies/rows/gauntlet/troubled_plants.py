@@ -100,7 +100,7 @@ class _ServoWithPlay:
     def follow(
         self, frame: int, time: float, measured: Array, desired: Array, desired_rate: Array
     ) -> Array:
-        """Return the servo's command at a frame after the play, and log the one before it."""
+        """Return the command at a frame behind the play, and log the servo's command before it."""
         error = desired - measured
         self._integral = self._integral + self._period * error
         rate = (measured - self._last) / self._period
