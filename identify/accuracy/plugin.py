@@ -51,9 +51,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="RATIO",
         type=ratio,
         help="fail if a figure is worse than the saved figure by more than RATIO of it, such as "
-        "0.1 (for samples: if both whole intervals are), if it has fewer values, if a sample has "
-        "become a single number or the reverse, or if its test ran or was skipped without "
-        "recording it; fail also if none of the saved figures was measured",
+        "0.1 (for samples: if even the nearest ends of both intervals are), if it has fewer "
+        "values, if a sample has become a single number or the reverse, or if its test ran or was "
+        "skipped without recording it; fail also if none of the saved figures was measured",
     )
     add(
         "--accuracy-dir",

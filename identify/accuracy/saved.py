@@ -51,7 +51,7 @@ class Comparison:
 
     @property
     def evidence_change(self) -> str:
-        """One line that states how the evidence differs, empty if the present is not weaker.
+        """One line that states how the present evidence differs, empty if it is not weaker.
 
         It differs if a single number replaces a sample or the reverse, or if there are fewer
         values. An interval of fewer values is wider, so it could hide a deterioration.

@@ -284,9 +284,9 @@ def _render(
     poses = board_poses(source.rig, board, count, rng)
     renderer = choose_renderer(source.renderer)
     frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
-    with progress.stage("render", count) as advance, atomic_contents(folder) as made:
-        save_pairs(made, frames, advance)
-        write_text(made / "board.toml", board.as_toml())
+    with progress.stage("render", count) as advance, atomic_contents(folder) as temporary:
+        save_pairs(temporary, frames, advance)
+        write_text(temporary / "board.toml", board.as_toml())
     if not quiet:
         typer.echo(
             f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "

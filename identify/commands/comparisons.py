@@ -140,12 +140,12 @@ def estimators(
         "instruments": instruments.figures,
         "estimators": {s.name: _entry(s) for s in scores},
     }
-    made = {
+    contents = {
         "instruments.nc": netcdf({"": channels}),
         "estimators.json": entry,
         "figures/estimators.png": estimators_figure(scores),
     }
-    save_files(folder.path, made)
+    save_files(folder.path, contents)
     tell(entry, json, quiet, lambda: _print_scores(scores, out))
 
 

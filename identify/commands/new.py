@@ -110,8 +110,8 @@ def robot(
     }
     lengths = {name: value for name, value in given.items() if value is not None}
     try:
-        made = _of_lengths(file, like, lengths) if lengths else None
-        text = made or _of_a_workshop(copy_of("robot", like, file))
+        resized = _of_lengths(file, like, lengths) if lengths else None
+        text = resized or _of_a_workshop(copy_of("robot", like, file))
         write_new({toml_file(file): text}, read_robot_file)
     except RobotFileError as error:
         large = [
@@ -331,8 +331,8 @@ def _of_lengths(file: Path, like: str, lengths: Mapping[str, float]) -> str:
         loop_settings(chosen, given.servo, timing, given.control, given.plant)
         for timing in (given.timing, slower)
     ]
-    made, comments = robot_of_lengths(toml_file(file).stem, chosen, lengths, loops)
-    return with_schema(schema_of("robot"), robot_text(made, comments))
+    resized, comments = robot_of_lengths(toml_file(file).stem, chosen, lengths, loops)
+    return with_schema(schema_of("robot"), robot_text(resized, comments))
 
 
 def _option(length: str) -> str:

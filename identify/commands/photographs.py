@@ -127,9 +127,9 @@ def _render(folder: Path, sensor: str, count: int, seed: int, progress: Progress
     header = ",".join(f"{name}_{unit}" for name, unit in zip(POSE, UNITS, strict=True))
     text = io.StringIO()
     np.savetxt(text, poses, delimiter=",", header=header, comments="")
-    with progress.stage("render", count) as advance, atomic_contents(folder) as made:
-        save_pairs(made, frames, advance)
-        write_text(made / "true_poses.csv", text.getvalue())
+    with progress.stage("render", count) as advance, atomic_contents(folder) as temporary:
+        save_pairs(temporary, frames, advance)
+        write_text(temporary / "true_poses.csv", text.getvalue())
 
 
 def save_pairs(folder: Path, frames: "Iterable[StereoFrame]", advance: Advance) -> None:
@@ -224,10 +224,10 @@ def measure(
 
     measuring = load_sensor(sensor, renderer=RENDERER, taught=read_taught(taught))
     pairs = photographs_for(measuring, left, right, colour)
-    made = None
+    temporary = None
     if pictures is not None:
         target = context.with_resource(new_run_folder(pictures)).path
-        made = context.with_resource(atomic_contents(target))
+        temporary = context.with_resource(atomic_contents(target))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -236,9 +236,9 @@ def measure(
     with terminal_progress(quiet, "pairs/s").stage("measure", len(pairs)) as advance:
         for one in measure_pairs(pairs, measuring.estimator):
             table.writerow(one.row)
-            if made is not None:
+            if temporary is not None:
                 picture = cv2.imencode(".png", one.picture())[1].tobytes()
-                write_bytes(_new_picture(made, one.name, count), picture)
+                write_bytes(_new_picture(temporary, one.name, count), picture)
             count += 1
             if not one.measurement.ok:
                 lost.append(f"{one.name}: {one.measurement.reason}")

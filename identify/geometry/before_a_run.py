@@ -54,7 +54,7 @@ def run_geometry(
         designer = _designer(robot, settings, limits, frames, covariance, plan.sight)
         chosen, among = _choose(designer, settings, seed, progress)
         true = true_deviations(robot, setup.scenario.plant, settings, seed)
-        # This raises an error for poses out of reach before the slow teaching of the sensor.
+        # Poses out of reach raise an error here, before the slow teaching of the sensor.
         true_poses(robot, true, chosen.joints, chosen.poses)
         sensor = plan.taught(robot, seed, progress)
         data, lost = measure_static_poses(

@@ -135,7 +135,7 @@ class Designer:
         return self.seen(joints, poses)
 
     def seen(self, joints: Array, poses: Array) -> Candidates:
-        """Return joint coordinates (N, n) and their poses (N, 6) with the information of these."""
+        """Return candidates with joint coordinates (N, n), poses (N, 6) and their information."""
         none = np.zeros(len(self.model.scale))
         free = list(self.limits.robot.geometry.chart.freedoms)
         columns, by_joints = self.model.columns(joints, poses, none)

@@ -2,7 +2,7 @@
 
 The joints move to commanded coordinates of the encoders. The pose of the platform follows from the
 true geometry, which includes the offsets of the encoders. Poses are measured through images, or
-drawn with the noise that the sensor states for one image.
+drawn with the noise that the sensor states.
 """
 
 from collections.abc import Mapping
@@ -123,7 +123,7 @@ def measured(
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
-            # Each pose has its own stream, so a lost frame does not change the noise of others.
+            # Each pose has its own stream, so a lost frame does not change the noise at others.
             sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
             values, covariances = _frames_at(sensor, pose, bodies, frames)
             advance(frames)

@@ -53,7 +53,7 @@ class Exhibit:
     title        Subject of the figure or table.
     paper, ours  Sentences on what the paper shows, and on what our counterpart shows and why it
                  differs.
-    columns      Numbers of the exhibit, which become its CSV file.
+    columns      Texts and numbers of the exhibit, which become its CSV file.
     draw         Function that draws the figure. It is None for a table, whose columns are drawn.
     """
 

@@ -28,7 +28,7 @@ PARAMETER_STDS = 3.0
 DECLARED_STDS = 3.0
 # Kinds of common errors that the cameras declare, beside those of teaching.
 OF_CAMERAS = ("rig", "exposure")
-TEACHING = "teaching"  # kind of the errors of teaching, which every run has, and which are small
+TEACHING = "teaching"  # kind of the errors of teaching, too small to count as declared errors
 
 # Words for kinds of common errors whose names need an explanation.
 KINDS = {

@@ -1,7 +1,7 @@
 """Formatting of numbers for reports.
 
-A number gets the digits that its uncertainty allows. A number that is only a rounding error is
-written as zero.
+A number with a standard deviation gets the digits that this allows. A number that is only a
+rounding error of its terms is written as zero.
 """
 
 import math

@@ -1,6 +1,7 @@
 """HTML page of a report.
 
-The page is one file without a script. Its figures adapt to the colours of the reader's screen.
+The page is one file without a script. Its figures, except those that are images, adapt to the
+colours of the reader's screen.
 """
 
 import base64
@@ -47,7 +48,7 @@ def write_report(
     """Write the report and the figures of a run folder, and return the path of the report.
 
     The files are ``report.html``, ``figures/*.png`` and ``figures/*.pdf``. Either all or none of
-    them are written. After all is drawn, ``further`` returns additional files to write.
+    them are written. ``further`` is called after all is drawn, and returns more files to write.
 
     Raises OutputFolderError if an earlier stage has not been run. Raises RecordError if a file of
     the run is damaged. Raises WriteError if a file cannot be written.

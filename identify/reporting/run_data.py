@@ -86,7 +86,7 @@ class RunData:
     def cameras_consistent(self) -> bool | None:
         """True if the cameras cannot be the cause of the model's residuals.
 
-        None if this is unknown, see `identify.reporting.verdict.cameras_consistent`.
+        It is None if this is unknown, see `identify.reporting.verdict.cameras_consistent`.
         """
         return cameras_consistent(self.experiment, self.truth)
 
@@ -107,8 +107,8 @@ class RunData:
     def stereo_view(self) -> StereoView | None:
         """View of both cameras of a simulated run at the middle of the record.
 
-        The images are rendered again from scenario, seed and true pose. None if they cannot be
-        rendered.
+        The images are rendered again from scenario, seed and true pose. The view is None if they
+        cannot be rendered.
         """
         if self.truth is None or isinstance(self.scene, str):
             return None

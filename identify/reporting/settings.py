@@ -66,7 +66,10 @@ class _Stated(NamedTuple):
 
 
 def _compared(recorded: str) -> tuple[str, dict[str, _Stated], dict[str, _Stated]]:
-    """Return the built-in scenario for a recorded one, and the settings of the record and of it."""
+    """Return the name of the built-in scenario for a recorded one, and the settings of both.
+
+    The settings of the recorded scenario come first.
+    """
     ours = _settings(recorded)
     name = ours["name"].value if "name" in ours else ""
     # A user's own scenario may have any name.

@@ -288,11 +288,13 @@ def common_scale_sentence(identification: Mapping[str, Any]) -> str:
 def measures_sentence(result: dict[str, Any]) -> str:
     """Return the sentences on what the goals of a run measure, which the report has as a column."""
     validated = bool(result.get("validation"))
-    compared = [f"of the {unseen(result).what} against the true robot"] if validated else []
-    compared += ["of measured against true poses"] if result.get("sensor") else []
+    compared = [f"of the {unseen(result).what} in the worst run"] if validated else []
+    compared += ["of measured poses over all frames"] if result.get("sensor") else []
     said = []
     if compared:
-        said.append(f"Errors are the RMS of the worst axis and run: {', and '.join(compared)}.")
+        said.append(
+            f"Errors against the truth are the RMS of the worst axis: {', and '.join(compared)}."
+        )
     if explanation_goals(result):
         said.append(
             "Residuals are measured minus identified poses. Noise variance is that which the "
@@ -332,8 +334,8 @@ def print_identification(result: dict[str, Any], path: Path) -> None:
 def print_goals(result: dict[str, Any], report: Path) -> None:
     """Print the goals of a run with their values and, at the end, the path of the report.
 
-    Between them are the common scale, how many intervals contain the truth, the widened limits, and
-    the missed goals with their likeliest causes and the commands to type next.
+    Between them are what the goals measure, the common scale, how many intervals contain the truth,
+    widened limits, and the missed goals with their likeliest causes and the commands to type next.
     """
     table = goals_table(result)
     goals = check_goals(result)

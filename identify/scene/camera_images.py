@@ -26,8 +26,8 @@ class Found:
     centres
         Detected centres (2, k, 2) in the whole images, in px.
     shapes
-        Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px. None if the
-        detector does not return ellipses.
+        Matrices (2, k, 2, 2) that map the unit disc to the detected ellipses, in px, or None if
+        the detector does not return ellipses.
     expected
         Projections (2, k, 2) of the true positions into the images, in px.
     points, covariances
@@ -63,7 +63,7 @@ class ImagingSensor:
     The sensor is not taught, so a sticker is searched near its nominal position.
 
     seed      Seed of the noise.
-    renderer  "analytic", which needs no OpenGL, or "pyrender".
+    renderer  "analytic", which needs no OpenGL, "pyrender" or "scene".
     region    First pixels (2, 2) and side, in px, of the shown part; None for the whole images.
     """
 
@@ -132,8 +132,8 @@ def stereo_view(
 ) -> StereoView:
     """Draw the camera images of a workcell, cropped to the robot, and find the stickers in them.
 
-    The default pose (6,) is home. ``seed`` is the seed of the noise. The renderer "pyrender" needs
-    OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
+    The default pose (6,) is home. ``seed`` is the seed of the noise. The renderers "pyrender" and
+    "scene" need OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
     """
     drawn_pose = cell.home if pose is None else np.asarray(pose, dtype=float)
     return ImagingSensor(cell, seed, renderer, region_of(cell, [drawn_pose])).look(drawn_pose)

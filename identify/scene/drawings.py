@@ -75,7 +75,7 @@ def stereo_figure(
     """Draw both camera images with the detected ellipses, and each centre's error as an arrow.
 
     ``size`` is in inches. An error is detected minus true centre, enlarged by the factor
-    ``arrows``. None draws no arrows.
+    ``arrows``. With None, no arrows are drawn.
     """
     figure = Figure(figsize=size, layout="constrained")
     for side, axes in enumerate(figure.subplots(1, 2, squeeze=False)[0]):

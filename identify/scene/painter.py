@@ -65,7 +65,7 @@ class Painter:
     def faces(
         self, vertices: Array, faces: NDArray[np.int_], colour: str, towards: float = 0.0
     ) -> None:
-        """Add the triangles (m, 3) of a closed body, shaded by the light.
+        """Add the triangles (m, 3) of a closed body that face the viewer, shaded by the light.
 
         The corners of a triangle run counter-clockwise, seen from outside.
         """

@@ -162,7 +162,7 @@ class Workcell:
 
     @cached_property
     def rig(self) -> tuple[StereoRig, Array] | None:
-        """Stereo rig and camera_from_base (4, 4). None without a sensor."""
+        """Stereo rig and camera_from_base (4, 4), or None without a sensor."""
         return None if self.sensor is None else rig_from_file(self.sensor.rig)
 
     @cached_property

@@ -89,8 +89,8 @@ def follow(
 ) -> TrackingRun:
     """Follow a motion under a law that uses a model.
 
-    ``latencies`` replace the latencies of the scenario. Raises the errors of `prepared`, and
-    LoopFailure if the loop is unstable.
+    ``seen`` measures the poses, and ``latencies`` replace those of the scenario. Raises the errors
+    of `prepared`, and LoopFailure if the loop is unstable.
     """
     in_loop = prepared(plant, law, known, motion, seen, latencies.known)
     times = plant.runs.timing.frame_times(motion.duration_s)

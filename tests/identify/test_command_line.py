@@ -163,8 +163,8 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         "and more than 3 standard"
     )
     assert f"{missed} deviations, joint1.viscous\n" in shown
-    measured = "identified model against the true robot, and of measured against true poses."
-    assert f"Errors are the RMS of the worst axis and run: of the {measured}" in shown
+    measured = "of the identified model in the worst run, and of measured poses over all frames."
+    assert f"Errors against the truth are the RMS of the worst axis: {measured}" in shown
     assert all(
         text in shown
         for text in ("validation motion, position", "µrad", "stereo frames", str(run_folder.report))

@@ -104,7 +104,7 @@ class Fit:
     def error_curves(self, i: int) -> list[Curve]:
         """Return the errors of the identified model in component i, in µm or µrad.
 
-        They are the measurement minus the model and, if the truth is known, the truth minus it.
+        They are the measurement and, if it is known, the truth, each minus the identified model.
         """
         curves = [
             Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], NOISE)
@@ -204,7 +204,7 @@ def fit_figure(fit: Fit) -> Figure:
 def error_figure(fit: Fit) -> Figure:
     """Draw a summary of the errors of both models over a run.
 
-    If the truth is known, the errors of models and measurement are relative to it. Otherwise, the
+    If the truth is known, the errors of models and measurement are against it. Otherwise, the
     errors of the models are relative to the measurement, and the noise of the cameras is shown.
     """
     parts = [

@@ -138,7 +138,7 @@ def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -
         # The sort is stable: of places that are equally good, the nearest comes first.
         for step in sorted(steps, key=lambda step: _faults(point + step, half, points, marks, k)):
             low, high = point + step - half, point + step + half
-            if all((low > other).any() or (high < one).any() for one, other in taken):
+            if all((low > top).any() or (high < bottom).any() for bottom, top in taken):
                 taken.append((low, high))
                 axes.annotate(
                     label,

@@ -1,8 +1,8 @@
 """Style of all figures.
 
 Sizes and fonts are those for print. Every curve has its own line style or marker, so that curves
-also differ without colour. A report replaces the colours by colours of the reader's screen. Figures
-must therefore use only the colours of `PALETTE`.
+also differ without colour. A report replaces the colours by colours of the reader's screen. Its
+figures must therefore use only the colours of `PALETTE`.
 """
 
 import io
