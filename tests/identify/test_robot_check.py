@@ -301,6 +301,8 @@ def test_a_sensor_for_legs_from_above_has_its_platform_below_them():
     (found,) = check_legs_outside(robot, "mine", file.model_copy(update={"platform": at_home}))
     assert not found.ok
     assert "of leg" in found.text
+    meshed = at_home.model_copy(update={"mesh": "platform.stl"})
+    assert not list(check_legs_outside(robot, "mine", file.model_copy(update={"platform": meshed})))
     made = fitted(file, robot)
     findings = [*about_sensor(robot, "mine", made), *check_legs_outside(robot, "mine", made)]
     assert all(one.ok for one in findings)
