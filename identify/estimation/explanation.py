@@ -66,9 +66,12 @@ class Misfit:
     std: float
 
     def __str__(self) -> str:
+        # The residuals of a model that the logged commands drive are the noise itself.
+        moving = ", more than 1 as it also moves the robot through the servo"
         return (
             f"the mean squared residual is {self.found:.3f} times the variance that the sensor "
             f"states, and {self.expected:.3f} ± {self.std:.3f} times is expected of noise alone"
+            f"{moving if self.expected > 1.0 else ''}"
         )
 
     @property

@@ -1,6 +1,6 @@
 """Check whether a sensor file describes the platform of a robot, and whether the cameras see it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from identify.verification.finding import Finding
 
 # Checks that a run repeats before it begins, and that end it.
 REFUSED = ("sensor's platform", "sensor's home", "visible stickers", "stickers at teaching")
+PLATFORM = "platform"  # name of the body in messages on stickers
 MOST_INSIDE_M = 0.02  # largest length, m, of a leg inside the platform of the sensor
 
 
@@ -42,7 +43,11 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
         home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
         text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
     yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")
-    planes = seen_by_plane(sight_lines(file), robot.home_pose)
+    sight, unseen = sight_lines(file), unseen_at_teaching(file)
+    planes = {
+        name: ([k for k in seen if (PLATFORM, sight.platform.sticker_ids[k]) not in unseen], needed)
+        for name, (seen, needed) in seen_by_plane(sight, robot.home_pose).items()
+    }
     # the plane with the fewest stickers beyond the needed number
     plane = min(planes, key=lambda name: len(planes[name][0]) - planes[name][1])
     seen, needed = planes[plane]
@@ -55,14 +60,12 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
     yield Finding(
         "visible stickers", len(seen) >= needed, len(seen), text, limit=needed, relation=">="
     )
-    yield _taught_stickers(file)
+    base = marked_body("base", file.base)
+    yield _taught_stickers(len(sight.platform.sticker_ids) + len(base.sticker_ids), unseen)
 
 
-def _taught_stickers(file: SensorFile) -> Finding:
-    """Check that teaching sees every sticker of the file."""
-    sections = {"platform": file.platform, "base": file.base}
-    total = sum(len(marked_body(name, one).sticker_ids) for name, one in sections.items())
-    unseen = unseen_at_teaching(file)
+def _taught_stickers(total: int, unseen: Mapping[tuple[str, str], str]) -> Finding:
+    """Check that teaching sees all stickers. ``unseen`` are those of `unseen_at_teaching`."""
     text = f"teaching sees all {total} stickers of platform and base"
     if unseen:
         (body, sticker), reason = next(iter(unseen.items()))

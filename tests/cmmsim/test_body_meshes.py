@@ -114,11 +114,8 @@ def test_a_sticker_behind_a_fin_ends_the_teaching_until_it_is_removed(tmp_path, 
     said = "sticker.? A3 .* remove it from platform.planes.A.stickers"
     with pytest.raises(cmmsim.TeachingError, match=said):
         sensor.teach()
-    (finding,) = (
-        one
-        for one in about_sensor(load_robot("rss6"), "mine", read_sensor_file(file, WIDE))
-        if one.check == "stickers at teaching"
-    )
+    found = about_sensor(load_robot("rss6"), "mine", read_sensor_file(file, WIDE))
+    finding = {one.check: one for one in found}["stickers at teaching"]
     assert (finding.ok, finding.value, finding.limit) == (False, 35, 36)
     assert "A3 of the platform is hidden from the left camera: remove it from" in finding.text
     stickers = read_sensor_file("ctrack780").platform.planes.A.stickers
