@@ -102,7 +102,7 @@ class Figure:
 
     @property
     def limit_text(self) -> str:
-        """Limit with its relation and without a unit, such as "≤ 2". Empty if there is none."""
+        """Limit with its relation and without a unit, such as "≤ 2", or "" without a limit."""
         return (
             ""
             if self.limit is None

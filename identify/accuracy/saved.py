@@ -28,7 +28,7 @@ class Comparison:
 
     @property
     def mismatch(self) -> str:
-        """Reason why the figures cannot be compared. Empty if they can be compared."""
+        """Reason why the figures cannot be compared, or "" if they can be compared."""
         for what in ("unit", "better"):
             new = getattr(self.now, what)
             old = getattr(self.saved, what)

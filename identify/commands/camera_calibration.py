@@ -126,9 +126,9 @@ def calibrate(
     deviations, covariance, residuals, and the images used and rejected. If the points of a picture
     have correlated errors, the covariance is enlarged, with a warning. It also writes rig.toml, the
     camera tables of a sensor file; residuals.png, coverage.png and distortion.png; and with
-    --sensor also sensor.toml, that whole sensor file with the calibrated cameras. Cameras that
-    cannot be those of a sensor, as with exchanged folders or a board in mm, end with an error and
-    without sensor.toml; the other files show why.
+    --sensor also sensor.toml, that whole sensor file with the calibrated cameras. If a sensor
+    cannot have these cameras, as with exchanged folders or a board in mm, the command fails and
+    writes no sensor.toml; the other files show why.
 
     \b
     Examples:

@@ -164,7 +164,7 @@ def budget(
 GROUPS = ("pose.x", "pose.alpha", "prediction.x", "prediction.alpha")
 
 
-NEGLIGIBLE = 1e-3  # fraction of the combined uncertainty below which a table has no digits
+NEGLIGIBLE = 1e-3  # fraction of a column's whole below which the table only gives an upper bound
 
 
 def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
@@ -210,7 +210,7 @@ def _print_budget(found: "Budget", identified: list[str], folder: Path) -> None:
 
 
 def _short(part: float, whole: float) -> str:
-    """Return a number with fewer digits if it is a negligible part of a whole."""
+    """Format a number, or only an upper bound of it if it is a negligible part of a whole."""
     least = NEGLIGIBLE * whole
     return f"<{least:.1g}" if 0 < abs(part) < least else f"{part:.3g}"
 

@@ -42,7 +42,7 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments. An error names the form in which the command takes what was typed.
 
-        The stages of a run have the option --out for its folder, and other commands an argument.
+        Some commands have the option --out for a folder, and others have an argument.
         """
         typed = list(args)
         try:
@@ -63,7 +63,7 @@ class Command(TyperCommand):
         if name != "out" or any(one.param_type_name == "argument" for one in self.params):
             return ""
         folder = typed[0] if typed and not typed[0].startswith("-") else "FOLDER"
-        # What a run has written lies in the folder that is meant.
+        # A file that a run has written stands for the folder of the run.
         if Path(folder).is_file():
             folder = str(Path(folder).parent)
         return f"A folder stands after --out: cmmsim {self.name} --out {folder}"

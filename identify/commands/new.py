@@ -139,7 +139,7 @@ def sensor(
 
     With --robot, the file has the robot's home, a platform on which its legs end, and cameras that
     see all stickers of the built-in sensor at home. For legs that come from above, platform and
-    cameras are upside down. It states these alone. The built-in sensor supplies the rest.
+    cameras are upside down. The file states these alone; the built-in sensor supplies the rest.
 
     Reads a robot file, if one is named. Writes one TOML file.
 

@@ -68,11 +68,11 @@ def track(
 
     The simulated robot follows the scenario's validation trajectories, a circle and a square, with
     images in the loop. The laws are the paper's servo (pid), joint commands shaped by the inverse
-    dynamics (feedforward), and torques (computed_torque). A law knows the initial guess of the
-    model, the identified model, or the true model. The results are the errors of the true poses,
-    the effort, and the share of the squared error that an exact sensor, an exact model or zero
-    latency would remove. The scenario's [control] states the limits of the actuators, and whether
-    an observer predicts the pose.
+    dynamics (feedforward), and torques (computed_torque). Laws other than pid know the initial
+    guess of the model, the identified model, or the true model. The results are the errors of the
+    true poses, the effort, and the share of the squared error that an exact sensor, an exact model
+    or zero latency would remove. The scenario's [control] states the limits of the actuators, and
+    whether an observer predicts the pose.
 
     Reads a scenario, the folder of a finished run that --run names, and a CSV file of poses that
     --motion names, with the columns t, x, y, z, alpha, beta, gamma in s, m and rad.

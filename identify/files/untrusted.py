@@ -11,7 +11,7 @@ from identify.files.limited_process import within_limits
 
 ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
-# Largest size of the numbers in a group, bytes. A record of a million frames has this size.
+# Largest size of the numbers in a group, bytes. A record of half a million frames has this size.
 LIMIT_BYTES = 256_000_000
 # Names of the groups, and one group. The group is None if it was not requested or does not exist.
 Content = tuple[list[str], xr.Dataset | None]

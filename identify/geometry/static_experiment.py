@@ -80,7 +80,7 @@ def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
 
 
 def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:
-    """Return the poses (N, 6) of the true robot for encoder readings `joints` (N, n).
+    """Return the poses (N, 6), near `start`, of the true robot for encoder readings (N, n).
 
     Raises EstimationError if the robot cannot reach a pose. The message names the pose.
     """

@@ -117,7 +117,7 @@ def table_figure(table: Table) -> Figure:
 
 
 def pose_columns(poses: Array, whose: str = "") -> dict[str, Array]:
-    """Return poses (N, 6) [m, rad] as six columns in mm and mrad, headed by ``whose`` they are."""
+    """Return poses (N, 6) [m, rad] as columns in mm and mrad, with ``whose`` in the headings."""
     before = f"{whose} " if whose else ""
     return {
         f"{before}{name} [{'mm' if i < 3 else 'mrad'}]": 1e3 * poses[:, i]

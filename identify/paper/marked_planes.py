@@ -97,7 +97,7 @@ def _distances(points: Array, plane: NDArray[np.int_], planes: list[FittedPlane]
 
 
 def draw(marked: MarkedPlanes) -> Figure:
-    """Draw stickers, planes, their intersections, and the frame that they define, in mm."""
+    """Draw stickers, planes, two of their intersections, and the frame of the planes, in mm."""
     figure = Figure(figsize=(WIDTH, 4.2))
     axes: Any = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
     for k, (name, colour) in enumerate(zip(PLANE_NAMES, COLOURS, strict=True)):

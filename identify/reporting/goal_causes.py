@@ -131,7 +131,7 @@ def _unsure_drive(run: _Run) -> Advice | None:
 
 
 def _known_cause(run: _Run) -> Advice | None:
-    """Find the first cause of the run's diagnosis, or that no known cause explains the misfit."""
+    """Return the first cause of the diagnosis, or say that no known cause explains the misfit."""
     diagnosis = run.result.get("diagnosis")
     if run.explained or not diagnosis:
         return None

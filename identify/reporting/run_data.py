@@ -66,7 +66,7 @@ class RunData:
 
     @property
     def scenario_toml(self) -> str:
-        """Scenario that the record was made with, as TOML. Empty if the record states none."""
+        """Scenario that the record was made with, as TOML, or "" if the record states none."""
         return str(self.experiment.attrs.get("scenario", ""))
 
     @cached_property

@@ -36,6 +36,7 @@ from identify.scene.drawings import (
     BRIGHT,
     CAMERA,
     DARK,
+    FRUSTUM_M,
     SOLIDS,
     camera_box,
     leg_colour,
@@ -226,7 +227,7 @@ def _data(motion: Motion, rods: Array) -> dict[str, Any]:
         {
             "name": camera.name,
             "centre": camera.centre.tolist(),
-            "corners": camera.frustum(0.3).tolist(),
+            "corners": camera.frustum(FRUSTUM_M).tolist(),
         }
         for camera in cell.cameras
     ]

@@ -122,7 +122,7 @@ def error_budget(folder: Path | str) -> Budget:
 
     Raises
     ------
-    RecordError
+    OutputFolderError, RecordError
         The run was identified by an older version, is incomplete, or its files do not belong
         together.
 

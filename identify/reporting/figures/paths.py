@@ -115,7 +115,7 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_]) -> None:
     axes.plot(*path[:1].T, linestyle="none", marker="s", color=RED, markersize=6)
 
 
-LABEL = 6.5  # size of a label of a time, points
+LABEL = 6.5  # size of the font of the label of a time, points
 # Directions from a mark in which its label is tried.
 AROUND = np.array([[1, 1], [-1, 1], [1, -1], [-1, -1], [1, 0], [-1, 0], [0, 1], [0, -1]])
 
@@ -156,7 +156,7 @@ def _label_times(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -
 def _faults(
     middle: Array, half: Array, points: Array, marks: NDArray[np.int_], mark: int
 ) -> tuple[bool, bool]:
-    """Tell whether a label is nearer to another mark than to its own, and whether it hides a path.
+    """Tell whether a label is nearer to another mark than its own, and whether it hides the path.
 
     middle, half (2,)  Middle and half size of the label.
     points (N, 2)      Points of the path, of which `marks` and `mark` are indices.
