@@ -53,7 +53,7 @@ def load_sensor(
     Raises
     ------
     UnknownSensorError
-        If no built-in sensor has the name.
+        If ``name`` is neither a built-in name nor the path of a file.
     SensorFileError
         If the file cannot be read or contains a wrong value.
     UnknownOptionError

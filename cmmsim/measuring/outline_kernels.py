@@ -19,7 +19,7 @@ class Outlines(NamedTuple):
     ``shapes`` (n, 2, 3) are the entries xx, xy, yy of the ellipses' matrices, px. ``informations``
     (n, 2, 6) are the entries 00, 01, 02, 11, 12, 22 of their inverse covariances, px^-2.
     ``normals`` (n, 3) are the stickers' normals in body axes, and ``radius`` is the stickers'
-    radius, m.
+    radius, m. ``cameras`` are as the estimator knows them.
     """
 
     shapes: Array

@@ -48,12 +48,12 @@ def own_cause(name: str) -> Cause:
     if isinstance(step, bool) or not isinstance(step, int | float) or not 0 < step < math.inf:
         raise EstimationError(f"cause {name!r} has step = {step!r}, must be a number > 0")
     known = (EstimationError, DynamicsError)
-    told = PluginFunction(f"cause {name!r}", function, EstimationError, known, _check_run)
+    checked = PluginFunction(f"cause {name!r}", function, EstimationError, known, _check_run)
     return Cause(
         name=name,
         unit=str(getattr(function, "unit", "1")),
         group=name,
-        change=in_each_run(told),
+        change=in_each_run(checked),
         step=float(step),
         remedy=lambda size: f"see {name}",
     )

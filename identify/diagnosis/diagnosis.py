@@ -85,9 +85,9 @@ class Finding:
 class CandidateRow:
     """Candidate as it was ranked before any cause was fitted.
 
-    group: name of the group of similar causes. share: fraction of the misfit that it alone
-    explains. value and std: size of a single cause, to first order, with its standard deviation due
-    to noise. None for a group, a cause without a size, and one that the residuals cannot show.
+    share: fraction of the misfit that the candidate alone explains. value and std: size of a single
+    cause, to first order, with its standard deviation due to noise. They are None for a group, a
+    cause without a size, and one that the residuals cannot show. For the others see `Finding`.
     """
 
     name: str

@@ -37,7 +37,7 @@ class OutOfReachError(Exception):
 
 @dataclass(frozen=True)
 class Point:
-    """Optimum of a problem with some causes, and its linearisation there.
+    """Optimum of a problem with some causes, and the linearisation there.
 
     Attributes
     ----------

@@ -94,7 +94,7 @@ class ProcessExecutor:
         self._looked = time.monotonic()
 
     def __call__(self, shared: Shared, batches: Batches) -> Iterator[list[Finished]]:
-        """Yield batches in the order in which they finish, and an empty list after each wait.
+        """Yield the rows of each batch when it finishes, and an empty list after each wait.
 
         Raises StudyError if processes cannot be started, repeatedly die before they are ready, or
         start the study anew.

@@ -109,8 +109,8 @@ def run_study(
         found = int(journal.finished.sum())
         try:
             with interruptible():
-                shown = _rate_limited(lambda: so_far(tidy_table(study, journal.rows())))
-                _compute_pending(study.name, shared, design, journal, progress, workers, shown)
+                show = _rate_limited(lambda: so_far(tidy_table(study, journal.rows())))
+                _compute_pending(study.name, shared, design, journal, progress, workers, show)
         except KeyboardInterrupt:
             # The rows are read from the file, because Ctrl-C can interrupt their registration.
             done = list(journal.rows())
@@ -149,7 +149,7 @@ def _compute_pending(
     journal: Journal,
     progress: Progress,
     workers: Workers,
-    shown: Callable[[], None],
+    show: Callable[[], None],
 ) -> None:
     missing = len(design) - int(journal.finished.sum())
     if not missing:
@@ -162,7 +162,7 @@ def _compute_pending(
                 journal.append(finished)
             advance(len(finished))
             if finished:
-                shown()
+                show()
 
 
 # Intended duration of a batch, s. Batches of this duration cost little to send, and little is lost

@@ -63,19 +63,19 @@ def _own(name: str, function: Callable[..., Any]) -> Kind:
     Errors of its rows name the function, and the file and line that raised an exception.
     """
     known = (CmmError, DynamicsError, IdentifyError)
-    told = PluginFunction(f"kind {name!r}", function, StudyError, known, _check_figures)
+    checked = PluginFunction(f"kind {name!r}", function, StudyError, known, _check_figures)
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # functions written in C can lack a signature
-        return Kind(name, told)
+        return Kind(name, checked)
     for count in (3, 2):
         try:
             signature.bind(*range(count))
         except TypeError:
             continue
         if count == 3:
-            return Kind(name, told)
-        return Kind(name, lambda scenario, seed, _: told(scenario, seed), takes_options=False)
+            return Kind(name, checked)
+        return Kind(name, lambda scenario, seed, _: checked(scenario, seed), takes_options=False)
     raise StudyError(
         f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, "
         "seed, options)"

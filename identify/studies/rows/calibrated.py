@@ -73,7 +73,7 @@ COLUMNS = {
     ),
     "poses_covered_percent": Column(
         "%",
-        "fraction of the coordinates of an unseen pose in the predicted 95 % interval",
+        "fraction of the true coordinates of an unseen pose in the predicted 95 % intervals",
         main=True,
     ),
     "poses_inner_covered_percent": Column("%", "the same for predicted 68.3 % intervals"),
@@ -93,7 +93,7 @@ class CalibrationOptions(SensorOptions):
     log_from_s: float = Field(
         0.0,
         ge=0.0,
-        description="time at which the log begins, s; above 0 the robot moves already, so that the "
+        description="time at which the log begins; above 0 the robot moves already, so that the "
         "logged commands drive the model and its state at the start is estimated",
     )
 

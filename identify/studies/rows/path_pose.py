@@ -50,11 +50,11 @@ COLUMNS = {
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
     "used_position_rms_um": Column(
-        "um", "error of the last arrived position, at all times along the path", main=True
+        "um", "error of the last arrived position, from the first arrival to the last", main=True
     ),
     "used_orientation_rms_urad": Column(
         "urad",
-        "error of the last arrived orientation, at all times along the path",
+        "error of the last arrived orientation, from the first arrival to the last",
         main=True,
     ),
 }

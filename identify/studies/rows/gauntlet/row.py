@@ -33,20 +33,20 @@ COLUMNS = {
     "troubles": Column("1", "number of troubles"),
     "outside": Column("1", "1 if the trouble is outside the catalogue of the diagnosis"),
     **{
-        f"{name}_{place}": Column(unit, f"{what} of trouble {place}")
+        f"{name}_{place}": Column(unit, what.format(f"trouble {place}"))
         for place in (1, 2)
         for name, unit, what in (
-            ("trouble", "1", "kind"),
-            ("size", "SI", "size"),
-            ("named", "1", "place of the finding that names it, 0 if none does,"),
-            ("together", "1", "1 if named as one that cannot be told from another, statement"),
-            ("size_error", "1", "error of the size in its standard deviations"),
-            ("alone", "1", "misfit beside nothing else, for two troubles,"),
+            ("trouble", "1", "kind of {}"),
+            ("size", "SI", "size of {}"),
+            ("named", "1", "place of the finding that names {}, 0 if none does"),
+            ("together", "1", "1 if {} is named only as one that cannot be told from another"),
+            ("size_error", "1", "error of the size of {} in its standard deviations"),
+            ("alone", "1", "misfit with {} alone over that of noise, for two troubles"),
         )
     },
-    "stopped": Column("1", "1 if experiment or identification stopped with an error"),
+    "stopped": Column("1", "1 if identification or diagnosis stopped with an error"),
     "misfit": Column(
-        "1", "mean squared residual of the plain model over that by noise alone", main=True
+        "1", "mean squared residual of the plain model over that of noise alone", main=True
     ),
     "findings": Column("1", "number of findings"),
     "first_group": Column("1", "group of causes of the first finding, -1 if there is none"),
@@ -59,7 +59,7 @@ COLUMNS = {
         "%", "share of their 95 % intervals that contain the truth", main=True
     ),
     "before_covered_percent": Column("%", "the same share for the plain model"),
-    "remedied_explained": Column("1", "1 if noise explains what the remedied model leaves"),
+    "remedied_explained": Column("1", "1 if noise explains the remedied model's residuals"),
     "identification_seconds": Column("s", "time of the identification"),
     "diagnosis_seconds": Column("s", "time of the diagnosis"),
 }
