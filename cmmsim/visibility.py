@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmmsim.errors import LostError
+from cmmsim.errors import LostError, SensorFileError
 from cmmsim.files.rig_and_bodies import MarkedBody, marked_body, rig_from_file
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import read_sensor_file
@@ -27,7 +27,6 @@ from cmmsim.geometry.pose import (
 )
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.scene_bodies import TOUCHING, scene_body
-from cmmsim.loading import load_sensor
 from cmmsim.measuring.observation import DetectionSettings, faces_camera
 from cmmsim.measuring.pose_estimator import by_planes, by_registration
 from cmmsim.sensor import Sensor
@@ -153,11 +152,24 @@ def expected_covariance(
 ) -> Array:
     """Return the covariance (6, 6) that a sensor would state for a pose (6,), m and rad.
 
-    One exposure is drawn without OpenGL. Teaching is assumed to be free of errors. Raises LostError
-    if the stickers do not determine the pose, and the same exceptions as `load_sensor`.
+    One exposure is drawn, see `drawing_sensor`. Teaching is assumed to be free of errors. Raises
+    LostError if the stickers do not determine the pose, and the same exceptions as `load_sensor`.
     """
-    sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
+    sensor = drawing_sensor(read_sensor_file(name, changes), method)
     return stated_covariance(sensor, sight_lines(name, changes), pose)
+
+
+def drawing_sensor(file: SensorFile, method: str = "registration") -> Sensor:
+    """Return a sensor that draws without OpenGL, unless a sticker lies in a hollow of a mesh.
+
+    In this case it draws with pyrender. Raises the same exceptions as `Sensor`.
+    """
+    sensor = Sensor(file, 0, method, renderer="analytic")
+    try:
+        sensor.camera  # noqa: B018  # the cameras are made on first use
+    except SensorFileError:
+        return Sensor(file, 0, method, renderer="pyrender")
+    return sensor
 
 
 def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:

@@ -23,10 +23,11 @@ Offset = Annotated[float, Bounds(-100.0, 100.0, "px")]
 class Lens(Section):
     """Blur, vignetting and reflections of both lenses.
 
-    Distortion belongs to the entries of each camera. The vignetting grows with the square of the
-    distance from the principal point. With an ``aperture``, a point out of focus is a blur circle
-    of the diameter focal length x aperture x abs(1 / focus - 1 / depth), px. It is drawn as a
-    Gaussian of the same variance.
+    Distortion belongs to the entries of each camera. Teaching warns of a point spread that carries
+    the light of the bodies over the rings of stickers, which moves their centres. The vignetting
+    grows with the square of the distance from the principal point. With an ``aperture``, a point
+    out of focus is a blur circle of the diameter focal length x aperture x abs(1 / focus - 1 /
+    depth), px. It is drawn as a Gaussian of the same variance.
     """
 
     psf_px: Annotated[float, Field(ge=0.0, le=4.0)] = quantity(

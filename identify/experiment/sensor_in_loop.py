@@ -14,7 +14,7 @@ from cmmsim.files.rig_and_bodies import marked_body, rig_from_file
 from cmmsim.files.schema import unit
 from cmmsim.geometry.pose import pose_to_transform
 from cmmsim.uncertainty.known_rig import KnownRig
-from cmmsim.visibility import SightLines, stated_covariance
+from cmmsim.visibility import SightLines, drawing_sensor, stated_covariance
 from dynamics import Robot
 from dynamics.bodies import parts_of
 from dynamics.closed_loop import IdealSensor, RateSensor
@@ -192,8 +192,7 @@ def sight_lines(file: SensorFile) -> SightLines:
 def _covariance(file_json: str, method: str, pose: tuple[float, ...]) -> Array:
     """Return the covariance that a sensor states for a pose. It is cached for rows of a study."""
     file = SensorFile.model_validate_json(file_json)
-    sensor = cmmsim.Sensor(file, 0, method, renderer="analytic")
-    return stated_covariance(sensor, sight_lines(file), np.array(pose))
+    return stated_covariance(drawing_sensor(file, method), sight_lines(file), np.array(pose))
 
 
 class PoseSensor(Protocol):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from cmmsim import CmmError
+from cmmsim import CmmError, OpenGLMissingError
 from dynamics import DynamicsError, load_robot
 from identify.arrays import Array
 from identify.errors import IdentifyError, RecordError
@@ -107,17 +107,18 @@ class RunData:
     def stereo_view(self) -> StereoView | None:
         """View of both cameras of a simulated run at the middle of the record.
 
-        The images are rendered again from scenario, seed and true pose. The view is None if they
-        cannot be rendered.
+        The images are rendered again from scenario, seed and true pose, without OpenGL if possible,
+        and else with the renderer of the run. The view is None if they cannot be rendered.
         """
         if self.truth is None or isinstance(self.scene, str):
             return None
-        try:
-            return stereo_view(
-                self.scene, self.middle, seed=int(self.experiment.attrs.get("seed", 0))
-            )
-        except (CmmError, DynamicsError):
-            return None
+        seed = int(self.experiment.attrs.get("seed", 0))
+        for renderer in ("analytic", self.scenario.renderer):
+            try:
+                return stereo_view(self.scene, self.middle, seed, renderer)
+            except (CmmError, DynamicsError, OpenGLMissingError):
+                continue
+        return None
 
     @property
     def middle(self) -> Array:

@@ -12,7 +12,7 @@ from cmmsim.files.body_meshes import read_mesh, surface_heights
 from cmmsim.files.rig_and_bodies import marked_body
 from cmmsim.files.schema import unit
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.visibility import unseen_at_teaching
+from cmmsim.visibility import drawing_sensor, unseen_at_teaching
 from dynamics import load_robot
 from identify.verification.sensor_check import about_sensor
 from tests.cmmsim.sensors import NOISE_FREE
@@ -101,6 +101,9 @@ def test_a_wall_on_the_mesh_hides_the_stickers_behind_it_and_no_other(tmp_path, 
         match=r"^platform.mesh .*platform\.stl: stickers A1, .*, A6 lie in a hollow of",
     ):
         cmmsim.load_sensor(file, renderer="analytic").capture(mine.home)
+    # what draws without OpenGL elsewhere draws such a mesh with pyrender
+    assert drawing_sensor(read_sensor_file(file)).renderer == "pyrender"
+    assert drawing_sensor(read_sensor_file("ctrack780")).renderer == "analytic"
 
 
 @pytest.mark.rendering
