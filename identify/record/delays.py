@@ -27,6 +27,8 @@ CLOSE_S = 1.0
 GOOD = 0.9  # correlation above which no lags larger than CLOSE_S are tried
 # Difference from the highest correlation up to which a lag nearer to zero is taken.
 ALIKE = 0.02
+MOST_ROWS = 1000  # largest number of poses with which a lag is tried
+MOST_LAGS = 5000  # largest number of lags of one sign that are tried
 FEWEST = 8  # smallest number of poses that overlap with commands
 
 
@@ -52,28 +54,45 @@ def motion_lag(time: Array, coordinates: Array, command_time: Array, command: Ar
     if min(len(time), len(command_time)) < FEWEST:
         return MotionLag(0.0, 0.0)
     duration = min(np.ptp(time), np.ptp(command_time)) / 2
-    step = max(float(np.median(np.diff(time))) / 2, FINEST_S)
+    fine = max(float(np.median(np.diff(time))) / 2, FINEST_S)
+    # Rows spread over the log are enough, and long logs have many lags to try.
+    every = -(-len(time) // MOST_ROWS)
+    rows, moved = time[::every], coordinates[::every]
+
+    def scores_at(lags: Array) -> Array:
+        return np.array([_correlation(rows - lag, moved, command_time, command) for lag in lags])
+
     for reach in (min(CLOSE_S, duration), duration):
+        step = max(fine, reach / MOST_LAGS)
         lags = step * np.arange(-np.floor(reach / step), np.floor(reach / step) + 1)
-        scores = np.array(
-            [_correlation(time - lag, coordinates, command_time, command) for lag in lags]
-        )
+        scores = scores_at(lags)
         if len(scores) and scores.max() > GOOD:
             break
     if not len(scores) or scores.max() <= 0:
         return MotionLag(0.0, 0.0)
     good = np.flatnonzero(scores >= scores.max() - ALIKE)
     nearest = good[np.argmin(np.abs(lags[good]))]
-    # From the good lag nearest to zero, climb to the peak to which it belongs.
-    best = int(nearest)
-    while 0 < best < len(lags) - 1 and scores[best] < max(scores[best - 1], scores[best + 1]):
-        best += 1 if scores[best + 1] > scores[best - 1] else -1
+    best = _peak(scores, int(nearest))
+    if step > fine:
+        around = np.ceil(step / fine)
+        lags = lags[best] + fine * np.arange(-around, around + 1)
+        step = fine
+        scores = scores_at(lags)
+        best = int(np.argmax(scores))
     shift = 0.0
     if 0 < best < len(lags) - 1:
         before, peak, after = scores[best - 1 : best + 2]
         curvature = before - 2 * peak + after
         shift = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
     return MotionLag(float(lags[best] + shift * step), float(scores[best]))
+
+
+def _peak(scores: Array, start: int) -> int:
+    """Return the index of the peak to which an index of scores belongs."""
+    best = start
+    while 0 < best < len(scores) - 1 and scores[best] < max(scores[best - 1], scores[best + 1]):
+        best += 1 if scores[best + 1] > scores[best - 1] else -1
+    return best
 
 
 def _correlation(time: Array, coordinates: Array, command_time: Array, command: Array) -> float:

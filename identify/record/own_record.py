@@ -8,7 +8,6 @@ names of the columns of a log.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +26,7 @@ from identify.record.from_telemetry import record_of
 from identify.record.load import store_load
 from identify.record.provenance import recorded_scenario
 from identify.record.readers.bags import is_bag
-from identify.record.readers.mapped import read_mapped
+from identify.record.readers.mapped import read_mapped, read_otherwise
 from identify.record.recording import read
 from identify.record.suspicions import (
     EQUAL,
@@ -153,26 +152,30 @@ def log_suspicions(path: Path, about: Description, telemetry: Telemetry, robot: 
     there is one.
     """
     columns = about.columns
-    found = suspicions(telemetry, robot, columns)
+    lag = lag_of(telemetry, robot).seconds
+    found = suspicions(telemetry, robot, columns, lag)
     if columns is None:
         return found
 
     # A wrong order also changes signs and correlations of joints, so the order is judged first.
     if columns.measured.convention in EULER_ORDERS:
-        fraction = unexplained(telemetry, robot)
+        fraction = unexplained(telemetry, robot, lag)
         if fraction > EXPLAINED:
-            others = _tried(path, about, robot, "convention", columns.measured.other_conventions)
-            fractions = {convention: unexplained(one, robot) for convention, one in others}
+            # Poses out of reach have no lag.
+            own = lag if fraction < 1 else None
+            names = columns.measured.other_conventions
+            others = _tried(path, about, telemetry, robot, "convention", names)
+            fractions = {convention: unexplained(one, robot, own) for convention, one in others}
             if said := better_order(fraction, fractions):
                 return [said]
     # If the poses fit as stated, the commands are wrong, and no other units of poses are tried.
-    if found and not fits(telemetry, robot):
+    if found and not fits(telemetry, robot, lag):
         units = [unit for unit in ("rad", "deg") if unit != columns.measured.angle_unit]
         for key, values in (
             ("angle_unit", units if len(columns.measured.orientation) == 3 else []),
             ("convention", columns.measured.other_conventions),
         ):
-            tried = _tried(path, about, robot, key, values)
+            tried = _tried(path, about, telemetry, robot, key, values)
             fitting = (value for value, one in tried if fits(one, robot))
             if value := next(fitting, ""):
                 found[-1] += f"; with {key} = {value!r} of the poses it would fit"
@@ -189,21 +192,25 @@ def equal_orders(path: Path, about: Description, telemetry: Telemetry, robot: Ro
     # The lag of a wrong order, which fits nowhere, would be searched over the whole record.
     lag = lag_of(telemetry, robot).seconds
     most = EQUAL * unexplained(telemetry, robot, lag)
-    others = _tried(path, about, robot, "convention", names)
+    others = _tried(path, about, telemetry, robot, "convention", names)
     return [name for name, one in others if unexplained(one, robot, lag) <= most]
 
 
 def _tried(
-    path: Path, about: Description, robot: Robot, key: str, values: Iterable[str]
+    path: Path,
+    about: Description,
+    telemetry: Telemetry,
+    robot: Robot,
+    key: str,
+    values: Iterable[str],
 ) -> Iterator[tuple[str, Telemetry]]:
     """Yield values of a key of the measured columns with which the log can be read, and the log."""
     columns = about.columns
     assert columns is not None
-    for value in values:
-        measured = columns.measured.model_copy(update={key: value})
-        other = replace(about, columns=columns.model_copy(update={"measured": measured}))
-        with suppress(RecordError):
-            yield value, read_telemetry(path, other, robot)
+    others = [columns.measured.model_copy(update={key: value}) for value in values]
+    rate_hz = about.scenario.timing.frame_rate_hz
+    for other, log in read_otherwise(columns, path, robot, rate_hz, telemetry.poses, others):
+        yield getattr(other, key), replace(telemetry, poses=log)
 
 
 def _of_log(path: Path) -> tuple[xr.Dataset, Scenario]:

@@ -55,22 +55,32 @@ ZERO = 0.5
 SCALE = 2.0  # largest factor between two units that count as the same one. Loops overshoot and lag.
 
 
-def suspicions(telemetry: Telemetry, robot: Robot, columns: Columns | None = None) -> list[str]:
+def suspicions(
+    telemetry: Telemetry,
+    robot: Robot,
+    columns: Columns | None = None,
+    lag_s: float | None = None,
+) -> list[str]:
     """Return what is likely wrong with the units, frames and joints of telemetry, as sentences.
 
     ``columns`` is what the description of a log states. Units and axes that would fit are then
-    those that it should state instead.
+    those that it should state instead. Without ``lag_s``, the lag of the motion is determined here.
     """
-    return list(_found(telemetry, robot, columns))
+    lag = lag_of(telemetry, robot).seconds if lag_s is None else lag_s
+    return list(_found(telemetry, robot, columns, lag))
 
 
-def fits(telemetry: Telemetry, robot: Robot) -> bool:
-    """Return whether the poses are in reach, and all joints move as their commands do."""
+def fits(telemetry: Telemetry, robot: Robot, lag_s: float | None = None) -> bool:
+    """Return whether the poses are in reach, and all joints move as their commands do.
+
+    Without `lag_s`, the lag of the motion is determined here.
+    """
     poses = telemetry.poses
     if _reached(_on_chart(poses.pose[poses.ok], robot), robot).mean() < FITS:
         return False
     time, coordinates = joint_motion(telemetry, robot)
-    commanded = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    lag = lag_of(telemetry, robot).seconds if lag_s is None else lag_s
+    commanded = _commands_at(telemetry, time - lag)
     return bool(np.diagonal(_correlations(commanded, coordinates)).min() > FITS)
 
 
@@ -129,7 +139,9 @@ def lag_of(telemetry: Telemetry, robot: Robot) -> MotionLag:
     return motion_lag(time, coordinates, commands.time, commands.command)
 
 
-def _found(telemetry: Telemetry, robot: Robot, columns: Columns | None) -> Iterator[str]:
+def _found(
+    telemetry: Telemetry, robot: Robot, columns: Columns | None, lag: float
+) -> Iterator[str]:
     poses = telemetry.poses
     measured, given = (columns.measured, columns.command) if columns else (None, None)
     reached = _reached(_on_chart(poses.pose[poses.ok], robot), robot)
@@ -137,7 +149,7 @@ def _found(telemetry: Telemetry, robot: Robot, columns: Columns | None) -> Itera
         yield _out_of_reach(telemetry, robot, reached, measured)
         return
     time, coordinates = joint_motion(telemetry, robot)
-    commanded = _commands_at(telemetry, time - lag_of(telemetry, robot).seconds)
+    commanded = _commands_at(telemetry, time - lag)
     moving = (np.ptp(commanded, axis=0) > 0) & (np.ptp(coordinates, axis=0) > 0)
     if not moving.all():
         return
@@ -147,7 +159,7 @@ def _found(telemetry: Telemetry, robot: Robot, columns: Columns | None) -> Itera
     hint = ""
     if len(sure) < len(alike):
         hint = order or _fitting(telemetry, robot, alike.mean(), measured)
-    elif alike.min() > 0 and unexplained(telemetry, robot) > EXPLAINED:
+    elif alike.min() > 0 and unexplained(telemetry, robot, lag) > EXPLAINED:
         # Wrong columns of small angles leave all joints similar to their commands.
         hint = _fitting(telemetry, robot, alike.mean(), measured)
     if not hint:

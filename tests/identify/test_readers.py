@@ -21,6 +21,7 @@ from identify.record.own_record import (
     read_telemetry,
 )
 from identify.record.readers.bags import Bag
+from identify.record.readers.mapped import read_otherwise
 from identify.record.recording import poses, write
 from identify.verification.logged_run import read_logged_run
 from tests.identify.commands import command, one_line
@@ -382,6 +383,23 @@ def test_orders_of_angles_that_a_small_motion_cannot_tell_are_named(record, tmp_
         f"base_from_frame = [0, 0, 0, {', '.join(map(str, frame))}]\n[columns.reference]",
     )
     assert read_logged_run(path).equal_orders == ()
+
+
+def test_poses_with_other_conventions_are_those_of_a_file_that_states_them(record, tmp_path):
+    path = as_table(tmp_path, record)
+    seen = telemetry_of(path).poses
+    columns = read_description(description_file(path), path).columns
+    names = ["euler_zyx", "rotation_vector"]
+    others = [columns.measured.model_copy(update={"convention": name}) for name in names]
+    found = [
+        log for _, log in read_otherwise(columns, path, load_robot("rss6"), 60.0, seen, others)
+    ]
+    text = path.with_suffix(".toml").read_text()
+    for other, log in zip(others, found, strict=True):
+        stated = text.replace('convention = "euler_XYZ"', f'convention = "{other.convention}"', 1)
+        path.with_suffix(".toml").write_text(stated)
+        np.testing.assert_array_equal(log.pose, telemetry_of(path).poses.pose)
+        assert not np.array_equal(log.pose, seen.pose, equal_nan=True)
 
 
 def test_commands_in_a_wrong_unit_do_not_put_the_convention_in_doubt(record, tmp_path):

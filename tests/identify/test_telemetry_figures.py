@@ -49,6 +49,19 @@ def test_the_lag_of_a_motion_is_found_between_the_samples_of_both(lag):
     assert found.correlation > 0.999
 
 
+def test_a_lag_of_seconds_is_found_to_a_millisecond_in_a_log_of_minutes():
+    """The far lags are tried in coarser steps and with a part of the rows."""
+    time = np.arange(0, 120, 1 / 100)
+    command_time = np.arange(-60, 180, 1 / 50)
+    waves = np.random.default_rng(1).uniform(0.3, 8, (2, 3, 7))  # rad/s, and phases
+
+    def joints(at):
+        return np.sin(waves[0] * at[:, None, None] + waves[1]).sum(axis=2)
+
+    found = motion_lag(time, joints(time - 31.2345), command_time, joints(command_time))
+    assert found.seconds == pytest.approx(31.2345, abs=1e-3)
+
+
 @pytest.fixture(scope="module")
 def run():
     """A run of 10 s whose commands are written 4 ms after the exposure; some frames are lost."""

@@ -5,7 +5,8 @@ A pose of the log is (R, p), a rotation and a position in the log's own frame. I
 left-handed system right-handed.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -66,6 +67,27 @@ def read_mapped(columns: Columns, path: Path, robot: Robot, rate_hz: float) -> T
     return _Reader(path, rate_hz).telemetry(columns, robot)
 
 
+def read_otherwise(
+    columns: Columns,
+    path: Path,
+    robot: Robot,
+    rate_hz: float,
+    seen: PoseLog,
+    others: Sequence[PoseColumns],
+) -> Iterator[tuple[PoseColumns, PoseLog]]:
+    """Yield the poses of a log with other units and conventions of the same columns.
+
+    The file is read once, without covariances. ``seen`` has the times and marks of the rows, as
+    `read_mapped` has read them. Others with which a row is wrong are left out.
+    """
+    own = columns.measured
+    stream = _Reader(path, rate_hz).stream(own, _pose_names(own), columns.holds_events)
+    for other in others:
+        with suppress(RecordError):
+            poses, ok = _poses(stream, other)
+            yield other, PoseLog(seen.time, _near_home(poses, robot), ok & seen.ok, stream.rows)
+
+
 @dataclass
 class _Reader:
     """Files of a record, each opened once."""
@@ -78,7 +100,7 @@ class _Reader:
         """Return the logs of a record."""
         measured = columns.measured
         events = columns.holds_events
-        stream = self._stream(measured, _pose_names(measured), events)
+        stream = self.stream(measured, _pose_names(measured), events)
         moments = self._moments(stream, measured, measured.time)
         start = moments[0]
         poses, ok = _poses(stream, measured)
@@ -93,7 +115,7 @@ class _Reader:
         given = columns.command
         own = given if given.is_own else _shared(given, columns.measured)
         written = [] if given.written is None else [given.written]
-        stream = self._stream(own, [*given.names, *written], columns.holds_events)
+        stream = self.stream(own, [*given.names, *written], columns.holds_events)
         time = _since(self._moments(stream, own, own.time), start)
         commands = _joint_coordinates(stream, given, robot)
         if given.is_own:
@@ -116,7 +138,7 @@ class _Reader:
         if given is None:
             return None
         own = given if given.is_own else _shared(given, columns.measured)
-        stream = self._stream(own, _pose_names(given), columns.holds_events)
+        stream = self.stream(own, _pose_names(given), columns.holds_events)
         poses, ok = _poses(stream, given, measured=False)
         if not ok.all():
             row = int(np.argmin(ok))
@@ -124,7 +146,7 @@ class _Reader:
         time = _since(self._moments(stream, own, own.time), start)
         return ReferenceLog(time, _near_home(poses, robot), stream.rows)
 
-    def _stream(self, log: Log, names: list[str], events: bool) -> Stream:
+    def stream(self, log: Log, names: list[str], events: bool) -> Stream:
         """Return the rows that have a time and, if rows are events, any cell of the columns."""
         path = self.path if log.file is None else self.path.parent / log.file
         file = self.opened.setdefault(path, open_log(path))
@@ -156,8 +178,7 @@ class _Reader:
 
 def _shared(own: Log, measured: PoseColumns) -> Log:
     """Return columns with the file, topic and times of the poses, whose rows they share."""
-    place: Mapping[str, object] = {name: getattr(measured, name) for name in Log.model_fields}
-    return own.model_copy(update=place)
+    return own.model_copy(update={name: getattr(measured, name) for name in Log.model_fields})
 
 
 def _pose_names(log: PoseColumns) -> list[str]:
