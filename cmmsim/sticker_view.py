@@ -24,7 +24,8 @@ from cmmsim.teaching import TeachingPlan, WindowSizes, image_radii, window_sizes
 from cmmsim.uncertainty.known_rig import KnownRig
 
 # Least width of the ring beyond the fitted pixels, in point spreads, in the flattest image. With
-# 1.35, poses of ctrack780 have no visible bias (lens.psf_px = 0.8), and with 1.2 teaching can fail.
+# 1.33, the bias of poses of ctrack780 is below half a standard deviation (lens.psf_px = 0.8), and
+# with 1.19, teaching can fail.
 LEAST_SPREADS = 1.3
 
 
@@ -91,8 +92,8 @@ class StickerView:
         if stated > self.widest_psf_px:
             warnings.warn(
                 f"teaching: lens.psf_px = {stated:g} blurs the light of the bodies over the rings "
-                "of stickers, so that poses are off by more than they state; at most "
-                f"{self.widest_psf_px:.2g} px is free of this, or a larger stickers.ring_radius",
+                "of stickers, so that poses are off by more than they state; this is small up to "
+                f"{self.widest_psf_px:.2g} px, and with a larger stickers.ring_radius",
                 TeachingWarning,
                 stacklevel=4,
             )

@@ -163,7 +163,7 @@ def test_a_point_spread_that_blurs_the_edge_of_rings_is_named_before_and_after_t
     assert wider == pytest.approx(widest * (2.8 - 2.4) / (3.0 - 2.4))
     assert teaching_itself({"stickers.body_level": 8})._view.widest_psf_px == np.inf
     blurred = teaching_itself({"lens.psf_px": 2.0})
-    said = "lens.psf_px = 2 blurs the light of the bodies over .* at most 0.82 px is free of this"
+    said = "lens.psf_px = 2 blurs the light of the bodies over .* this is small up to 0.82 px"
     with (
         pytest.warns(TeachingWarning, match=said),
         pytest.raises(
