@@ -119,7 +119,7 @@ class SolvedFrames:
 
     @property
     def lost(self) -> NDArray[np.bool_]:
-        """Frames (f,) without a pose."""
+        """Mask (f,) of the frames without a pose."""
         return self.verdicts[:, 0] != 0
 
     def used_in(self, frame: int) -> StickerObservation:

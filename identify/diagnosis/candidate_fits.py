@@ -94,7 +94,7 @@ def fitted_candidates(problem: OutputErrorProblem, now: State, rows: Rows) -> tu
     """Fit the best candidate of a state's ranking beside the causes that the state has.
 
     Others are fitted, too, see `CLOSE`, `LOOSE`, `RIVALS` and `MOST_LEFT`. Returns the fits that
-    help, by increasing cost. The best candidate leads if only by chance its fit costs more.
+    help, by increasing cost. The best candidate's leads if its cost is hardly above the least.
     """
     point, asked, places = now.point, now.asked, now.places
     alike = indistinguishable(now.ranking, rows, point.beside_all.part(point.residual))

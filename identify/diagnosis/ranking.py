@@ -8,10 +8,10 @@ pursuit). Each of these costs 2 ln k more, as it is chosen among k (Chen and Che
 2008).
 
 A candidate counts if chance does not explain its statistic. The misfit that it leaves is not white:
-it is correlated between frames, and with any slow column. The covariance of U^T r is therefore that
-of noise plus, weighted with the model's fraction of the error, that of residuals as correlated as
-those left (`identify.estimation.explanation`). The probability is multiplied by the number of
-candidates (Bonferroni).
+it is correlated between frames, and with any slow column. The covariance of U^T r is therefore a
+sum: that of noise, and that of residuals as correlated as those left, which is weighted with the
+model's fraction of the error (`identify.estimation.explanation`). The probability is multiplied by
+the number of candidates (Bonferroni).
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 
 # Absolute cosine between two projected columns from which on they cannot be told apart.
 ALIKE = 0.99
-# Absolute cosine up to which columns are exact enough to tell which cause is the better one.
+# Absolute cosine between a column and the true effect of its cause. Columns are not more exact.
 EXACT = 0.999
 NEAR = 9.0  # difference of two statistics that chance may make, in units of the noise
 ROUNDING = 1e-13  # fraction of the largest eigenvalue up to which eigenvalues are rounding errors

@@ -47,7 +47,7 @@ from identify.estimation.output_error_problem import OutputErrorProblem
 
 CHANCE = 0.01  # largest probability of chance with which a candidate counts
 MOST = 3  # largest number of causes or groups that are selected
-SEVERAL = 2  # number of causes above which a selection begins anew with another first one
+SEVERAL = 2  # number of candidates above which a selection begins anew with another first one
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _explains_most(rows: Rows, without: Point, there: Point) -> bool:
 
 
 def _doubtful(rows: Rows, ended: State) -> bool:
-    """Tell whether a selection needs many causes, or leaves some of the misfit."""
+    """Tell whether a selection needs more than SEVERAL candidates, or leaves some of the misfit."""
     return len(ended.chosen) > SEVERAL or misfit_of(rows, ended.point.residual).significant
 
 
