@@ -222,7 +222,7 @@ class Sensor(Instrument):
         images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
             self._tracker = self._new_tracker()
-        # One random number per frame, so that runs over different poses lose the same frames.
+        # Each frame takes one random number, so runs over different poses lose the same frames.
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
             measured = lost_measurement(

@@ -89,8 +89,8 @@ def diagnosed(
     problem = output_error_problem(asked.records, side, asked.settings)
     errors = result.common_errors.learned
     costs = dict(zip(result.searches, result.costs, strict=True))["command_driven"]
-    # The final search has estimated the common errors. At the optimum under the commands they
-    # differ, so that a search follows, as it does if the first one reached its limit.
+    # The final search has estimated common errors, which differ at the optimum under the commands.
+    # Without them, this optimum is known unless its search reached the limit of iterations.
     settled = not errors and len(costs) <= asked.settings.max_iterations
     found = diagnosis_from(problem, result.driven_estimate, causes, errors, settled)
     return replace(found, seconds=time.perf_counter() - began)

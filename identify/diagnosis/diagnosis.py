@@ -211,7 +211,7 @@ def diagnosis_of(
     # the causes can explain more than the excess over noise, which would make fractions above one
     whole = max(excess, gains)
     sizes = dict(zip(selection.places, _sizes(selection, causes, rows), strict=True))
-    # a list that is set again replaces the earlier one, so it repeats the earlier entries
+    # a setting of a list replaces an earlier setting of it, so it repeats the earlier entries
     lists: dict[str, list[str]] = {}
     findings = tuple(_finding(one, causes, sizes, whole, lists) for one in selection.selected)
     noise = noise_finding(selection, rows, whole)
@@ -237,7 +237,7 @@ def noise_finding(selection: Selection, rows: Rows, whole: float) -> Finding | N
     ]
     names = ("noise of the positions", "noise of the orientations")
     excess = 6 * count * (left.found - left.expected)
-    # residuals smaller than the stated noise have no misfit, which this would be a fraction of
+    # residuals smaller than the stated noise leave no misfit of which this could be a fraction
     share = excess / whole if excess > 0 else 1.0
     return Finding(
         name="noise of the sensor",

@@ -150,7 +150,7 @@ def rank(
     """
     left = beside.part(residual)
     usable = np.isfinite(columns).all(axis=0)
-    # single columns are taken from it many times
+    # columns are contiguous, because single columns are taken many times
     projected = np.asfortranarray(beside.part(np.where(usable, columns, 0.0)))
     lengths = np.where(usable, np.linalg.norm(columns, axis=0), np.inf)
     every = candidates(causes)

@@ -54,7 +54,7 @@ class OrthogonalComplement:
     def part(self, rows: Array) -> Array:
         """Return the projection of residuals (m,) or columns (m, k) onto the complement."""
         beside = rows - self.basis @ (self.basis.T @ rows)
-        # a second time, as rounding errors of the first matter in a small projection
+        # the projection is repeated, as its rounding errors matter if it is small
         return np.asarray(beside - self.basis @ (self.basis.T @ beside))
 
 

@@ -201,6 +201,9 @@ def _exchanged(problem: OutputErrorProblem, now: State, cost: float, rows: Rows)
             refitted = fitted(problem, start, now.causes, places, sizes, sizes, free, None)
         except DynamicsError:
             continue
+        # if chance explains all others without it, it stays
+        if not refitted[0]:
+            continue
         others = tuple(other for other in now.chosen if other is not one)
         left = _of_places(others, refitted[0])
         without = _state(problem, now, left, *refitted, rows, one.places)

@@ -4,6 +4,7 @@ model is accused of nothing.
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from scipy.stats import binom
 import identify
 from dynamics.geometry import RobotGeometry
 from identify.commands.diagnosis import _say
-from identify.diagnosis.candidate_fits import shown_sizes
+from identify.diagnosis import selection
+from identify.diagnosis.candidate_fits import Selected, State, shown_sizes
 from identify.diagnosis.catalogue import own_cause
 from identify.diagnosis.cause import Cause, InList, in_each_run
 from identify.diagnosis.diagnose import diagnosis_from
@@ -217,6 +219,15 @@ def test_a_cause_that_is_tried_at_a_size_is_not_left_out_by_its_derivative():
     beside = OrthogonalComplement.of(by_parameters)
     point = Point(causes, np.zeros(3), np.array([1e-9, 1e-9]), linear, beside)
     assert shown_sizes(point).tolist() == [False, True]
+
+
+def test_a_cause_stays_without_which_chance_explains_all_others(monkeypatch):
+    law, zero = (Selected(None, (place,), 1.0, ()) for place in (0, 1))
+    point = SimpleNamespace(sizes=np.ones(2), parameters=np.zeros(1))
+    causes = (SimpleNamespace(step=0.0), SimpleNamespace(step=1.0))
+    now = State((law, zero), (0, 1), point, causes, None, ())
+    monkeypatch.setattr(selection, "fitted", lambda *_: ((), point))
+    assert selection._exchanged(None, now, 10.0, None) is now
 
 
 @pytest.mark.slow

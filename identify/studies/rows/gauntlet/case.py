@@ -128,7 +128,7 @@ def run_case(case: Drawn) -> Case:
         for trouble, (number, _) in zip(case.troubles, named_by, strict=True)
     ]
     named = {number for number, _ in named_by}
-    # a laboratory cannot know which findings are right, so it also applies those of other findings
+    # a laboratory cannot know which findings are right, so it also applies the other remedies
     remedies += [
         Remedied(typed(one).settings)
         for number, one in enumerate(diagnosis.findings, start=1)
