@@ -20,6 +20,7 @@ from identify.record.delays import MotionLag, motion_lag
 from identify.record.telemetry import Telemetry
 from identify.record.tried_columns import (
     command_units,
+    mirrored_axes,
     other_poses,
     reordered,
     signs_line,
@@ -48,6 +49,9 @@ FITS = 0.9
 OPPOSES = -0.8
 # Distance, rad, of a joint's offset from whole turns below which it counts as these turns.
 NEAR_TURN = 0.3
+# Largest distance of poses from home as a mirror in the plane of the base shows it, as a fraction
+# of the height of home above this plane.
+OTHER_SIDE = 0.5
 ALIKE = 0.02  # difference of mean correlations up to which units and axes fit equally well
 # Largest offset of a joint from its command, as a fraction of its travel limit, that needs no other
 # zero. Drives without an integral hold a joint away from its command.
@@ -165,10 +169,24 @@ def _found(
     if not hint:
         # A joint whose drive does not follow says nothing about its own zero.
         yield from _of_joints(sure, commanded, coordinates, alike, robot, order, given)
+        if alike.min() > FITS:
+            yield from _mirrored(telemetry, robot, measured)
     else:
         yield (
             "the measured motion is not that of the commands (correlations of the joints from "
             f"{alike.min():.2f} to {alike.max():.2f}); {hint}"
+        )
+
+
+def _mirrored(telemetry: Telemetry, robot: Robot, measured: PoseColumns | None) -> Iterator[str]:
+    """Yield a sentence if poses lie where a mirror in the plane of the base would show home."""
+    poses = telemetry.poses
+    height = float(np.median(poses.pose[poses.ok, 2]))
+    home = float(robot.home_pose[2])
+    if abs(height + home) < OTHER_SIDE * abs(home):
+        yield (
+            f"the poses lie at z = {height:.3g} m, and home is at {home:.3g} m: a pose mirrored in "
+            f"the plane of the base has the same joint coordinates{mirrored_axes(measured)}"
         )
 
 
@@ -286,7 +304,7 @@ def _fitting(telemetry: Telemetry, robot: Robot, alike: float, measured: PoseCol
         distance = float(np.abs(np.median(tried, axis=0) - robot.home_pose)[:3].max())
         # Smaller changes are tried first. Only a better fit, or one nearer to home, replaces them.
         if score > best + ALIKE or (score > best - ALIKE and distance < nearest / 2):
-            best = score
+            best = max(best, score)
             nearest = distance
             found = said
     return found

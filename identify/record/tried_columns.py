@@ -75,6 +75,14 @@ def other_poses(poses: Array, measured: PoseColumns | None) -> Iterator[tuple[st
             yield hint, _in_base(moved, measured, stated)
 
 
+def mirrored_axes(measured: PoseColumns | None) -> str:
+    """Return what a description should state if z of the base has the wrong sign."""
+    if measured is None or any(measured.base_from_frame):
+        return ", and the sign of z is likely wrong"
+    axes = [*measured.axes[:2], f"-{measured.axes[2]}".removeprefix("--")]
+    return f"; with axes = {json.dumps(axes)} {POSES_TABLE} they would be at home"
+
+
 def _in_log(poses: Array, measured: PoseColumns) -> Array:
     """Return poses (N, 6), m and rad, as the log has them, with angles XYZ near those of poses."""
     position, turned = measured.in_log(poses)

@@ -529,6 +529,12 @@ WRONG_TABLES = [
         "the commands of joint 2 lie -6.2.* off by a turn .zeros = .0, -0.003.*, 0, 0, 0, 0. in",
     ),
     (
+        described_as(
+            'convention = "euler_XYZ"', 'convention = "euler_XYZ"\naxes = ["x", "y", "-z"]'
+        ),
+        'the poses lie at z = -0.2.* with axes = ."x", "y", "z". in .columns.measured. they',
+    ),
+    (
         described_as('time = "time_s"', 'time = "time_s"\ntime_unit = "ms"'),
         "line 3: time_s is 1.66667e-05 after 0 in the row before, which is 0.001 frames of 60 Hz",
     ),
