@@ -125,8 +125,8 @@ def budget(
     geometry, drives, scale anchor, initial guess, and others that the run states. The parts are
     those of the covariance of the identification. Predictions need a validated run.
 
-    Reads scenario.toml, experiment.nc, covariance.nc and result.json of the folder, and
-    validation.nc if there is one.
+    Reads scenario.toml, experiment.nc, covariance.nc and result.json of the folder, and of a
+    validated run also validation.nc and trajectories.json.
 
     Writes budget.json, which is also the JSON, budget.csv, and budget.png, which leaves out
     parameters that are not identified, into the folder budget there.

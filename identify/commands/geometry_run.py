@@ -46,12 +46,12 @@ def geometry(
     are listed. The scenario's [geometry] has the settings; its [plant] has the geometry errors of
     the simulated robot.
 
-    Reads a scenario, or poses of your own from a JSON file like poses.json: joints (N, n) in rad or
-    m, joint_std (n,), poses (N, 6) in m and rad and covariances (N, 6, 6). The optional
+    Reads a scenario, and with --poses a JSON file like poses.json: joints (N, n) in rad or m,
+    joint_std (n,), poses (N, 6) in m and rad and covariances (N, 6, 6). The optional
     base_covariance and platform_covariance, each (6, 6), state how well the base and platform
     frames are known. Writes geometry.json, which is also the JSON, geometry.md, geometry.png,
-    geometry.svg, covariance.nc, poses.json and robot.toml. robot.toml is the calibrated robot,
-    which every other command reads; cmmsim run --set geometry.known=FILE also reads its covariance.
+    geometry.svg, covariance.nc, poses.json, scenario.toml and robot.toml, the calibrated robot.
+    Every other command reads robot.toml; cmmsim run --set geometry.known=FILE also its covariance.
 
     \b
     Examples:

@@ -329,8 +329,8 @@ def report(
 
     A missed goal changes the exit status only with --strict.
 
-    Reads result.json, the records and model.nc from the folder. Writes report.html and figures
-    there.
+    Reads result.json, covariance.nc, the records and model.nc from the folder. Writes report.html
+    and figures there, and into result.json how long this took.
 
     \b
     Example:

@@ -1,7 +1,7 @@
 """Datasets of described variables over time, and covariances, in groups of netCDF files.
 
 Files are written completely or not at all. Dimensions, shapes and names are checked. The file
-`covariance.nc` has the covariance of the estimated parameters, in SI units.
+`covariance.nc` has the covariance of the estimated parameters and common errors, in SI units.
 """
 
 import io
@@ -299,7 +299,7 @@ def read_sources(path: Path | str, covariance: Array) -> dict[str, Array]:
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:
-    """Read the names (p,) of parameters, empty if the file has none, and their covariance (p, p).
+    """Read the names (q,) of quantities, empty if the file has none, and their covariance (q, q).
 
     Raises RecordError if the file is damaged or lacks the covariance, if a covariance is not
     finite, or if a variance is not positive.

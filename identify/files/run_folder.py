@@ -51,7 +51,7 @@ class RunFolder:
         self.experiment = path / "experiment.nc"  # record and truth of the excitation run
         # Record and truth of the run with the payload, if the payload sets the scale.
         self.payload = path / "payload.nc"
-        self.covariance = path / "covariance.nc"  # covariance of the estimated parameters
+        self.covariance = path / "covariance.nc"  # of the estimated parameters and common errors
         self.validation = path / "validation.nc"  # records and truth of the validation runs
         self.model = path / "model.nc"  # poses of initial and identified model on all trajectories
         self.result = path / "result.json"  # figures of the run

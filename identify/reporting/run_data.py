@@ -44,7 +44,8 @@ class RunData:
     validation         Records of the validation runs.
     validation_truth   Truth of the first validation run.
     models             Poses of the models, by the name of the run.
-    covariance, names  Covariance (p, p) of the estimates, and the names (p,) of the parameters.
+    covariance, names  Covariance (p + k, p + k) and names (p + k,) of the p parameters and the k
+                       common errors of the poses.
     trajectories       Trajectories of excitation and validation.
     """
 

@@ -211,11 +211,11 @@ HATCHES = ("", "////", "....", "xxxx", "----", "\\\\\\\\")
 
 
 def budget_figure(budget: Budget, identified: Mapping[str, bool]) -> Figure:
-    """Draw the fraction of each source in the variance of poses, predictions and parameters.
+    """Draw the share of each source in the variance of poses, predictions and parameters.
 
     The rows are poses and predictions, and then the ``identified`` parameters, sorted by the share
     of the source with the largest mean share. The number beside a row is the combined standard
-    uncertainty. Fractions that are negative, because of correlations, are left out.
+    uncertainty. Shares that are negative, because of correlations, are left out.
     """
     names = budget.quantities
     shown = [k for k, name in enumerate(names) if budget.std[k] > 0 and identified.get(name, True)]
