@@ -83,9 +83,9 @@ class RunFolder:
 
         The digests of netCDF files are compared before a library opens any of these files.
 
-        Raises OutputFolderError if the folder or a file is missing, or if the folder is that of a
-        study. The message names the first missing file and the stage that writes it. Raises
-        RecordError if a netCDF file cannot be read, or its digest is wrong.
+        Raises OutputFolderError if the folder or a file is missing, or if the path is a file or the
+        folder of a study. The message names the first missing file and the stage that writes it.
+        Raises RecordError if a netCDF file cannot be read, or its digest is wrong.
         """
         if self.path.is_file():
             raise OutputFolderError(

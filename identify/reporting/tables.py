@@ -251,7 +251,7 @@ def sums_of(identification: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def identified_counts(identification: Mapping[str, Any]) -> str:
-    """Return the numbers of identified parameters and sums of parameters, in words."""
+    """Say how many parameters, and how many sums of parameters, are identified."""
     kinds = {
         "parameters": list(identification["parameters"].values()),
         "sums of parameters": sums_of(identification),
@@ -264,7 +264,7 @@ def identified_counts(identification: Mapping[str, Any]) -> str:
 
 
 def common_scale_sentence(identification: Mapping[str, Any]) -> str:
-    """Return the sentence on how well the common scale is known, or "" without an entry of it."""
+    """Return sentences on how well the common scale is known, or "" without an entry of it."""
     scale = identification.get(ENTRY)
     if scale is None:
         return ""

@@ -78,7 +78,7 @@ def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
 class Section(BaseModel):
     """Base of all sections.
 
-    Sections are frozen. Types must match exactly, keys must be known, and numbers must be finite.
+    Sections are frozen. Keys must be known, numbers finite, and types exact, or an int for a float.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

@@ -83,7 +83,7 @@ class ImagingSensor:
     def look(self, pose: Array) -> StereoView:
         """Return images and stickers at a pose (6,).
 
-        Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
+        Raises dynamics.UnreachablePoseError, dynamics.ChartError or cmmsim.CmmError.
         """
         drawn = self._sensor.look(pose, self._cell.obstacles(pose))
         if self._region is not None and self._sensor.renderer == "analytic":
@@ -133,7 +133,7 @@ def stereo_view(
     """Draw the camera images of a workcell, cropped to the robot, and find the stickers in them.
 
     The default pose (6,) is home. ``seed`` is the seed of the noise. The renderers "pyrender" and
-    "scene" need OpenGL. Raises dynamics.UnreachablePoseError or cmmsim.CmmError.
+    "scene" need OpenGL. Raises the exceptions of `ImagingSensor.look`.
     """
     drawn_pose = cell.home if pose is None else np.asarray(pose, dtype=float)
     return ImagingSensor(cell, seed, renderer, region_of(cell, [drawn_pose])).look(drawn_pose)

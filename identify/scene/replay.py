@@ -139,7 +139,7 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
     ------
     WriteError
         The file cannot be written.
-    dynamics.UnreachablePoseError
+    dynamics.UnreachablePoseError, dynamics.ChartError
         The robot cannot take a pose of the motion.
     cmmsim.CmmError
         The sensor cannot be made or cannot draw.

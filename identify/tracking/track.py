@@ -73,8 +73,8 @@ def track(
                 robot is identified first, if that model is requested.
     own         CSV file with poses to follow in place of the standard motions.
 
-    Raises ScenarioError, TrajectoryError or RecordError if the scenario, a motion or the run folder
-    does not fit. Errors of the identification are also raised.
+    Raises ScenarioError, TrajectoryError, OutputFolderError or RecordError if scenario, motion or
+    run folder does not fit. Errors of the identification are also raised.
     """
     scenario = setup.scenario
     seed = setup.seed
