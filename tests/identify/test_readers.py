@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from dynamics import load_robot
 from identify.commands.help import NOT_DONE
 from identify.errors import RecordError
+from identify.record.from_telemetry import reading_notes
 from identify.record.own_record import (
     description_file,
     read_description,
@@ -226,6 +227,18 @@ def test_records_of_all_logs_and_of_netcdf_are_the_same_to_1e_9(record, tmp_path
         np.testing.assert_allclose(
             found["command"].values, kept["command"].values[rows], rtol=0, atol=TOLERANCE
         )
+
+
+def test_a_latency_does_not_move_commands_that_have_times_of_their_own(record, tmp_path):
+    path = as_motive(tmp_path, record)
+    (own,), _ = read_own_records([path])
+    change(
+        path.with_suffix(".toml"), "frame_rate_hz = 60.0", "frame_rate_hz = 60.0\nlatency_s = 0.1"
+    )
+    (late,), _ = read_own_records([path])
+    np.testing.assert_array_equal(late["acting"], own["acting"])
+    note = "timing.latency_s = 0.1 does not move the commands, which have times of their own"
+    assert set(reading_notes([late])) - set(reading_notes([own])) == {note}
 
 
 def test_netcdf_holds_the_same(record, tmp_path):
