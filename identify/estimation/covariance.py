@@ -75,6 +75,7 @@ class Uncertainty:
     sources (p + k, p + k)  Parts of `whole` by source of the uncertainty: NOISE, MODEL, LOAD,
                             GUESS, ANCHOR, the kinds of common errors, and CORRELATED. Parts that do
                             not occur are left out. Up to rounding, their sum is `whole`.
+    white (p, p)            Covariance of the estimate if the residuals were white.
     information (p, p)      Information of the poses alone.
     gradient (p,)           J^T r of poses and prior at the estimate, half the gradient of the cost.
     misfit                  Misfit of all records together.
@@ -83,6 +84,7 @@ class Uncertainty:
 
     whole: Array
     sources: dict[str, Array]
+    white: Array
     information: Array
     gradient: Array
     misfit: Misfit
@@ -179,6 +181,7 @@ def estimate_uncertainty(
     return Uncertainty(
         covariance,
         sources,
+        units[:size] @ units[:size].T,
         information,
         np.asarray(gradient),
         misfit,

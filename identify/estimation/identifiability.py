@@ -284,6 +284,7 @@ def judge(
         uncertainty.gradient,
         uncertainty.information + known,
         uncertainty.covariance,
+        uncertainty.white,
         problem.bounds,
     )
     excited = [

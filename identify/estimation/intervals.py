@@ -11,10 +11,16 @@ flat body, all of the gradient with respect to its ten numbers is balanced. The 
 unheld estimate, truncated at the bounds, has the stated coverage whatever the truth. But it can be
 empty, or not contain the estimate. Averaged over all truths within the bounds, it is also in the
 wrong position, because a bound that a quantity cannot cross moves all correlated quantities, too.
-The stated distribution is therefore the distribution of the unheld estimate, truncated at all
-bounds, see `truncated_normal`. Its interval alone would not do either. For a sum of many quantities
-whose true values are at their bounds, this interval is too high by more than its standard
-deviation.
+The stated distribution is therefore truncated at all bounds, see `truncated_normal`. Its interval
+alone would not do either. For a sum of many quantities whose true values are at their bounds, this
+interval is too high by more than its standard deviation.
+
+The estimate weighs poses and initial guess as if the residuals were white. In a closed loop the
+noise also moves the robot, and the covariance of the estimate is larger than that of white noise.
+The bounds act like the initial guess: by the weights of white noise. The distribution that is
+truncated therefore has the covariance of white noise, and the rest of the covariance is an excess
+of `TruncatedNormal`. If the excess were truncated as well, errors due to noise would be taken for
+knowledge of how the truth is related to its bounds.
 
 The returned interval is the shortest that contains both intervals and the estimate, truncated at
 the smallest allowed value. It is never empty, and has at least the stated coverage. Without bounds
@@ -48,13 +54,15 @@ class BoundedEstimate:
     """Estimate (p,) within bounds.
 
     at_bound (p,): True for coordinates at their bounds. unheld (p,): estimate without bounds.
-    covariance (p, p): covariance of the unheld estimate.
+    covariance (p, p): covariance of the unheld estimate. white (p, p): what it would be if the
+    residuals were white.
     """
 
     estimate: Array
     at_bound: NDArray[np.bool_]
     unheld: Array
     covariance: Array
+    white: Array
     bounds: ParameterBounds
 
     def intervals(self, rows: Array) -> Array:
@@ -77,7 +85,8 @@ class BoundedEstimate:
         lower = self.bounds.linear_lower
         bounded = np.isfinite(lower)
         directions = np.asarray(np.linalg.inv(self.bounds.matrix)[bounded], dtype=float)
-        return truncated(self.unheld, self.covariance, directions, lower[bounded])
+        excess = self.covariance - self.white
+        return truncated(self.unheld, self.white, directions, lower[bounded], excess)
 
     def probabilities(self, rows: Array, values: Array) -> Array:
         """Return the probabilities (n,) of rows (n, p) @ parameters < values (n,).
@@ -129,6 +138,7 @@ def bounded_estimate(
     gradient: Array,
     information: Array,
     covariance: Array,
+    white: Array,
     bounds: ParameterBounds,
 ) -> BoundedEstimate:
     """Return the estimate (p,) of a search within bounds.
@@ -137,4 +147,4 @@ def bounded_estimate(
     arguments see `BoundedEstimate`.
     """
     unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
-    return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)
+    return BoundedEstimate(estimate, at_bound, unheld, covariance, white, bounds)

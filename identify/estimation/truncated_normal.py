@@ -5,6 +5,10 @@ al. 2011, "Gaussian probabilities and expectation propagation"). Each bound is r
 factor. The factor is chosen such that mean and variance along the bound's direction agree with
 those of the distribution that is truncated there. All bounds are visited in turn until their
 factors no longer change. For a single bound, mean and covariance are exact.
+
+The normal distribution may have been computed with noise that is smaller than the true noise. Its
+mean then errs by more than its covariance says. The factors of the bounds are further knowledge,
+which reduces this excess as it reduces the covariance.
 """
 
 from dataclasses import dataclass
@@ -38,7 +42,8 @@ class TruncatedNormal:
 
     mean (p,), covariance (p, p): moments of the truncated distribution. precision, weighted (k,):
     precision of each bound's normal factor, and precision times mean of this factor. Both are zero
-    for a bound without effect.
+    for a bound without effect. excess (p, p): covariance of the mean, as it would be without
+    bounds, minus the covariance of the distribution that is truncated.
     """
 
     mean: Array
@@ -46,15 +51,21 @@ class TruncatedNormal:
     directions: Array
     precision: Array
     weighted: Array
+    excess: Array
 
     def marginals(self, rows: Array) -> tuple[Array, Array]:
         """Return mean and standard deviation (n,) of the quantities rows (n, p) @ x.
 
-        If a quantity is a positive multiple of a bounded one, the factor of this bound is taken out
-        again. Truncated at the bound, the returned normal distribution is then the quantity's.
+        The excess is included. If a quantity is a positive multiple of a bounded one, the factor of
+        this bound is taken out again. Truncated at the bound, the returned normal distribution is
+        then the quantity's.
         """
         mean = rows @ self.mean
-        variance = np.einsum("gi,ij,gj->g", rows, self.covariance, rows)
+        reduced = rows @ self.covariance
+        variance = np.einsum("gi,gi->g", reduced, rows)
+        # Derivatives of the means with respect to the mean without bounds.
+        gains = rows - (reduced @ self.directions.T * self.precision) @ self.directions
+        excess = np.einsum("gi,ij,gj->g", gains, self.excess, gains)
         norms = np.linalg.norm(self.directions, axis=1)
         # Scalar products of each quantity with each bound's direction.
         products = rows @ self.directions.T
@@ -63,20 +74,28 @@ class TruncatedNormal:
             scale = products[n, k] / norms[k] ** 2
             remaining = 1.0 / variance[n] - self.precision[k] / scale**2
             mean[n] = (mean[n] / variance[n] - self.weighted[k] / scale) / remaining
+            excess[n] /= (variance[n] * remaining) ** 2
             variance[n] = 1.0 / remaining
-        return mean, np.sqrt(variance)
+        return mean, np.sqrt(variance + excess)
 
 
-def truncated(mean: Array, covariance: Array, directions: Array, lower: Array) -> TruncatedNormal:
+def truncated(
+    mean: Array,
+    covariance: Array,
+    directions: Array,
+    lower: Array,
+    excess: Array | float = 0.0,
+) -> TruncatedNormal:
     """Return the normal distribution with mean (p,) and covariance (p, p), truncated at bounds.
 
-    directions (k, p), lower (k,): the bounds directions @ x >= lower. If the passes do not
+    directions (k, p), lower (k,): the bounds directions @ x >= lower. excess (p, p): further
+    covariance of the mean, see `TruncatedNormal`. If the passes do not
     converge, or if the distribution without one bound's factor has no positive variance, the
     distribution is returned without bounds.
     """
-    untruncated = TruncatedNormal(
-        mean, covariance, directions, np.zeros(len(lower)), np.zeros(len(lower))
-    )
+    beyond = np.broadcast_to(excess, covariance.shape)
+    zeros = np.zeros(len(lower))
+    untruncated = TruncatedNormal(mean, covariance, directions, zeros, zeros, beyond)
     new_mean = np.array(mean, dtype=float)
     new_covariance = np.array(covariance, dtype=float)
     # Natural parameters of the factors: precision, and precision times mean.
@@ -105,7 +124,9 @@ def truncated(mean: Array, covariance: Array, directions: Array, lower: Array) -
             step = gain * (by_weighted - by_precision * centre) * variance**0.5
             change = max(change, abs(step), abs(by_precision) * variance)
         if change < SETTLED:
-            return TruncatedNormal(new_mean, new_covariance, directions, precision, weighted)
+            return TruncatedNormal(
+                new_mean, new_covariance, directions, precision, weighted, beyond
+            )
     return untruncated
 
 

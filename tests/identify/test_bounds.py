@@ -5,6 +5,8 @@ The linear problems have known statistics: the estimate without bounds is that o
 `numpy.linalg.lstsq`.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -151,8 +153,9 @@ def fitted(matrix, data, bounds, start) -> BoundedEstimate:
     )
     estimate, information = bounds.parameters(found.parameters), matrix.T @ matrix
     gradient = matrix.T @ (matrix @ estimate - data)
+    covariance = np.linalg.inv(information)
     return bounded_estimate(
-        estimate, found.at_bound, gradient, information, np.linalg.inv(information), bounds
+        estimate, found.at_bound, gradient, information, covariance, covariance, bounds
     )
 
 
@@ -329,7 +332,8 @@ def test_a_sum_of_many_at_their_bounds_is_covered_where_the_cut_interval_of_the_
     data = rng.standard_normal((DRAWS, size))
     one = np.eye(size)
     estimates = [
-        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data
+        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, one, bounds)
+        for y in data
     ]
 
     def cut(found, rows):
@@ -355,9 +359,7 @@ def body_fit(physical):
 
 def test_intervals_end_at_the_bounds_and_hold_the_estimate_and_how_far_a_bound_moved_it_is_a_warning():
     found, unbounded = body_fit(physical=True)
-    wide = BoundedEstimate(
-        found.estimate, found.at_bound, found.unheld, 100 * found.covariance, found.bounds
-    )
+    wide = replace(found, covariance=100 * found.covariance, white=100 * found.white)
     for one in (found, wide):
         intervals = one.intervals(np.eye(67))
         assert np.all(intervals[:, 0] >= 0)

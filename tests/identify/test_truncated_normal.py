@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import truncnorm
+from scipy.stats import kstest, norm, truncnorm
 
 from identify.estimation.truncated_normal import truncated
 
@@ -49,3 +49,26 @@ def test_bounds_that_are_far_away_change_nothing():
     found = truncated(mean, np.eye(2), np.eye(2), np.zeros(2))
     assert np.array_equal(found.mean, mean)
     assert np.array_equal(found.covariance, np.eye(2))
+
+
+def test_noise_beyond_the_stated_one_is_not_taken_for_knowledge_of_a_bound():
+    """Truths from a prior that a bound truncates far from its mean, and estimates with the weights
+    of noise that is a fifth of the true one. A simulation of all of it is the oracle.
+    """
+    rng = np.random.default_rng(2)
+    rows, spread, lower = np.array([[1.1, 1.0], [-0.8, -0.7], [0.1, 0.2]]), 5.0, 1.5
+    white = np.linalg.inv(np.eye(2) + rows.T @ rows)
+    covariance = white @ (np.eye(2) + spread**2 * rows.T @ rows) @ white
+    bound = np.array([[0.0, 1.0]]), np.array([lower])
+    below: dict[str, list[float]] = {"apart": [], "together": []}
+    for _ in range(1000):
+        truth = np.array([rng.standard_normal(), truncnorm.rvs(lower, np.inf, random_state=rng)])
+        estimate = white @ rows.T @ (rows @ truth + spread * rng.standard_normal(3))
+        for name, found in (
+            ("apart", truncated(estimate, white, *bound, covariance - white)),
+            ("together", truncated(estimate, covariance, *bound)),
+        ):
+            centre, std = found.marginals(np.array([[1.0, 0.0]]))
+            below[name].append(float(norm.cdf((truth[0] - centre[0]) / std[0])))
+    assert kstest(below["apart"], "uniform").pvalue > 0.01
+    assert kstest(below["together"], "uniform").pvalue < 1e-6
