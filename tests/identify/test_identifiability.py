@@ -188,7 +188,9 @@ def test_the_estimate_does_not_decide(base, factor):
     guess = starting_guess(rss6(), "guess", 1.0)
     criterion = identifiability(guess, rss6())
     covariance = np.diag((0.2 * criterion.sizes) ** 2)
-    uncertainty = Uncertainty(covariance, {"guess": covariance}, covariance, truth(), None)
+    uncertainty = Uncertainty(
+        covariance, {"guess": covariance}, covariance, covariance, truth(), None
+    )
     groups = group_estimates(base, guess, criterion, factor * truth(), uncertainty)
     assert groups.identifiable.all()
     assert not criterion.judge(group_rows(base.combinations, LAYOUT), 9 * covariance).any()
