@@ -186,10 +186,12 @@ def clock_notes(records: Sequence[CommonErrorEstimates]) -> tuple[str, ...]:
         std = dict(zip(found.names, found.std.tolist(), strict=True))
         said = []
         if CLOCK_OFFSET in std:
-            offset, doubt = 1e3 * found.learned[CLOCK_OFFSET], 1e3 * std[CLOCK_OFFSET]
+            offset = 1e3 * found.learned[CLOCK_OFFSET]
+            doubt = 1e3 * std[CLOCK_OFFSET]
             said.append(f"{offset:.3f} ± {doubt:.3f} ms after their logged times")
         if CLOCK_DRIFT in std:
-            drift, doubt = 1e6 * found.learned[CLOCK_DRIFT], 1e6 * std[CLOCK_DRIFT]
+            drift = 1e6 * found.learned[CLOCK_DRIFT]
+            doubt = 1e6 * std[CLOCK_DRIFT]
             said.append(f"{drift:.1f} ± {doubt:.1f} us later in every second")
         if said:
             of_record = f" of record {number}" if len(records) > 1 else ""

@@ -116,7 +116,8 @@ def truncated(
                 return untruncated
             cavity_mean = (centre / variance - weighted[k]) / cavity_precision
             factor = _factor(cavity_mean, 1.0 / cavity_precision, float(bound))
-            by_precision, by_weighted = factor[0] - precision[k], factor[1] - weighted[k]
+            by_precision = factor[0] - precision[k]
+            by_weighted = factor[1] - weighted[k]
             precision[k], weighted[k] = factor
             gain = 1.0 / (1.0 + by_precision * variance)
             new_mean += cross * (gain * (by_weighted - by_precision * centre))

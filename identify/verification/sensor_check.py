@@ -43,7 +43,8 @@ def about_sensor(robot: Robot, sensor: str, file: SensorFile) -> Iterator[Findin
         home = ", ".join(f"{value:.4g}" for value in robot.home_pose)
         text += f": platform.home of the sensor must be near [{home}]; {OWN_SENSOR}"
     yield Finding("sensor's home", away <= limit, away, text, limit=limit, unit="m")
-    sight, unseen = sight_lines(file), unseen_at_teaching(file)
+    sight = sight_lines(file)
+    unseen = unseen_at_teaching(file)
     planes = {
         name: ([k for k in seen if (PLATFORM, sight.platform.sticker_ids[k]) not in unseen], needed)
         for name, (seen, needed) in seen_by_plane(sight, robot.home_pose).items()

@@ -97,7 +97,8 @@ def bodies_of(place: Place) -> Iterator[Body]:
         words = _pose_words(name)
         if not words or has_word(name, OTHERWISE):
             continue
-        last, before = words[-1].lower(), words[:-1]
+        last = words[-1].lower()
+        before = words[:-1]
         kept = [word for word in before if word.lower() not in (*PLACED, *TURNED)]
         # Vicon names a subject and its segment, which are often alike.
         stem = " ".join(dict.fromkeys(kept))

@@ -40,7 +40,8 @@ TIME_WORDS = ("time", "t", "timestamp", "stamp", "secs")  # words for times
 MARKS = ("ok", "valid", "tracked", "visible")  # words for columns that mark measured poses
 
 # Rates, Hz, of cameras, between which the unit of a time without a unit is the only likely one.
-SLOWEST_HZ, FASTEST_HZ = 3.0, 2000.0
+SLOWEST_HZ = 3.0
+FASTEST_HZ = 2000.0
 COUNTED = 1e-3  # largest distance from one of a step of times that may be numbers of frames
 
 # Conventions of three angles whose names tell no axes.
