@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.full_bodies import LinkMotion, centred, full_force, full_mass
+from dynamics.legs.full_leg_bodies import LinkMotion, centred, full_force, full_mass
 from dynamics.legs.leg import (
     EXACT,
     ROUNDED,

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from dynamics.expressions import symmetric_from_lower
 from dynamics.legs.crank_legs import Z
-from dynamics.legs.full_bodies import (
+from dynamics.legs.full_leg_bodies import (
     LinkMotion,
     centred,
     link_forces,

@@ -1,13 +1,14 @@
 """Motion of a run: true, measured and modelled poses, frame by frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
 from cmmsim.errors import CmmError
-from dynamics import load_robot
+from cmmsim.files import SensorFile
+from dynamics import Robot, load_robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import read_truth, true_poses
@@ -17,7 +18,7 @@ from identify.record.known_geometry import known_geometry
 from identify.record.model_runs import EXCITATION
 from identify.record.provenance import RunFiles, check_robot, recorded_seed
 from identify.record.recording import TRUTH_GROUP, poses, run_name
-from identify.scenario import Scenario, load_scenario
+from identify.scenario import load_scenario
 from identify.scene.workcell import Workcell, workcell
 
 # Names of the poses of a motion in the data of the page.
@@ -113,7 +114,9 @@ def read_motion(folder: Path | str, name: str = EXCITATION, renderer: str | None
     record = files.experiment if name == EXCITATION else files.validation[names.index(name) - 1]
     notes: list[str] = []
     scenario = load_scenario(run.whole_scenario)
-    cell = _cell(run, scenario, record, notes)
+    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run.path).robot
+    check_robot(record, robot)
+    cell = _cell(robot, scenario.sensor_file, notes)
     if renderer is None:
         renderer = "analytic" if scenario.renderer == "statistical" else scenario.renderer
     seen = {MEASURED: poses(record, "measured")}
@@ -139,12 +142,10 @@ def read_motion(folder: Path | str, name: str = EXCITATION, renderer: str | None
     return Motion(cell, record["time"].values, seen, covariance, seed, renderer, title, notes)
 
 
-def _cell(run: RunFolder, scenario: Scenario, record: xr.Dataset, notes: list[str]) -> Workcell:
-    """Return robot and sensor of a run, or the robot alone with a note if there is no sensor."""
-    robot = known_geometry(load_robot(scenario.robot), scenario.geometry, run.path).robot
-    check_robot(record, robot)
+def _cell(robot: Robot, sensor_file: Callable[[], SensorFile], notes: list[str]) -> Workcell:
+    """Return a robot with its sensor, or the robot alone with a note if there is no sensor."""
     try:
-        return workcell(robot, scenario.sensor_file())
+        return workcell(robot, sensor_file())
     except (CmmError, ScenarioError) as error:
         notes.append(f"Cameras, stickers and images are left out: {error}.")
         return workcell(robot)
