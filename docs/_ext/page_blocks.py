@@ -154,7 +154,7 @@ TABLES: dict[str, Callable[[Path], str]] = {
     "robots": kept_figures.robots,
     "laws": kept_figures.laws,
     "answer_estimators": kept_figures.leaderboard,
-    "answer_calibration": kept_figures.answer("calibration", {}, UNIFORM),
+    "answer_calibration": kept_figures.answer("calibration", {}, UNIFORM | POSES),
     "answer_calibration_robots": kept_figures.answer(
         "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
     ),
