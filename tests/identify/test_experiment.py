@@ -214,7 +214,7 @@ def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_r
         "motor_inertia_kg_m2",
     ):
         assert line in text
-    assert "joint_stiffness" not in quick().to_toml()
+    assert "\njoint_stiffness" not in quick().to_toml()
     with pytest.raises(SimulationError, match="of crank2 including its motor"):
         build_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6()).check()
     plant, reference = (
