@@ -81,7 +81,7 @@ UNIFORM = {
     "inner_covered_percent": "their 68.3 % intervals that contain the truth, %",
 }
 
-# Its figures of predicted poses, which older kept answers lack.
+# Its figures of predicted poses.
 POSES = {
     "poses_covered_percent": "coordinates of predicted poses within 95 % intervals, %",
     "poses_inner_covered_percent": "within 68.3 % intervals, %",
@@ -156,7 +156,7 @@ TABLES: dict[str, Callable[[Path], str]] = {
     "answer_estimators": kept_figures.leaderboard,
     "answer_calibration": kept_figures.answer("calibration", {}, UNIFORM | POSES),
     "answer_calibration_robots": kept_figures.answer(
-        "calibration_robots", {"scenario.robot": "robot"}, UNIFORM
+        "calibration_robots", {"scenario.robot": "robot"}, UNIFORM | POSES
     ),
     "answer_calibration_full": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
     "answer_calibration_off_grid": kept_figures.answer("calibration_off_grid", {}, UNIFORM | POSES),
