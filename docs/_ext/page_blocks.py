@@ -160,6 +160,9 @@ TABLES: dict[str, Callable[[Path], str]] = {
     ),
     "answer_calibration_full": kept_figures.answer("calibration_full", {}, UNIFORM | POSES),
     "answer_calibration_off_grid": kept_figures.answer("calibration_off_grid", {}, UNIFORM | POSES),
+    "answer_calibration_photographs": kept_figures.answer(
+        "calibration_photographs", {}, UNIFORM | POSES
+    ),
     "answer_pixel_noise": kept_figures.answers(
         {"pixel_noise": ("`analytic`",), "pixel_noise_scene": ("`scene`",)},
         ("renderer",),
