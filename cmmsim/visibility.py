@@ -5,7 +5,7 @@ neither camera sees it at grazing incidence. Obstacles are not considered. For t
 and base can hide stickers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,7 @@ def unseen_at_teaching(file: SensorFile) -> dict[tuple[str, str], str]:
         for stream, (body, section) in enumerate(zip(bodies, sections.values(), strict=True))
     ]
     home = np.array(file.platform.home)
+    radius = file.stickers.radius
     unseen: dict[tuple[str, str], str] = {}
     for pose in (home, *teaching_path(home, TRIED_POSES)):
         placed = [camera_from_base @ pose_to_transform(pose), camera_from_base]
@@ -105,27 +106,41 @@ def unseen_at_teaching(file: SensorFile) -> dict[tuple[str, str], str]:
                     for into, scene in zip(moves, scenes, strict=True)
                 ]
             )
+            camera = ("left", "right")[side]
             for body, scene, transform, into in zip(bodies, scenes, placed, moves, strict=True):
                 shown = rig.project(apply(transform, scene.sticker_places))[1][side]
-                facing = faces_camera(
-                    apply(into, scene.sticker_places), body.sticker_normals @ into[:3, :3].T
-                )
-                for k, place in enumerate(scene.sticker_places):
-                    rim = place + file.stickers.radius * RIM @ body.in_plane[k].T
-                    reason = (
-                        "lies outside of the image of"
-                        if not shown[k]
-                        else "is turned away from"
-                        if not facing[k]
-                        else "is hidden from"
-                        if _is_hidden(apply(into, rim), triangles)
-                        else ""
-                    )
-                    if reason:
-                        camera = ("left", "right")[side]
-                        key = body.name, str(body.sticker_ids[k])
-                        unseen.setdefault(key, f"{reason} the {camera} camera")
+                radius = file.stickers.radius
+                for k, reason in _unseen(
+                    body, scene.sticker_places, into, radius, shown, triangles
+                ):
+                    key = body.name, str(body.sticker_ids[k])
+                    unseen.setdefault(key, f"{reason} the {camera} camera")
     return unseen
+
+
+def _unseen(
+    body: MarkedBody,
+    places: Array,
+    camera_from_body: Array,
+    radius: float,
+    shown: NDArray[np.bool_],
+    triangles: Array,
+) -> Iterator[tuple[int, str]]:
+    """Yield the index of each sticker that a camera does not see whole, with the reason.
+
+    places (n, 3), shown (n,): centres of the stickers in the body, and whether the image contains
+    them. triangles (m, 3, 3): surfaces of all bodies in the axes of the camera.
+    """
+    centres = apply(camera_from_body, places)
+    facing = faces_camera(centres, body.sticker_normals @ camera_from_body[:3, :3].T)
+    for k, place in enumerate(places):
+        rim = place + radius * RIM @ body.in_plane[k].T
+        if not shown[k]:
+            yield k, "lies outside of the image of"
+        elif not facing[k]:
+            yield k, "is turned away from"
+        elif _is_hidden(apply(camera_from_body, rim), triangles):
+            yield k, "is hidden from"
 
 
 def _is_hidden(points: Array, triangles: Array) -> bool:

@@ -1,4 +1,4 @@
-"""Array type of this package, QR factor of tall matrices, and rounding to a common grid."""
+"""Array type of this package, QR factor of tall matrices, normalised errors, and rounding."""
 
 import math
 
@@ -10,6 +10,10 @@ Array = NDArray[np.float64]
 # Number of rows of a block. A matrix with up to twice as many rows is one block. A block with one
 # column per parameter fits into the cache of a processor.
 BLOCK = 600
+
+# Variance, in units of those of the quantities, up to which a direction counts as one without a
+# variance. Rounding leaves some 1e-15.
+LEAST_VARIANCE = 1e-12
 
 
 def triangular_factor(*parts: Array) -> Array:
@@ -30,6 +34,23 @@ def triangular_factor(*parts: Array) -> Array:
         for first in range(0, max(count, 1), step)
     ]
     return np.asarray(blocks[0] if len(blocks) == 1 else np.linalg.qr(np.vstack(blocks), mode="r"))
+
+
+def normalised_square(errors: Array, covariances: Array) -> float:
+    """Return the mean of e^T P^-1 e / m over N errors e (N, m) with covariances P (N, m, m).
+
+    Where P is singular, only the directions with a variance count. The result is NaN if P is.
+    """
+    if np.isnan(covariances).any():
+        return np.nan
+    # In units of the standard deviations, quantities of different units are comparable.
+    std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    unit = np.where(std > 0, std, 1.0)
+    variances, axes = np.linalg.eigh(covariances / (unit[:, :, None] * unit[:, None, :]))
+    along = np.einsum("nij,ni->nj", axes, errors / unit)
+    uncertain = variances > LEAST_VARIANCE
+    squared = np.divide(along**2, variances, out=np.zeros_like(along), where=uncertain)
+    return float(squared.sum() / max(uncertain.sum(), 1))
 
 
 def agreed(values: ArrayLike, bits: int = 27) -> Array:

@@ -253,6 +253,21 @@ class CommandColumns(Log):
         _check_once(self.names)
         return self
 
+    @property
+    def factor(self) -> float:
+        """Rad or m in a unit of the columns."""
+        return (ANGLES | LENGTHS)[self.unit] if isinstance(self.unit, str) else self.unit
+
+    @property
+    def all_signs(self) -> list[int]:
+        """Sign of each joint, 1 where none is stated."""
+        return [1] * len(self.names) if self.signs is None else [*self.signs]
+
+    @property
+    def all_zeros(self) -> Array:
+        """Values (n,) of the columns at the zeros of the joints, 0 where none is stated."""
+        return np.zeros(len(self.names)) if self.zeros is None else np.array(self.zeros)
+
 
 class Columns(Section):
     """Columns of a log whose names differ from those of a record."""

@@ -174,8 +174,7 @@ def signs_line(given: CommandColumns | None, against: NDArray[np.intp]) -> str:
     """Return what a description should state of the directions of joints, in brackets."""
     if given is None:
         return "(columns.command.signs)"
-    signs: list[int] = [*given.signs] if given.signs else [1] * len(given.names)
-    turned = [-sign if joint in against else sign for joint, sign in enumerate(signs)]
+    turned = [-sign if joint in against else sign for joint, sign in enumerate(given.all_signs)]
     return f"(signs = {turned} {COMMANDS_TABLE})"
 
 
@@ -186,9 +185,7 @@ def zeros_line(given: CommandColumns | None, offsets: Array) -> str:
     """
     if given is None:
         return "(columns.command.zeros)"
-    zeros = np.array(given.zeros or [0.0] * len(given.names))
-    radians = ANGLES[given.unit] if isinstance(given.unit, str) else given.unit
-    moved = zeros - offsets / (radians * np.array(given.signs or [1] * len(given.names)))
+    moved = given.all_zeros - offsets / (given.factor * np.array(given.all_signs))
     return f"(zeros = [{', '.join(f'{value:.9g}' for value in moved)}] {COMMANDS_TABLE})"
 
 
@@ -200,7 +197,7 @@ def command_units(prismatic: bool, given: CommandColumns | None) -> Iterator[tup
             yield factor, said and f"they are {said.partition(' ')[2]} (columns.command.unit)"
         return
     table = LENGTHS if prismatic else ANGLES
-    own = table[given.unit] if isinstance(given.unit, str) else given.unit
+    own = given.factor
     values = {json.dumps(name): value for name, value in table.items() if name != given.unit}
     if not isinstance(given.unit, str):
         values |= {f"{own * factor:.6g}": own * factor for factor in tried if factor != 1.0}

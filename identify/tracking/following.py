@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.closed_loop.run import saturated_frames
-from identify.arrays import Array
+from identify.arrays import Array, normalised_square
 from identify.experiment.law_in_loop import KnownModel, LoopSensor, NamedMotion, prepared
 from identify.experiment.plant import Plant
 from identify.experiment.run import Latencies
@@ -52,9 +52,8 @@ class TrackingRun:
         """
         if self.expected is None:
             return None
-        errors = robot.coordinates(self.run.pose) - self.expected[0]
-        weighted = np.linalg.solve(self.expected[1], errors[..., None])[..., 0]
-        return float(np.mean(np.sum(errors * weighted, axis=1)) / errors.shape[1])
+        poses, covariances = self.expected
+        return normalised_square(robot.coordinates(self.run.pose) - poses, covariances)
 
 
 def by_drawing(

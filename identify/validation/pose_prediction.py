@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 
 from dynamics.closed_loop import LoopFailure
 from dynamics.kinematics.platform import Chart
-from identify.arrays import Array
+from identify.arrays import Array, normalised_square
 from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import repeated_experiments
 from identify.model.body_errors import body_errors
@@ -32,9 +32,6 @@ NEIGHBOURS = 5  # number of frames over which the covariance due to noise is ave
 # Weight of the mean over the motion in a frame's covariance due to noise. Without it, the
 # covariance would be zero while the platform still rests at the start.
 SHRINKAGE = 0.02
-# Variance, in units of those of the coordinates, up to which a direction counts as one in which the
-# platform does not move. Rounding leaves some 1e-15.
-LEAST_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -83,18 +80,7 @@ class PosePrediction:
         and only the directions with a variance count. The result is NaN if P is.
         """
         free = self.chart.basis
-        errors = (true - self.poses) @ free
-        covariance = free.T @ self.covariance @ free
-        if np.isnan(covariance).any():
-            return np.nan
-        # In units of the standard deviations, metres and radians are comparable.
-        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        unit = np.where(std > 0, std, 1.0)
-        variances, axes = np.linalg.eigh(covariance / (unit[:, :, None] * unit[:, None, :]))
-        along = np.einsum("nij,ni->nj", axes, errors / unit)
-        moving = variances > LEAST_VARIANCE
-        squared = np.divide(along**2, variances, out=np.zeros_like(along), where=moving)
-        return float(squared.sum() / max(moving.sum(), 1))
+        return normalised_square((true - self.poses) @ free, free.T @ self.covariance @ free)
 
 
 def predict_poses(

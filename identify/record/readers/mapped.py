@@ -353,15 +353,12 @@ def _joint_coordinates(stream: Stream, given: CommandColumns, robot: Robot) -> A
             f"columns.command.names has {len(given.names)} columns, and {robot.name} has {joints} "
             "joints"
         )
-    unit = given.unit
-    if isinstance(unit, str):
-        table = LENGTHS if robot.layout.prismatic else ANGLES
-        if unit not in table:
-            raise RecordError(
-                f"columns.command.unit is {unit!r}, and the joints of {robot.name} move in "
-                f"{robot.layout.joint_unit}: one of {', '.join(table)}"
-            )
-        unit = table[unit]
+    table = LENGTHS if robot.layout.prismatic else ANGLES
+    if isinstance(given.unit, str) and given.unit not in table:
+        raise RecordError(
+            f"columns.command.unit is {given.unit!r}, and the joints of {robot.name} move in "
+            f"{robot.layout.joint_unit}: one of {', '.join(table)}"
+        )
     cells = np.stack([stream.numbers(name) for name in given.names], axis=1)
     missing = np.argwhere(~np.isfinite(cells))
     if len(missing):
@@ -373,9 +370,8 @@ def _joint_coordinates(stream: Stream, given: CommandColumns, robot: Robot) -> A
             "state the column of the times in [columns.command], too (time = ...): rows without a "
             "command are then left out"
         )
-    signs = np.ones(joints) if given.signs is None else np.array(given.signs, dtype=float)
-    zeros = np.zeros(joints) if given.zeros is None else np.array(given.zeros)
-    return np.asarray(signs * unit * (cells - zeros))
+    signs = np.array(given.all_signs, dtype=float)
+    return np.asarray(signs * given.factor * (cells - given.all_zeros))
 
 
 def _check_overlap(poses: PoseLog, commands: CommandLog) -> None:
