@@ -282,7 +282,6 @@ def judge(
         estimate,
         solution.at_bound,
         uncertainty.gradient,
-        uncertainty.information + known,
         uncertainty.covariance,
         uncertainty.white,
         problem.bounds,

@@ -6,14 +6,15 @@ estimate, the unheld estimate is
 
     unheld = estimate - W^-1 g,
 
-with the information W and the part g of the cost's gradient that the active bounds balance. At a
-flat body, all of the gradient with respect to its ten numbers is balanced. The interval of the
-unheld estimate, truncated at the bounds, has the stated coverage whatever the truth. But it can be
-empty, or not contain the estimate. Averaged over all truths within the bounds, it is also in the
-wrong position, because a bound that a quantity cannot cross moves all correlated quantities, too.
-The stated distribution is therefore truncated at all bounds, see `truncated_normal`. Its interval
-alone would not do either. For a sum of many quantities whose true values are at their bounds, this
-interval is too high by more than its standard deviation.
+with the information W, whose inverse is the covariance for white residuals, and the part g of the
+cost's gradient that the active bounds balance. At a flat body, all of the gradient with respect to
+its ten numbers is balanced. The interval of the unheld estimate, truncated at the bounds, has the
+stated coverage whatever the truth. But it can be empty, or not contain the estimate. Averaged over
+all truths within the bounds, it is also in the wrong position, because a bound that a quantity
+cannot cross moves all correlated quantities, too. The stated distribution is therefore truncated at
+all bounds, see `truncated_normal`. Its interval alone would not do either. For a sum of many
+quantities whose true values are at their bounds, this interval is too high by more than its
+standard deviation.
 
 The estimate weighs poses and initial guess as if the residuals were white. In a closed loop the
 noise also moves the robot, and the covariance of the estimate is larger than that of white noise.
@@ -136,15 +137,13 @@ def bounded_estimate(
     estimate: Array,
     at_bound: NDArray[np.bool_],
     gradient: Array,
-    information: Array,
     covariance: Array,
     white: Array,
     bounds: ParameterBounds,
 ) -> BoundedEstimate:
     """Return the estimate (p,) of a search within bounds.
 
-    gradient (p,): J^T r of poses and prior. information (p, p): J^T J of both. For the other
-    arguments see `BoundedEstimate`.
+    gradient (p,): J^T r of poses and prior. For the other arguments see `BoundedEstimate`.
     """
-    unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    unheld = estimate - white @ bounds.balanced(gradient, at_bound)
     return BoundedEstimate(estimate, at_bound, unheld, covariance, white, bounds)

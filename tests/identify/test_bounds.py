@@ -154,9 +154,7 @@ def fitted(matrix, data, bounds, start) -> BoundedEstimate:
     estimate, information = bounds.parameters(found.parameters), matrix.T @ matrix
     gradient = matrix.T @ (matrix @ estimate - data)
     covariance = np.linalg.inv(information)
-    return bounded_estimate(
-        estimate, found.at_bound, gradient, information, covariance, covariance, bounds
-    )
+    return bounded_estimate(estimate, found.at_bound, gradient, covariance, covariance, bounds)
 
 
 def one_bounds(physical):
@@ -332,8 +330,7 @@ def test_a_sum_of_many_at_their_bounds_is_covered_where_the_cut_interval_of_the_
     data = rng.standard_normal((DRAWS, size))
     one = np.eye(size)
     estimates = [
-        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, one, bounds)
-        for y in data
+        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data
     ]
 
     def cut(found, rows):

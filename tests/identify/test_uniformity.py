@@ -64,9 +64,7 @@ def test_stated_probabilities_are_those_of_the_normal_distribution_cut_at_the_bo
     at_bound = np.zeros(size, dtype=bool)
     std = np.where(np.arange(size) % 2, 0.3, 1.0) * np.maximum(guess.values, 1e-3)
     covariance = np.diag(std**2)
-    found = bounded_estimate(
-        guess.values, at_bound, np.zeros(size), np.eye(size), covariance, covariance, bounds
-    )
+    found = bounded_estimate(guess.values, at_bound, np.zeros(size), covariance, covariance, bounds)
     truth = guess.values + 0.7 * std
     least = np.maximum(bounds.lower, 0)
     free = guess.values > 0
